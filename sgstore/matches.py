@@ -14,7 +14,7 @@ from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import lru_cache, partial
 from heapq import merge
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -755,6 +755,37 @@ class Windows:
         yield Window.of(group)
         grown = GROWTH * max(used, self._size)
         self._size = max(min(grown, used * ROWS // max(self.rows, 1), LAST_WINDOW), 1)
+
+
+def intervals_for_people(
+    intervals: Iterable[Interval],
+) -> tuple[tuple[str, ...], Iterator[tuple[Any, ...]]]:
+    """Columns and rows of intervals, shorter: the first frame as ``trace#seq``, a variable as its name.
+
+    Returns
+    -------
+    columns : tuple of str
+        Empty if there is no interval: then nothing tells what they would hold.
+    rows : iterator of tuple
+    """
+    some = iter(intervals)
+    first = next(some, None)
+    if first is None:
+        return (), iter(())
+    named = {name.removesuffix(".name") for name in first.values if name.endswith(".name")}
+    keep = [name for name in first.values if name.removesuffix(".id") not in named]
+    columns = ("from", "start", "end", "frames", *(name.removesuffix(".name") for name in keep))
+    rows = (
+        (
+            f"{one.trace}#{one.start_seq}",
+            round(one.start, 3),
+            round(one.end, 3),
+            one.frames,
+            *(one.values[name] for name in keep),
+        )
+        for one in chain([first], some)
+    )
+    return columns, rows
 
 
 def notes_in(

@@ -108,8 +108,6 @@ def _plain(text: str) -> str:
 
 # The verb that checks: verdicts of traces -------------------------------------------------------
 
-COLUMNS = ("check", "trace", "verdict", "who", "from", "start", "end", "frames")
-
 
 @app.command(rich_help_panel=PANEL)
 def check(
@@ -138,6 +136,7 @@ def check(
     and from when to when.
     """
     from sgstore.lang import joined
+    from sgstore.temporal import verdict_columns, verdict_rows
 
     asked, values = statements.asked(files)
     text = joined([*chain.from_iterable(asked.values())])
@@ -158,9 +157,8 @@ def check(
 
     quantitative = run.quantitative
     if ask.for_people:
-        more = MARGIN_COLUMNS if quantitative else ()
-        told = ((*row, *_margin(one)[: len(more)]) for one in counted() for row in _rows(one))
-        ask.write((*COLUMNS, *more), told)
+        told = (row for one in counted() for row in verdict_rows(one, margin=quantitative))
+        ask.write(verdict_columns(margin=quantitative), told)
         say(", ".join(f"{count} {word}" for word, count in tally.items()))
     else:
         more = ("robustness",) if quantitative else ()
@@ -175,28 +173,15 @@ def check(
     return NO_MATCH if require and tally["false"] else 0
 
 
-def _rows(verdict: Verdict) -> Iterator[tuple[Any, ...]]:
-    """A verdict as a person reads it: a row, or one for each violation."""
-    head = verdict.check, verdict.trace, verdict.verdict
-    told = False
-    for witness in verdict.witnesses:
-        who = ", ".join(witness.names.values())
-        for row in _times(witness.violations) or [("", "", "", "")]:
-            told = True
-            yield (*head, who, *row)
-    if not told:
-        for row in _times(verdict.violations) or [("", "", "", "")]:
-            yield (*head, "", *row)
-
-
-def _times(violations: tuple[Interval, ...]) -> list[tuple[Any, ...]]:
-    return [
-        (f"{i.trace}#{i.start_seq}", round(i.start, 3), round(i.end, 3), i.frames)
-        for i in violations
-    ]
-
-
-_DOCUMENT: Final = (*COLUMNS[:3], "reason", "first_violation", "violations", "witnesses")
+_DOCUMENT: Final = (
+    "check",
+    "trace",
+    "verdict",
+    "reason",
+    "first_violation",
+    "violations",
+    "witnesses",
+)
 """Columns of verdicts as a program reads them."""
 
 
@@ -216,23 +201,8 @@ def _document(verdict: Verdict) -> tuple[Any, ...]:
     return (*head, spans[0] if spans else None, spans, witnesses)
 
 
-MARGIN_COLUMNS: Final = ("robustness", "decided by", "in")
-"""Columns of checks with ``ROBUSTNESS``."""
-
-
-def _margin(verdict: Verdict) -> tuple[Any, ...]:
-    """By how much a check is met, as a person reads it: the number, the condition and who, and the frame."""
-    found = verdict.robustness
-    if found is None:
-        return "", "", ""
-    who = ", ".join(f"{variable} = {name}" for variable, name in found.names.items())
-    decided = f"{found.condition} ({who})" if found.condition and who else found.condition or who
-    frame = "" if found.seq is None else f"{verdict.trace}#{found.seq}"
-    return f"{found.value:.4g}", decided, frame
-
-
 def _margin_document(verdict: Verdict) -> dict[str, Any] | None:
-    """The same as a program reads it; no number is infinite in JSON."""
+    """By how much a check is met, as a program reads it; no number is infinite in JSON."""
     found = verdict.robustness
     if found is None:
         return None
@@ -337,7 +307,7 @@ def _as_json(event: MonitorEvent) -> None:
 
 def _tell_verdict(verdict: Verdict, *, as_json: bool) -> None:
     if as_json:
-        about = {
+        about: dict[str, Any] = {
             "event": "verdict",
             "name": verdict.check,
             "trace": verdict.trace,
@@ -349,10 +319,12 @@ def _tell_verdict(verdict: Verdict, *, as_json: bool) -> None:
             about["robustness"] = _margin_document(verdict)
         _line(json_text(about))
     else:
+        from sgstore.temporal import margin_cells
+
         count = len(verdict.violations)
         more = f"  {count} violation{'s' * (count > 1)}" if count else ""
         why = f"  ({verdict.reason})" if verdict.reason else ""
-        margin, decided, _ = _margin(verdict)
+        margin, decided, _ = margin_cells(verdict)
         more += f"  robustness {margin}" if margin else ""
         more += f"  {decided}" if decided else ""
         _line(f"{verdict.check}: {verdict.verdict}{more}{why}")

@@ -7,22 +7,30 @@ from ._charts import draw_rank_sizes as draw_rank_sizes
 from ._view import Relations as Relations
 from ._picture import draw_frame as draw_frame
 from ._picture import draw_map as draw_map
+from ._stored import Bindings as Bindings
 from ._stored import camera_image as camera_image
+from ._stored import camera_of as camera_of
 from ._stored import draw_clip as draw_clip
 from ._stored import draw_stored as draw_stored
 from ._stored import frame_image as frame_image
 from ._stored import range_of as range_of
 from ._swimlanes import LETTERS as LETTERS
+from ._swimlanes import Lane as Lane
 from ._swimlanes import NAME as NAME
+from ._swimlanes import Timeline as Timeline
 from ._swimlanes import draw_timelines as draw_timelines
 from ._swimlanes import lines_of as lines_of
 from ._swimlanes import timelines as timelines
 
 __all__ = [
+    "Bindings",
     "LETTERS",
+    "Lane",
     "NAME",
     "Relations",
+    "Timeline",
     "camera_image",
+    "camera_of",
     "draw_clip",
     "draw_curve",
     "draw_frame",

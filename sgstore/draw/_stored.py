@@ -9,7 +9,7 @@ import io
 import re
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from sgstore.draw._legend import Entry
     from sgstore.draw._view import Relations
     from sgstore.graph import SceneGraph
-    from sgstore.matches import Matches
     from sgstore.query import Store
     from sgstore.roads import RoadMap
     from sgstore.store import FrameRef
@@ -157,12 +156,20 @@ _PICTURE: Final = re.compile(rb"\xff\xd8\xff|\x89PNG\r\n\x1a\n")
 """How JPEG and PNG begin. Pictures stand whole in their messages, whatever encodes these."""
 
 
+class Bindings(Protocol):
+    """What a query binds in a frame: :class:`sgstore.matches.Matches`, or what is known of them already."""
+
+    def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
+        """Node ids of the variables by name, for each match."""
+        ...
+
+
 def draw_stored(  # noqa: PLR0913  as many options as the picture has
     store: Store,
     frame: int | str,
     to: str | Path,
     *,
-    matches: Matches | None = None,
+    matches: Bindings | None = None,
     camera: str | None = None,
     relations: Relations = "ego",
     radius: float | None = None,
@@ -178,7 +185,7 @@ def draw_stored(  # noqa: PLR0913  as many options as the picture has
         ``frame_id``, ``TRACE#SEQ`` or ``TRACE@12.3s``.
     to : str or Path
         ``….png`` or ``….svg``; a file that is there is replaced.
-    matches : Matches, optional
+    matches : Matches or other Bindings, optional
         What they bind in this frame is marked.
     camera : str, optional
         Channel of the picture to put beside it; by default the first that carries pictures, ``none`` for none.
@@ -234,7 +241,7 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
     frames: FrameRange,
     to: str | Path,
     *,
-    matches: Matches | None = None,
+    matches: Bindings | None = None,
     camera: str | None = None,
     relations: Relations = "ego",
     radius: float | None = None,
@@ -289,7 +296,7 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
         chosen = _chosen(store, frames, fps)
         trace = chosen[0].trace
         road_map = map_of(store, trace)
-        if camera is None and not _camera_of(store, trace):
+        if camera is None and not camera_of(store, trace):
             camera = NO_CAMERA
     spread = sorted({len(chosen) * i // SAMPLES for i in range(SAMPLES)} | {len(chosen) - 1})
     samples = [*shots([chosen[number] for number in spread], seen=False)]
@@ -331,7 +338,7 @@ def _picture(store: Store, frame: FrameRef, camera: str | None) -> bytes | None:
     if camera == NO_CAMERA:
         return None
     try:
-        message = store.payload(frame, camera or _camera_of(store, frame.trace))
+        message = store.payload(frame, camera or camera_of(store, frame.trace))
     except StoreError:
         if camera:
             raise
@@ -344,7 +351,7 @@ def _picture(store: Store, frame: FrameRef, camera: str | None) -> bytes | None:
     return message[start.start() :]
 
 
-def _camera_of(store: Store, trace: str) -> str:
+def camera_of(store: Store, trace: str) -> str:
     """The first channel that carries pictures; empty if none does."""
     topics = (c.topic for c in store.file.channels(trace) if c.schema.endswith("CompressedImage"))
     return min(topics, default="")
@@ -386,7 +393,7 @@ def camera_image(store: Store, frame: int | str, channel: str) -> Image:
     return image
 
 
-def frame_image(store: Store, frame: int | str, matches: Matches | None, **look: Any) -> Image:
+def frame_image(store: Store, frame: int | str, matches: Bindings | None, **look: Any) -> Image:
     """A frame from above; parameters and errors are those of :func:`sgstore.draw.draw_stored`."""
     check_installed()
     from PIL import Image

@@ -2,7 +2,10 @@
 
 from ._checks import CheckRun as CheckRun
 from ._checks import Verdict as Verdict
+from ._checks import margin_cells as margin_cells
 from ._checks import unknown_notes as unknown_notes
+from ._checks import verdict_columns as verdict_columns
+from ._checks import verdict_rows as verdict_rows
 from ._formula import Formula as Formula
 from ._matches import TemporalMatches as TemporalMatches
 from ._monitor import Monitor as Monitor
@@ -22,6 +25,9 @@ __all__ = [
     "TemporalMatches",
     "Verdict",
     "evaluate",
+    "margin_cells",
     "opened",
     "unknown_notes",
+    "verdict_columns",
+    "verdict_rows",
 ]

@@ -280,6 +280,48 @@ class Verdict:
         return tuple(STATUS[code] for code in self.status) if self.status is not None else ()
 
 
+_COLUMNS: Final = ("check", "trace", "verdict", "who", "from", "start", "end", "frames")
+_MARGIN_COLUMNS: Final = ("robustness", "decided by", "in")
+
+
+def verdict_columns(*, margin: bool = False) -> tuple[str, ...]:
+    """Columns of verdicts for people; with those of ``ROBUSTNESS``, if a check has it."""
+    return (*_COLUMNS, *_MARGIN_COLUMNS) if margin else _COLUMNS
+
+
+def verdict_rows(verdict: Verdict, *, margin: bool = False) -> Iterator[tuple[Any, ...]]:
+    """A verdict for people, as rows of :func:`verdict_columns`: one, or one for each violation."""
+    head = verdict.check, verdict.trace, verdict.verdict
+    tail = margin_cells(verdict) if margin else ()
+    told = False
+    for witness in verdict.witnesses:
+        who = ", ".join(witness.names.values())
+        for row in _times(witness.violations) or [("", "", "", "")]:
+            told = True
+            yield (*head, who, *row, *tail)
+    if not told:
+        for row in _times(verdict.violations) or [("", "", "", "")]:
+            yield (*head, "", *row, *tail)
+
+
+def margin_cells(verdict: Verdict) -> tuple[str, str, str]:
+    """By how much a check is met: the number, the condition and who, and the frame; empty: not known."""
+    found = verdict.robustness
+    if found is None:
+        return "", "", ""
+    who = ", ".join(f"{variable} = {name}" for variable, name in found.names.items())
+    decided = f"{found.condition} ({who})" if found.condition and who else found.condition or who
+    frame = "" if found.seq is None else f"{verdict.trace}#{found.seq}"
+    return f"{found.value:.4g}", decided, frame
+
+
+def _times(violations: tuple[Interval, ...]) -> list[tuple[Any, ...]]:
+    return [
+        (f"{i.trace}#{i.start_seq}", round(i.start, 3), round(i.end, 3), i.frames)
+        for i in violations
+    ]
+
+
 def verdict_of(
     check: BoundCheck,
     verdict: Verdict,
