@@ -35,11 +35,14 @@ if TYPE_CHECKING:
 
 NOT_ASKING = {
     *("ingest", "import", "rebuild", "derive", "remove", "verify", "info"),
-    *("doctor", "map", "monitor", "record", "demo"),
-    *("config", "translate", "patterns list", "patterns show", "payload"),
+    *("doctor", "map", "monitor", "record", "demo", "mcp"),
+    *("config", "translate", "patterns list", "patterns search", "patterns show", "payload"),
     *("lock list", "lock union", "lock intersect", "lock minus"),
 }
-"""Verbs that write stores or tell of them, that read recordings, and that need no store at all."""
+"""Verbs that write stores or tell of them, that read recordings, and that need no store at all.
+
+``mcp`` bounds each question of an assistant by itself.
+"""
 ASKING = [verb for verb in LINES if verb not in NOT_ASKING]
 OUTPUTS = {
     "select": ["-o", "{new}.lock", "--no-payloads"],

@@ -9,6 +9,7 @@ import pytest
 
 from sgstore.cli import run
 from sgstore.lang import pattern_named, patterns
+from sgstore.lang.library import search
 from sgstore.query import Store
 
 if TYPE_CHECKING:
@@ -36,6 +37,27 @@ def test_list_names_them_all_or_those_of_a_kind(capsys: pytest.CaptureFixture[st
     text = said(capsys, "list", "--kind", "concept")
     assert "cut_in" in text
     assert "ParkingExit" not in text
+
+
+def test_search_names_first_what_has_most_of_the_words(capsys: pytest.CaptureFixture[str]) -> None:
+    def found(*words: str) -> list[str]:
+        assert run(["patterns", "search", *words, "--json"]) == 0
+        return [one["name"] for one in json.loads(capsys.readouterr().out)]
+
+    assert found("cut", "in")[0] == found("Cut-In")[0] == "cut_in"
+    assert "jaywalking" in found("pedestrian")  # its sentence says: a person
+    assert {"hard_brake"} <= {*found("brakes")} & {*found("braking")}
+    assert {pattern_named(name).kind for name in found("lane", "--kind", "property")} == {
+        "property"
+    }
+    assert found("xylophone") == []
+
+
+@pytest.mark.parametrize("name", patterns())
+def test_what_is_searched_by_its_own_words_is_among_the_best(name: str) -> None:
+    (place,) = (i for i, one in enumerate(search(name)) if one.name == name)
+
+    assert place < 12
 
 
 def test_show_prints_a_query_that_can_be_asked(

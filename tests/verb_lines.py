@@ -43,6 +43,7 @@ LINES: dict[str, list[str]] = {
     "monitor": ["{recording}", "-e", "CHECK ALWAYS ego.speed < 3", "--duration", "1s"],
     "timeline": ["{store}", PATTERN],
     "patterns list": [],
+    "patterns search": ["cut", "in"],
     "patterns show": ["cut_in"],
     "patterns run": ["{store}", "cut_in"],
     "coverage classes": ["{store}", "--limit", "0"],

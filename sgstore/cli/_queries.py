@@ -290,13 +290,13 @@ def _say_all(answer: Answer) -> None:
         say(f"only the first {len(answer.rows)} rows; --max-rows sets how many")
 
 
-# Verbs about the library of named patterns: list, show, run -------------------------------------
+# Verbs about the library of named patterns: list, search, show, run -----------------------------
 
 library = Verbs(no_args_is_help=True)
 app.add_typer(
     library,
     name="patterns",
-    help="The library of named patterns: list, show, run them.",
+    help="The library of named patterns: list, search, show, run them.",
     rich_help_panel=PANEL,
 )
 
@@ -314,11 +314,12 @@ class Kind(StrEnum):
     property = "property"
 
 
+PatternKinds = Annotated[list[Kind] | None, Option("--kind", help="Only of this kind; repeatable.")]
+
+
 @library.command("list")
 def list_patterns(
-    kinds: Annotated[
-        list[Kind] | None, Option("--kind", help="Only of this kind; repeatable.")
-    ] = None,
+    kinds: PatternKinds = None,
     *,
     out: RowOptions,
 ) -> int:
@@ -329,7 +330,11 @@ def list_patterns(
     """
     from sgstore.lang.library import patterns
 
-    found = [p for p in patterns().values() if not kinds or p.kind in kinds]
+    _write_patterns([p for p in patterns().values() if not kinds or p.kind in kinds], out)
+    return 0
+
+
+def _write_patterns(found: list[NamedPattern], out: RowOptions) -> None:
     if out.for_people:
         columns = ("name", "kind", "from", "sentence")
         rows = [(p.name, p.kind, p.library, p.sentence) for p in found]
@@ -337,6 +342,21 @@ def list_patterns(
         columns = ("name", "kind", "library", "sentence", "parameters", "source", "query")
         rows = [(*_told(p).values(),) for p in found]
     out.write(columns, rows)
+
+
+@library.command("search")
+def search_patterns(
+    words: Annotated[
+        list[str], Argument(metavar="WORD…", help="Such as: pedestrian crossing; in any order.")
+    ],
+    kinds: PatternKinds = None,
+    *,
+    out: RowOptions,
+) -> int:
+    """Find patterns of the library by words, the best first."""
+    from sgstore.lang.library import search
+
+    _write_patterns(search(" ".join(words), [*(kinds or ())]), out)
     return 0
 
 
@@ -418,31 +438,19 @@ def _check(store: Path, **options: Any) -> int:
 
 def _write_intervals(intervals: Iterator[Interval], ask: AskOptions) -> int:
     """Intervals as rows; for people, with a name for each that takes part instead of its node id."""
+    from sgstore.matches import intervals_for_people
+
+    if ask.for_people:
+        return ask.write(*intervals_for_people(intervals))
     first = next(intervals, None)
     if first is None:
         return ask.write((), [])
-    every = chain([first], intervals)
-    if not ask.for_people:
-        columns = ("trace", "start_seq", "end_seq", "start", "end", "frames", *first.values)
-        rows = (
-            (i.trace, i.start_seq, i.end_seq, i.start, i.end, i.frames, *i.values.values())
-            for i in every
-        )
-        return ask.write(columns, rows)
-    named = {name.removesuffix(".name") for name in first.values if name.endswith(".name")}
-    keep = [name for name in first.values if name.removesuffix(".id") not in named]
-    columns = ("from", "start", "end", "frames", *(name.removesuffix(".name") for name in keep))
-    shown = (
-        (
-            f"{i.trace}#{i.start_seq}",
-            round(i.start, 3),
-            round(i.end, 3),
-            i.frames,
-            *(i.values[name] for name in keep),
-        )
-        for i in every
+    columns = ("trace", "start_seq", "end_seq", "start", "end", "frames", *first.values)
+    rows = (
+        (i.trace, i.start_seq, i.end_seq, i.start, i.end, i.frames, *i.values.values())
+        for i in chain([first], intervals)
     )
-    return ask.write(columns, shown)
+    return ask.write(columns, rows)
 
 
 def _told(found: NamedPattern) -> dict[str, Any]:

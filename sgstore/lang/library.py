@@ -21,8 +21,9 @@ import re
 from collections.abc import Mapping
 from dataclasses import field
 from difflib import get_close_matches
-from functools import cache
+from functools import cache, partial
 from importlib import resources
+from itertools import takewhile
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
@@ -30,10 +31,10 @@ from sgstore.errors import QueryError, QueryNameError
 from sgstore.lang._parse import parse
 from sgstore.lang.syntax import Define
 from sgstore.records import dataclass
-from sgstore.vocabulary import normalize_name, suggestion
+from sgstore.vocabulary import LABEL_ALIASES, normalize_name, suggestion
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator
 
 
 KINDS_OF_PATTERNS: Final = ("predicate", "concept", "scenario", "property")
@@ -223,6 +224,69 @@ def pattern_named(name: str) -> NamedPattern:
     near = next(iter(get_close_matches(name, found, 1)), suggestion(name, found))
     hint = f"did you mean '{near}'?" if near else "'sgstore patterns list' names them all"
     raise QueryNameError(f"no pattern is called '{name}'", hint=hint)
+
+
+_WORD: Final = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+")
+_STEM: Final = 4
+"""Letters that words of one stem have in common at least: ``brakes``, ``braking``."""
+
+
+def search(text: str, kinds: Collection[str] = ()) -> list[NamedPattern]:
+    """Entries of the library that some words describe, the best first.
+
+    A word counts most in a name, then in a sentence, then in parameters, source and text. Words of one stem
+    are alike, and so are two words for one kind (``pedestrian``, ``person``).
+
+    Parameters
+    ----------
+    text : str
+        Words in any order: ``"pedestrian crosses"``.
+    kinds : collection of str
+        Only of these :data:`KINDS_OF_PATTERNS`; empty: of all.
+
+    Returns
+    -------
+    list of NamedPattern
+        Those in which a word occurs, by how many of them do, then by where.
+    """
+    wanted = list(dict.fromkeys(_words(text)))
+    ranks: list[tuple[int, int, NamedPattern]] = []
+    for entry in patterns().values():
+        if kinds and entry.kind not in kinds:
+            continue
+        weights = [max(map(partial(_weight, word), _places(entry.name))) for word in wanted]
+        ranks.append((sum(map(bool, weights)), sum(weights), entry))
+    ranks.sort(key=lambda rank: (-rank[0], -rank[1]))
+    return [entry for words, _, entry in ranks if words]
+
+
+@cache
+def _places(name: str) -> tuple[tuple[int, frozenset[str]], ...]:
+    """Words of an entry of the library, and how much each of them weighs."""
+    entry = patterns()[name]
+    parameters = " ".join(f"{p.name} {p.meaning}" for p in entry.parameters.values())
+    rest = f"{parameters} {entry.source} {entry.kind} {entry.query}"
+    texts = (4, entry.name), (2, entry.sentence), (1, rest)
+    return tuple((weight, frozenset(_words(text))) for weight, text in texts)
+
+
+def _words(text: str) -> list[str]:
+    """Words in small letters, ``cut_in`` and ``ParkingExit`` being two each; other words for a kind as that."""
+    return [LABEL_ALIASES.get(word, word) for word in map(str.lower, _WORD.findall(text))]
+
+
+def _weight(word: str, place: tuple[int, frozenset[str]]) -> int:
+    weight, words = place
+    return weight if word in words or any(_of_one_stem(word, one) for one in words) else 0
+
+
+def _of_one_stem(a: str, b: str) -> bool:
+    common = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(a, b, strict=False)))
+    return common >= _STEM and max(len(a), len(b)) - common <= _ENDING
+
+
+_ENDING: Final = 3
+"""Letters of an ending at most: ``ing``."""
 
 
 @cache
