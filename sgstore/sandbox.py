@@ -131,7 +131,7 @@ class Sandbox:
         There is no such file, it is no store, or one of another version; or a table cannot be read.
     """
 
-    def __init__(  # noqa: PLR0913  its limits
+    def __init__(
         self,
         store: str | Path,
         *,

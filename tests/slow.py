@@ -16,6 +16,7 @@ SECONDS: Final = {
     "pytest_plugin": 28,
     "fuzz": 27,
     "rebuilding": 25,
+    "assistant": 25,
     "derive": 24,
     "cli_streams": 22,
     "library": 20,

@@ -44,7 +44,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"query", "rebuild", "record"}),
     frozenset({"demo", "locks", "sandbox"}),
     frozenset({"coverage", "pytest_plugin"}),
-    frozenset({"diff", "selection"}),
+    frozenset({"assistant", "diff", "selection"}),
     frozenset({"cli"}),
 )
 OWNERS = {
@@ -68,6 +68,8 @@ OWNERS = {
     "torch": {"exporters"},
     "torch_geometric": {"exporters"},
     "carla": {"readers"},
+    "mcp": {"assistant"},
+    "pydantic": {"assistant"},
 }
 MASKS_ARE_KNOWN_TO = {"store", "lang/_sql_masks", "lang/_results"}
 SQL_OF_MASKS = re.compile(r"\bmask\b|\bbit_or\b|\bbit_count\b|<<")

@@ -33,8 +33,8 @@ word: so full it is for every verb, closed for these, and for all of them in ``m
 """
 UNHEARD = {*TALKING, *some([*LINES], 11)}
 """Verbs whose reader goes away: the same stream of ours ends all of them; in ``make oracle`` every one."""
-WITHOUT_OUTPUT = {"record", "lock union", "lock intersect", "lock minus"}
-"""Verbs that print nothing on stdout here: no simulator runs, and locks are files."""
+WITHOUT_OUTPUT = {"record", "lock union", "lock intersect", "lock minus", "mcp"}
+"""Verbs that print nothing on stdout here: no simulator runs, locks are files, and no assistant asks."""
 
 
 @pytest.fixture(scope="module")

@@ -69,6 +69,7 @@ LINES: dict[str, list[str]] = {
     "export": ["{store}", "MATCH (e:Ego) WHERE e.speed > 9", "--to", "{new}.clips"],
     "demo": ["{new}.demo"],
     "record": ["{new}.mcap"],
+    "mcp": ["{store}"],
 }
 """What is given to each verb; the names in braces are files."""
 

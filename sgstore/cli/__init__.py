@@ -35,6 +35,7 @@ VERBS: Final = {
     "checks": ("check", "monitor", "timeline"),
     "coverage": ("coverage", "select", "prioritize", "diff", "lock"),
     "exports": ("show", "export"),
+    "assistant": ("mcp",),
 }
 """The modules of the verbs, and what is in them; help lists the modules in this order.
 

@@ -6,6 +6,11 @@ from ._bind import CheckInCatalog as CheckInCatalog
 from ._bind import bind_checks as bind_checks
 from ._bind import bind_query as bind_query
 from ._bind_temporal import FUTURE as FUTURE
+from ._catalog import EDGE_ATTRIBUTES as EDGE_ATTRIBUTES
+from ._catalog import ENV_ATTRIBUTES as ENV_ATTRIBUTES
+from ._catalog import FRAME_ATTRIBUTES as FRAME_ATTRIBUTES
+from ._catalog import NODE_ATTRIBUTES as NODE_ATTRIBUTES
+from ._catalog import TRACE_ATTRIBUTES as TRACE_ATTRIBUTES
 from ._catalog import Attribute as Attribute
 from ._catalog import Catalog as Catalog
 from ._catalog import RelationScope as RelationScope
@@ -38,6 +43,7 @@ from ._external import relation as relation
 from ._external import traces_with as traces_with
 from ._external import with_places as with_places
 from ._compile import for_people as for_people
+from ._functions import FUNCTIONS as FUNCTIONS
 from ._needs import MOTION as MOTION
 from ._needs import Need as Need
 from ._needs import of_check as of_check
@@ -88,13 +94,18 @@ __all__ = [
     "Catalog",
     "Compared",
     "Compiled",
+    "EDGE_ATTRIBUTES",
+    "ENV_ATTRIBUTES",
     "Evaluate",
     "ExternalRelation",
+    "FRAME_ATTRIBUTES",
+    "FUNCTIONS",
     "FUTURE",
     "FrameView",
     "Gathered",
     "Layout",
     "MOTION",
+    "NODE_ATTRIBUTES",
     "NamedPattern",
     "Need",
     "Pattern",
@@ -104,6 +115,7 @@ __all__ = [
     "SqlStatement",
     "TOLD_WEATHER",
     "TRACES",
+    "TRACE_ATTRIBUTES",
     "TRACE_OF_BUCKET",
     "TableFacts",
     "TraceFacts",

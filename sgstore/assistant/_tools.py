@@ -1,0 +1,455 @@
+"""The tools of an assistant: each asks one question of a store, or makes one picture of it.
+
+Whatever an assistant writes, patterns, rules and SQL, is evaluated in the sandbox alone: a process that sees
+the store and nothing else, and has a deadline. What this process does itself is to draw frames that are named,
+to read what a camera saw, and, where it was given a folder for that, to cut the clips that the sandbox found.
+
+The docstring of a tool is what the assistant is told of it.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import tempfile
+import threading
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
+
+from pydantic import Field
+
+from sgstore.assistant._text import cell, finite, remarks, rows_text
+from sgstore.assistant._vocabulary import Topic, topic_text
+from sgstore.errors import ExportError, StoreError
+from sgstore.query import Store
+from sgstore.sandbox import TIMEOUT_S, Sandbox
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from PIL.Image import Image
+
+    from sgstore.store import FrameRef
+
+ROWS: Final = 20
+"""Rows of an answer, unless more are asked for."""
+
+MOST_ROWS: Final = 1_000
+"""Rows of an answer at most, unless the server is told otherwise."""
+
+MOST_BYTES: Final = 2 << 20
+"""Longest answer; bytes. A model reads a small part of it, a program more."""
+
+SIDE: Final = 1_024
+"""Longest side of what a camera saw; pixels: models see no more."""
+
+FrameName = Annotated[str, Field(description="'town#120' (trace and number) or 'town@12.3s'")]
+Pattern = Annotated[
+    str, Field(description="MATCH …; or the name of a pattern of the library, such as cut_in")
+]
+Values = Annotated[
+    dict[str, Any] | None, Field(description="values of $name in it, or of the named pattern")
+]
+Limit = Annotated[int, Field(ge=1, description="rows at most")]
+
+
+@dataclass(frozen=True)
+class ToolAnswer:
+    """Answer of a tool.
+
+    Attributes
+    ----------
+    text : str
+        For the model.
+    data : dict
+        The same for a program: what JSON can hold.
+    image : bytes
+        A picture; empty where there is none.
+    image_type : str
+        Of the picture: ``image/png``.
+    """
+
+    text: str
+    data: dict[str, Any] = field(default_factory=dict[str, Any])
+    image: bytes = b""
+    image_type: str = "image/png"
+
+
+@dataclass(frozen=True)
+class KnownBindings:
+    """What the sandbox has found that a query binds in a frame, for a picture."""
+
+    found: list[dict[str, int]]
+
+    def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
+        """Node ids by the names of variables, for each match."""
+        del frame
+        return self.found
+
+
+class StoreTools:
+    """Tools on one store.
+
+    Parameters
+    ----------
+    store : str or Path
+    write_to : str or Path, optional
+        Folder for clips; without one nothing is exported.
+    timeout_s : float
+        Longest time for a question; s.
+    most_rows : int
+        Longest answer; rows.
+    tables : mapping of str to path, optional
+        As in :class:`sgstore.sandbox.Sandbox`.
+
+    Raises
+    ------
+    StoreError
+        There is no such file, or it is no store.
+    """
+
+    def __init__(
+        self,
+        store: str | Path,
+        *,
+        write_to: str | Path | None = None,
+        timeout_s: float = TIMEOUT_S,
+        most_rows: int = MOST_ROWS,
+        tables: Mapping[str, str | Path] | None = None,
+    ) -> None:
+        self._write_to = None if write_to is None else Path(write_to)
+        self._box = Sandbox(
+            store,
+            timeout_s=timeout_s,
+            max_rows=most_rows,
+            max_bytes=MOST_BYTES,
+            tables=tables,
+            worker="sgstore.assistant._worker",
+        )
+        self._store = Store(store)
+        self._turn = threading.Lock()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the process that answers."""
+        self._box.close()
+        self._store.close()
+
+    def tools(self) -> dict[str, Callable[..., ToolAnswer]]:
+        """The tools by name, in the order in which an assistant should read them."""
+        reading = (
+            *(self.list_traces, self.vocabulary, self.patterns_search, self.find, self.why_not),
+            *(self.sql, self.check, self.timeline, self.show, self.picture, self.coverage_missing),
+        )
+        found = {tool.__name__: tool for tool in reading}
+        return found if self._write_to is None else found | {"export_clips": self.export_clips}
+
+    def _ask(self, ask: str, **about: Any) -> dict[str, Any]:
+        return self._box.ask({"ask": ask, "with": about})
+
+    def _rows(self, ask: str, **about: Any) -> ToolAnswer:
+        reply = self._ask(ask, **about)
+        return ToolAnswer(rows_text(reply), finite(reply))
+
+    # What there is ----------------------------------------------------------------------------
+
+    def list_traces(self, limit: Limit = 100) -> ToolAnswer:
+        """List the recordings (traces) of the store: frames, seconds, map, losses."""
+        return self._rows("traces", limit=limit)
+
+    def vocabulary(
+        self,
+        about: Annotated[
+            Topic,
+            Field(
+                description="here: kinds and relations in this store; language: how to write a query, in one"
+                " page; others: what a query may name"
+            ),
+        ] = "here",
+    ) -> ToolAnswer:
+        """Tell what a query can say. Read 'language' once before the first query of your own."""
+        text = self.topic(about)
+        return ToolAnswer(text, {"about": about, "text": text})
+
+    def topic(self, about: Topic) -> str:
+        """The text on a topic of the vocabulary."""
+        if about == "language":
+            return self._language
+        return topic_text(about, self._ask("views" if about == "views" else "vocabulary"))
+
+    @cached_property
+    def _language(self) -> str:
+        place = resources.files("sgstore.assistant").joinpath("language.md")
+        return place.read_text(encoding="utf-8")
+
+    def patterns_search(
+        self,
+        words: Annotated[str, Field(description="such as 'pedestrian crossing'; empty: all")] = "",
+        kind: Annotated[
+            Literal["", "predicate", "concept", "scenario", "property"],
+            Field(description="property: a rule for check; predicate: a condition for WHERE"),
+        ] = "",
+        limit: Limit = 8,
+    ) -> ToolAnswer:
+        """Search the library of named patterns and rules: try this before writing a query."""
+        from sgstore.lang.library import patterns, search
+
+        every = [one for one in patterns().values() if not kind or one.kind == kind]
+        found = search(words, [kind] if kind else []) if words.strip() else every
+        listed = [
+            {
+                "name": one.name,
+                "kind": one.kind,
+                "sentence": one.sentence,
+                "parameters": {
+                    p.name: f"{p.default}: {p.meaning}" for p in one.parameters.values()
+                },
+                "query": one.query,
+            }
+            for one in found[:limit]
+        ]
+        lines = [
+            "\n".join(
+                [f"{one['name']} ({one['kind']}): {one['sentence']}", f"  {cell(one['query'])}"]
+            )
+            for one in listed
+        ]
+        if len(found) > limit:
+            lines.append(f"({len(found) - limit} more; raise limit, or add words)")
+        return ToolAnswer(
+            "\n".join(lines) or "nothing in the library has these words", {"patterns": listed}
+        )
+
+    # Questions --------------------------------------------------------------------------------
+
+    def find(
+        self,
+        query: Pattern,
+        form: Annotated[
+            Literal["intervals", "rows", "frames", "count"],
+            Field(
+                description="intervals: when it holds, and who; rows: one a match and frame, or what RETURN"
+                " says; frames: each once; count: number of frames"
+            ),
+        ] = "rows",
+        limit: Limit = ROWS,
+        parameters: Values = None,
+    ) -> ToolAnswer:
+        """Find scenes by a pattern of their scene graphs."""
+        return self._rows("find", query=query, form=form, limit=limit, parameters=parameters or {})
+
+    def why_not(self, frame: FrameName, query: Pattern, parameters: Values = None) -> ToolAnswer:
+        """Explain why a pattern does not match a frame: what fails first, and how near it came."""
+        reply = self._ask("why_not", frame=frame, query=query, parameters=parameters or {})
+        return ToolAnswer(reply["text"], finite(reply))
+
+    def sql(
+        self,
+        statement: Annotated[str, Field(description="SELECT … FROM frames, nodes, edges, …")],
+        limit: Limit = ROWS,
+    ) -> ToolAnswer:
+        """Ask in DuckDB's SQL, read only; vocabulary 'views' tells tables and columns."""
+        return self._rows("sql", statement=statement, limit=limit)
+
+    def check(
+        self,
+        rule: Annotated[
+            str,
+            Field(description="'CHECK name: ALWAYS …', or the name of a property of the library"),
+        ],
+        limit: Limit = ROWS,
+        parameters: Values = None,
+    ) -> ToolAnswer:
+        """Check a rule over time: for each trace true, false or unknown, and each violation."""
+        reply = self._ask("check", text=rule, limit=limit, parameters=parameters or {})
+        tally = ", ".join(f"{number} {word}" for word, number in reply["verdicts"].items())
+        return ToolAnswer(f"{rows_text(reply)}\n({tally or 'no trace'})", finite(reply))
+
+    def timeline(
+        self,
+        queries: Annotated[
+            list[str],
+            Field(min_length=1, description="each MATCH …, CHECK …, or a name of the library"),
+        ],
+        traces: Annotated[list[str] | None, Field(description="only these")] = None,
+        picture: Annotated[bool, Field(description="as a picture, too")] = False,  # noqa: FBT002
+    ) -> ToolAnswer:
+        """Show over time when patterns hold and rules are violated: a lane for each entity."""
+        from sgstore.draw import Lane, Timeline, draw_timelines, lines_of
+
+        reply = self._ask("timeline", queries=queries, traces=traces or [], limit=TRACES_DRAWN)
+        found = [
+            Timeline(one["trace"], one["seconds"], [Lane(**lane) for lane in one["lanes"]])
+            for one in reply["timelines"]
+        ]
+        lines = [line for one in found for line in lines_of(one)]
+        if reply["truncated"]:
+            lines.append(f"(the first {TRACES_DRAWN} traces; name others in traces)")
+        unknown = {one.trace: lane.reason for one in found for lane in one.lanes if lane.reason}
+        text = "\n".join([*map(_one_line, lines), *remarks({"left_out": unknown})])
+        image = self._drawn(lambda to: draw_timelines(found, to)) if picture and found else b""
+        return ToolAnswer(text, finite(reply), image)
+
+    # Pictures ---------------------------------------------------------------------------------
+
+    def show(
+        self,
+        frame: FrameName,
+        query: Annotated[str, Field(description="marks what it matches there")] = "",
+        relations: Annotated[
+            Literal["ego", "all", "none"], Field(description="which edges are drawn")
+        ] = "ego",
+        camera: Annotated[bool, Field(description="beside it what a camera saw")] = True,  # noqa: FBT002
+        graph: Annotated[bool, Field(description="beside it the graph instead")] = False,  # noqa: FBT002
+        radius: Annotated[float | None, Field(gt=0, description="half the side; m")] = None,
+    ) -> ToolAnswer:
+        """Draw a frame from above, the ego in the middle."""
+        from sgstore.draw import frame_image
+
+        known, text = None, f"{frame} from above"
+        if query.strip():
+            reply = self._ask("bindings", frame=frame, query=query, parameters={})
+            known = KnownBindings(reply["bindings"])
+            names = ", ".join(known.found[0]) if known.found else ""
+            marked = f"marked: {names}" if names else "the query does not match here: see why_not"
+            text = "\n".join([f"{text}; {marked}", *remarks(reply)])
+        with self._turn:
+            image = frame_image(
+                self._store,
+                frame,
+                known,
+                relations=relations,
+                camera=None if camera else "none",
+                diagram=graph,
+                radius=radius,
+            )
+        return ToolAnswer(text, {"frame": frame}, _encoded(image, "PNG"))
+
+    def picture(
+        self,
+        frame: FrameName,
+        channel: Annotated[str, Field(description="topic of a camera; empty: the first")] = "",
+    ) -> ToolAnswer:
+        """Fetch what a camera saw at a frame."""
+        from sgstore.draw import camera_of
+
+        with self._turn:
+            ref = self._store.file.frame(frame)
+            topic = channel or camera_of(self._store, ref.trace)
+            if not topic:
+                topics = ", ".join(one.topic for one in self._store.file.channels(ref.trace_id))
+                raise StoreError(f"{ref.trace} has no camera; its channels: {topics or 'none'}")
+            image = self._store.picture(ref, topic)
+        size = f"{image.width} x {image.height} pixels"
+        if max(image.size) > SIDE:
+            image.thumbnail((SIDE, SIDE))
+            size += f", shown {image.width} x {image.height}"
+        about = {"frame": f"{ref.trace}#{ref.seq}", "channel": topic}
+        image = _encoded(image.convert("RGB"), "JPEG")
+        return ToolAnswer(f"{about['frame']}, {topic}: {size}", about, image, "image/jpeg")
+
+    def _drawn(self, draw: Callable[[Path], None]) -> bytes:
+        """A picture that a function draws into a file."""
+        with self._turn, tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "drawn.png"
+            draw(file)
+            return file.read_bytes()
+
+    # Coverage and clips -----------------------------------------------------------------------
+
+    def coverage_missing(
+        self,
+        frames: Annotated[str, Field(description="MATCH … that chooses frames; empty: all")] = "",
+        reference: Annotated[
+            str, Field(description="MATCH … that chooses what to compare with; empty: all frames")
+        ] = "",
+        cells: Annotated[
+            str, Field(description="MATCH … RETURN a, b: each combination of values is a cell")
+        ] = "",
+        abstraction: Annotated[
+            Literal["RSV", "ER", "EL", "E", "junction"],
+            Field(description="without cells: of features"),
+        ] = "RSV",
+        k: Annotated[int, Field(ge=1, le=3, description="features in a combination")] = 2,
+        of_ego: Annotated[bool, Field(description="only features of the ego")] = True,  # noqa: FBT002
+        limit: Limit = ROWS,
+    ) -> ToolAnswer:
+        """List combinations that do not occur in some frames: of the values of a query, or of k features."""
+        reply = self._ask(
+            "missing",
+            frames=frames,
+            reference=reference,
+            cells=cells,
+            abstraction=abstraction,
+            k=k,
+            of_ego=of_ego,
+            limit=limit,
+        )
+        share = reply["share"]
+        head = f"{share['part']} of {share['of']} covered; of: {share['denominator']}. Missing:"
+        return ToolAnswer("\n".join([*reply["said"], head, rows_text(reply)]), finite(reply))
+
+    def export_clips(
+        self,
+        query: Pattern,
+        name: Annotated[str, Field(description="of a new folder for them: letters, digits, - _ .")],
+        before: Annotated[float, Field(ge=0, le=600, description="before each match; s")] = 2.0,
+        after: Annotated[float, Field(ge=0, le=600, description="after each match; s")] = 2.0,
+        form: Annotated[str, Field(description="mcap, parquet, frames, nx, pyg, s3c")] = "mcap",
+        with_graph: Annotated[bool, Field(description="mcap: with the scene graphs")] = False,  # noqa: FBT002
+        limit: Annotated[int, Field(ge=1, description="clips at most")] = ROWS,
+        parameters: Values = None,
+    ) -> ToolAnswer:
+        """Cut what a pattern matches out of the recordings, as files in the folder that the user gave."""
+        from sgstore.exporters import Export, exporter_named, write_export
+        from sgstore.world import Clip
+
+        if self._write_to is None:
+            raise ExportError("nothing may be written: the server was started without --write-to")
+        if not _NAME.fullmatch(name):
+            raise ExportError(f"{name!r} is no name of a folder; expected such as 'cut-ins_1'")
+        exporter_named(form)  # before anything is searched
+        reply = self._ask(
+            "clips",
+            query=query,
+            before=before,
+            after=after,
+            limit=limit,
+            parameters=parameters or {},
+        )
+        clips = tuple(Clip(*row) for row in reply["rows"])
+        if not clips:
+            return ToolAnswer(rows_text(reply), {"files": []})
+        with self._turn:
+            order = Export(self._store, clips, with_graph=with_graph, provenance={"query": query})
+            written = write_export(order, self._write_to / name, form)
+        rows = [one.as_row() for one in written]
+        losses = [f"{one.file.name}: lost: {loss.reason}" for one in written for loss in one.losses]
+        listed = {"columns": [*rows[0]], "rows": [[*row.values()] for row in rows]}
+        about = {**listed, "truncated": reply["truncated"], "left_out": reply["left_out"]}
+        about["notes"] = [*reply["notes"], *losses]
+        return ToolAnswer(rows_text(about), finite(about))
+
+
+TRACES_DRAWN: Final = 12
+"""Traces of one timeline."""
+
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}")
+
+
+def _one_line(text: str) -> str:
+    return text if text.isprintable() else "".join(c if c.isprintable() else " " for c in text)
+
+
+def _encoded(image: Image, form: str) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, form)
+    return buffer.getvalue()
