@@ -21,6 +21,13 @@ __version__ = "0.2.0.dev0"
 _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
+def load_ipython_extension(ipython: object) -> None:
+    """Make ``%%sgql`` and pictures of graphs known to a notebook: ``%load_ext sgstore``."""
+    from sgstore.notebook import load
+
+    load(ipython)
+
+
 def __getattr__(name: str) -> object:
     if name not in __all__:
         raise AttributeError(f"module 'sgstore' has no attribute {name!r}")

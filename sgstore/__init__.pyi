@@ -16,7 +16,9 @@ from .lang import Pattern as Pattern
 from .map_files import read_map_file as read_map_file
 from .matches import Interval as Interval
 from .matches import Matches as Matches
+from .query import ClipAnimation as ClipAnimation
 from .query import Store as Store
+from .query import StoreFrame as StoreFrame
 from .query import open as open
 from .sgg import SceneGraphGenerator as SceneGraphGenerator
 from .step import Frame as Frame
@@ -29,10 +31,13 @@ from .world import Clip as Clip
 
 __version__: str
 
+def load_ipython_extension(ipython: object) -> None: ...
+
 __all__ = [
     "AbstractionError",
     "CheckRun",
     "Clip",
+    "ClipAnimation",
     "Config",
     "ConfigError",
     "ExportError",
@@ -52,6 +57,7 @@ __all__ = [
     "SqlError",
     "Store",
     "StoreError",
+    "StoreFrame",
     "TraceError",
     "Verdict",
     "open",

@@ -18,7 +18,7 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from sgstore.errors import QueryError
+from sgstore.errors import QueryError, SgstoreError
 from sgstore.lang import (
     Compiled,
     Layout,
@@ -33,6 +33,7 @@ from sgstore.lang.ir import FRAME_COLUMNS, INTERVAL_COLUMNS
 from sgstore.quoting import quoted
 from sgstore.records import dataclass
 from sgstore.store import (
+    IN_NOTEBOOK,
     SEQ_BITS,
     FrameRef,
     GivenTable,
@@ -69,6 +70,13 @@ GROWTH: Final = 16
 
 LAST_WINDOW: Final = 16_384
 """Buckets of the largest window, and of the first one of who wants all rows: a million frames."""
+
+COUNTED: Final = 16_384
+"""Buckets of a store whose matching frames a notebook counts by itself: a million frames."""
+
+PICTURES: Final = 4
+"""Pictures below the matches in a notebook, and the frames that are looked at for them."""
+LOOKED_AT: Final = 2_000
 
 ROWS: Final = 1_000_000
 """Rows that a window should not exceed by much: it grows, or shrinks, as those before it had few or many."""
@@ -163,6 +171,44 @@ class Matches(Tabular):
         shown = text if len(text) <= SHOWN else f"{text[: SHOWN - 1]}…"
         limit = "" if self._limit is None else f", at most {self._limit} rows"
         return f"<Matches of {shown!r}{limit}>"
+
+    def _repr_html_(self) -> str:
+        """The first rows, the number of frames, and pictures of the first scenes, for notebooks."""
+        from sgstore.display import html_table
+
+        with self._file.snapshot():
+            columns, rows = self.for_people()
+            some = list(islice(rows, IN_NOTEBOOK + 1))
+            buckets = sum(trace.extent[1] for trace in self._file.catalog().traces)
+            frames = f"{self.count():,} frames" if buckets <= COUNTED else "count() tells how many"
+            pictures = "".join(self._pictures()) if some else ""
+        below = f"the first {IN_NOTEBOOK} rows" if len(some) > IN_NOTEBOOK else ""
+        caption = f"{self!r}: {frames}" if some else f"{self!r}: nothing matches"
+        return html_table(columns, some[:IN_NOTEBOOK], caption, below) + pictures
+
+    def _pictures(self) -> Iterator[str]:
+        """Small pictures of the frames in which the first runs begin; none where that cannot be."""
+        from sgstore.display import html_media
+        from sgstore.draw import thumbnail
+
+        before: FrameRef | None = None
+        left = PICTURES
+        for frame in islice(self.frames(), LOOKED_AT):
+            begins = before is None or (frame.trace_id, frame.seq - 1) != (
+                before.trace_id,
+                before.seq,
+            )
+            before = frame
+            if not begins:
+                continue
+            try:
+                small = thumbnail(self._file, frame)
+            except SgstoreError:  # no packages for drawing, or the recording is elsewhere
+                return
+            yield html_media(small, "image/jpeg", f"{frame.trace}#{frame.seq}, {frame.t:.1f} s")
+            left -= 1
+            if not left:
+                return
 
     def limit(self, most: int) -> Self:
         """The same matches, but no more rows than so many, as if the query ended in ``LIMIT``.

@@ -10,15 +10,17 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, overload
+from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
-from sgstore.errors import QueryError
+from sgstore.errors import QueryError, StoreError
 from sgstore.lang import CONSTANTS, about_frame, compile_query, union_parts
 from sgstore.matches import UnionMatches
-from sgstore.store import FrameRef, StoreFile, UserTables
+from sgstore.records import dataclass
+from sgstore.store import IN_NOTEBOOK, FrameRef, StoreFile, UserTables
 from sgstore.vocabulary import normalize_name
 
 if TYPE_CHECKING:
@@ -31,10 +33,11 @@ if TYPE_CHECKING:
 
     from sgstore.lang import Catalog, FrameView, Pattern, WhyNot, WhyNotSteps
     from sgstore.lang.ir import FrameAttribute
-    from sgstore.matches import Matches
+    from sgstore.matches import Interval, Matches
     from sgstore.segments import TraceOutcome
     from sgstore.store import Rows, SimilarFrames, StoredTrace
     from sgstore.temporal import CheckRun
+    from sgstore.world import Clip
 
 
 def open(
@@ -54,6 +57,102 @@ def open(
             store.ingest("recordings/")
     """
     return Store(path, create=create, memory=memory, tables=tables, max_spill=max_spill, root=root)
+
+
+class StoreFrame:
+    """A frame of a store: its graph, and what the sensors of the recording saw. Notebooks draw it from above.
+
+    Attributes
+    ----------
+    ref : FrameRef
+        Its ids, its trace and its times.
+    """
+
+    def __init__(self, store: Store, ref: FrameRef) -> None:
+        self._store, self.ref = store, ref
+
+    def __repr__(self) -> str:
+        return f"<StoreFrame '{self.ref.trace}#{self.ref.seq}' at {self.ref.t:g} s>"
+
+    def _repr_png_(self) -> bytes | None:
+        from sgstore.errors import MissingExtraError
+
+        try:
+            return _png(self.show())
+        except MissingExtraError:  # then its repr is shown
+            return None
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Topics of the sensors whose messages belong to the frame."""
+        sql = "SELECT channel FROM payloads WHERE frame_id = ? ORDER BY channel"
+        return tuple(topic for (topic,) in self._store.file.rows(sql, [self.ref.frame_id]))
+
+    def graph(self, abstraction: str | None = None) -> nx.MultiDiGraph[Any]:
+        """Its scene graph, or what an abstraction makes of it; see :meth:`Store.graph`."""
+        return (
+            self._store.graph(self.ref, abstraction) if abstraction else self._store.graph(self.ref)
+        )
+
+    def picture(self, channel: str | None = None) -> Image:
+        """What a camera saw, by default the first one; see :meth:`Store.picture`."""
+        from sgstore.draw import camera_of
+
+        return self._store.picture(self.ref, channel or camera_of(self._store, self.ref.trace))
+
+    def points(self, channel: str | None = None) -> NDArray[Any]:
+        """The points that a lidar or radar saw, by default the first one; see :meth:`Store.points`."""
+        return self._store.points(self.ref, channel)
+
+    def show(self, query: str | Pattern | nx.Graph[Any] | None = None, **look: Any) -> Image:
+        """The frame from above; see :meth:`Store.show`."""
+        return self._store.show(self.ref, query, **look)
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class ClipAnimation:
+    """A clip as an animation. Notebooks play it.
+
+    Attributes
+    ----------
+    data : bytes
+        The content of its file.
+    form : str
+        ``gif``, ``mp4`` or ``webm``.
+    frames : tuple of str
+        The first and the last frame: ``town@25s`` or ``town#250``.
+    marked : int
+        Pictures in which the query matches.
+    """
+
+    data: bytes
+    form: str
+    frames: tuple[str, str]
+    marked: int
+
+    def __repr__(self) -> str:
+        return f"<ClipAnimation from {self.frames[0]!r} to {self.frames[1]!r}: {self.form}>"
+
+    def _repr_html_(self) -> str:
+        from sgstore.display import html_media
+
+        kind = "image/gif" if self.form == "gif" else f"video/{self.form}"
+        return html_media(self.data, kind, f"{self.frames[0]} to {self.frames[1]}")
+
+    def save(self, path: str | Path) -> None:
+        """Write it into a file.
+
+        Raises
+        ------
+        ExportError
+            The file has another ending than the animation has a form, or cannot be written.
+        """
+        from sgstore.errors import ExportError
+        from sgstore.files import write_bytes
+
+        if Path(path).suffix != f".{self.form}":
+            raise ExportError(f"{path}: the animation is a {self.form}; expected .{self.form}")
+        write_bytes(path, self.data)
 
 
 class Store:
@@ -113,6 +212,21 @@ class Store:
 
     def __repr__(self) -> str:
         return f"Store({str(self.file.path)!r})"
+
+    def _repr_html_(self) -> str:
+        """The traces as a table, for notebooks."""
+        from sgstore.display import html_table
+
+        columns = ("trace", "frames", "seconds", "ego", "map", "flavour")
+        traces = self.traces()
+        rows = (
+            (one.name, one.frames, (one.end_ns - one.start_ns) / 1e9, one.ego, one.map, one.flavour)
+            for one in traces[:IN_NOTEBOOK]
+        )
+        more = f"{len(traces) - IN_NOTEBOOK} more traces" if len(traces) > IN_NOTEBOOK else ""
+        frames = sum(one.frames for one in traces)
+        caption = f"{self!r}: {len(traces)} trace{'s' * (len(traces) != 1)}, {frames:,} frames"
+        return html_table(columns, rows, caption, more)
 
     def __enter__(self) -> Self:
         return self
@@ -435,6 +549,123 @@ class Store:
 
         return camera_image(self, _ref(frame), channel)
 
+    def points(self, frame: int | str | FrameRef, channel: str | None = None) -> NDArray[Any]:
+        """The points of a lidar or radar at a frame, read from the recording.
+
+        ::
+
+            points = store.points("town#264")
+            near = points[points["z"] > -1]
+
+        Parameters
+        ----------
+        frame : int, str or FrameRef
+            As :meth:`graph` takes it.
+        channel : str, optional
+            Topic of the sensor; by default the first that carries points.
+
+        Returns
+        -------
+        (N,) structured array
+            Fields as the message calls them, such as ``x``, ``y``, ``z`` (m, in the axes of the sensor) and
+            ``intensity``.
+
+        Raises
+        ------
+        StoreError
+            There is no such frame or channel, or no message of the channel belongs to the frame.
+        TraceError
+            The recording is gone, was replaced, or is damaged there.
+        ExportError
+            The message holds no points.
+        """
+        from sgstore.exporters import cloud_of
+
+        if channel is None:
+            known = self.file.channels(self.file.frame(_ref(frame)).trace)
+            topics = [one.topic for one in known if "PointCloud" in one.schema]
+            if not topics:
+                told = ", ".join(one.topic for one in known) or "none"
+                raise StoreError(f"no channel carries points; the channels: {told}")
+            channel = min(topics)
+        return cloud_of(self.file, _ref(frame), channel)
+
+    def frame(self, frame: int | str | FrameRef) -> StoreFrame:
+        """A frame, to look at from all sides: its graph, its pictures, its points.
+
+        Parameters
+        ----------
+        frame : int, str or FrameRef
+            As :meth:`graph` takes it.
+
+        Raises
+        ------
+        StoreError
+            There is no such frame.
+        """
+        return StoreFrame(self, self.file.frame(_ref(frame)))
+
+    def animate(
+        self,
+        clip: str | Clip | Interval,
+        query: str | Pattern | nx.Graph[Any] | None = None,
+        *,
+        form: Literal["gif", "mp4", "webm"] = "gif",
+        **look: Any,
+    ) -> ClipAnimation:
+        """A clip as an animation that runs as fast as the trace did.
+
+        Parameters
+        ----------
+        clip : str, Clip or Interval
+            ``TRACE@12s..18s``, ``TRACE#120..180``, or what :meth:`Matches.clips` and
+            :meth:`Matches.intervals` give.
+        query : str, Pattern or networkx graph, optional
+            As :meth:`find` takes it; what it matches is marked.
+        form : {"gif", "mp4", "webm"}
+            The last two with the extra ``video``.
+        **look
+            ``camera``, ``relations``, ``radius``, ``north_up``, ``diagram``, ``fps``: see
+            :func:`sgstore.draw.draw_clip`.
+
+        Raises
+        ------
+        StoreError, QueryError, ExportError, TraceError
+            There is no such clip or channel, the query is none, or the recording is gone.
+        MissingExtraError
+            The packages for drawing are not installed.
+        """
+        from sgstore.draw import draw_clip
+        from sgstore.files import working_folder
+
+        frames = self._range_of(clip)
+        matches = None if query is None else self.find(query)
+        with working_folder("animation") as folder:
+            file = folder / f"clip.{form}"
+            marked = draw_clip(self, frames, file, matches=matches, **look)
+            return ClipAnimation(file.read_bytes(), form, frames, marked)
+
+    def _range_of(self, clip: str | Clip | Interval) -> tuple[str, str]:
+        """The first and the last frame of a clip, by their names."""
+        from sgstore.draw import range_of
+        from sgstore.matches import Interval
+
+        if isinstance(clip, str):
+            frames = range_of(clip)
+            if frames is None:
+                raise StoreError(f"not a clip: {clip!r}; expected TRACE@12s..18s or TRACE#120..180")
+            return frames
+        if isinstance(clip, Interval):
+            return f"{clip.trace}#{clip.start_seq}", f"{clip.trace}#{clip.end_seq}"
+        sql = (
+            "SELECT min(seq), max(seq) FROM frames WHERE trace = ? AND log_time_ns BETWEEN ? AND ?"
+        )
+        rows = self.file.rows(sql, [clip.trace, clip.start_ns, clip.end_ns])
+        first, last = rows.values[0]
+        if first is None:
+            raise StoreError(f"no frame of {clip.trace!r} is in {clip}")
+        return f"{clip.trace}#{first}", f"{clip.trace}#{last}"
+
     def show(
         self,
         frame: int | str | FrameRef,
@@ -593,6 +824,12 @@ class UserStatement:
             self.notes += matches.notes
         if found:
             self.given = lambda: [part for name, of in found for part in of.as_table(name)]
+
+
+def _png(image: Image) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG")
+    return buffer.getvalue()
 
 
 def _ref(frame: int | str | FrameRef) -> int | str:

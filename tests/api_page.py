@@ -15,8 +15,11 @@ from sgstore.store import Tabular
 PAGE = Path(__file__).parents[1] / "docs" / "api.md"
 
 PARTS: dict[str, tuple[str, ...]] = {
-    "A store": ("open", "Store"),
-    "Answers": ("Matches", "Interval", "Clip", "FrameRef", "Rows", "CheckRun", "Verdict"),
+    "A store": ("open", "Store", "StoreFrame"),
+    "Answers": (
+        *("Matches", "Interval", "Clip", "ClipAnimation", "FrameRef"),
+        *("Rows", "CheckRun", "Verdict"),
+    ),
     "Graphs and patterns": ("SceneGraph", "Pattern"),
     "Online": ("Config", "Frame", "SceneGraphGenerator", "Monitor", "read_map_file"),
     "Errors": (

@@ -17,6 +17,7 @@ SECONDS: Final = {
     "fuzz": 27,
     "rebuilding": 25,
     "assistant": 25,
+    "notebook": 25,
     "derive": 24,
     "cli_streams": 22,
     "library": 20,

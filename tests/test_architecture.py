@@ -26,6 +26,7 @@ LAYERS: tuple[frozenset[str], ...] = (
         {
             "columns",
             "compiled",
+            "display",
             "errors",
             "geometry",
             "pair_numbers",
@@ -42,7 +43,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"derive", "importing", "matches", "segments"}),
     frozenset({"doctor", "exporters", "ingest", "temporal"}),
     frozenset({"query", "rebuild", "record"}),
-    frozenset({"demo", "locks", "sandbox"}),
+    frozenset({"demo", "locks", "notebook", "sandbox"}),
     frozenset({"coverage", "pytest_plugin"}),
     frozenset({"assistant", "diff", "selection"}),
     frozenset({"cli"}),

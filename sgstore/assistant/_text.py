@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.files import without_controls
+from sgstore.display import cell
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -15,7 +14,7 @@ MOST: Final = 30_000
 """Characters of rows in one answer; some ten thousand tokens."""
 
 LONGEST: Final = 400
-"""Characters of one value."""
+"""Characters of one value; of a query more than a table of a notebook has room for."""
 
 
 def rows_text(reply: Mapping[str, Any]) -> str:
@@ -45,25 +44,12 @@ def _lines(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> tuple[list[
     lines = [" | ".join(columns)]
     left = MOST
     for number, row in enumerate(rows):
-        line = " | ".join(map(cell, row))
+        line = " | ".join(cell(value, LONGEST) for value in row)
         left -= len(line) + 1
         if left < 0 and number:
             return lines, number
         lines.append(line)
     return lines, len(rows)
-
-
-def cell(value: Any) -> str:
-    """A value on one line."""
-    if value is None:
-        return ""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, float):
-        return f"{value:.6g}" if math.isfinite(value) else str(value)
-    text = json.dumps(value, ensure_ascii=False) if isinstance(value, list | dict) else str(value)
-    text = without_controls(" ".join(text.split()))
-    return text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…"
 
 
 def remarks(reply: Mapping[str, Any]) -> list[str]:

@@ -17,11 +17,12 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
+from textwrap import indent
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 from pydantic import Field
 
-from sgstore.assistant._text import cell, finite, remarks, rows_text
+from sgstore.assistant._text import finite, remarks, rows_text
 from sgstore.assistant._vocabulary import Topic, topic_text
 from sgstore.errors import ExportError, StoreError
 from sgstore.query import Store
@@ -217,10 +218,8 @@ class StoreTools:
             for one in found[:limit]
         ]
         lines = [
-            "\n".join(
-                [f"{one['name']} ({one['kind']}): {one['sentence']}", f"  {cell(one['query'])}"]
-            )
-            for one in listed
+            f"{one.name} ({one.kind}): {one.sentence}\n{indent(one.query, '  ')}"
+            for one in found[:limit]
         ]
         if len(found) > limit:
             lines.append(f"({len(found) - limit} more; raise limit, or add words)")

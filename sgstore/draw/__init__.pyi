@@ -13,7 +13,9 @@ from ._stored import camera_of as camera_of
 from ._stored import draw_clip as draw_clip
 from ._stored import draw_stored as draw_stored
 from ._stored import frame_image as frame_image
+from ._stored import graph_picture as graph_picture
 from ._stored import range_of as range_of
+from ._stored import thumbnail as thumbnail
 from ._swimlanes import LETTERS as LETTERS
 from ._swimlanes import Lane as Lane
 from ._swimlanes import NAME as NAME
@@ -41,7 +43,9 @@ __all__ = [
     "draw_stored",
     "draw_timelines",
     "frame_image",
+    "graph_picture",
     "lines_of",
     "range_of",
+    "thumbnail",
     "timelines",
 ]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import re
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
     from sgstore.graph import SceneGraph
     from sgstore.query import Store
     from sgstore.roads import RoadMap
-    from sgstore.store import FrameRef
+    from sgstore.store import FrameRef, StoreFile
 
 
 DPI: Final = 85.0
@@ -329,7 +330,11 @@ def _chosen(store: Store, frames: FrameRange, fps: float) -> list[FrameRef]:
 
 def map_of(store: Store, trace: str) -> RoadMap | None:
     """The road map of a trace of a store; ``None`` if it has none."""
-    found = store.file.road_map_text(trace)
+    return _map_in(store.file, trace)
+
+
+def _map_in(file: StoreFile, trace: str) -> RoadMap | None:
+    found = file.road_map_text(trace)
     return read_map(found[1], found[0]) if found else None
 
 
@@ -353,7 +358,11 @@ def _picture(store: Store, frame: FrameRef, camera: str | None) -> bytes | None:
 
 def camera_of(store: Store, trace: str) -> str:
     """The first channel that carries pictures; empty if none does."""
-    topics = (c.topic for c in store.file.channels(trace) if c.schema.endswith("CompressedImage"))
+    return _camera_in(store.file, trace)
+
+
+def _camera_in(file: StoreFile, trace: str) -> str:
+    topics = (c.topic for c in file.channels(trace) if c.schema.endswith("CompressedImage"))
     return min(topics, default="")
 
 
@@ -404,3 +413,54 @@ def frame_image(store: Store, frame: int | str, matches: Bindings | None, **look
         image = Image.open(file)
         image.load()
     return image
+
+
+THUMBNAIL: Final = 180
+"""Longest side of a small picture; pixels."""
+
+
+def thumbnail(file: StoreFile, frame: FrameRef, side: int = THUMBNAIL) -> bytes:
+    """A small picture of a frame, as JPEG: what a camera saw, or, without one, the frame from above.
+
+    Raises
+    ------
+    StoreError, TraceError, ExportError
+        The frame, or its recording, is gone, or the picture cannot be read.
+    MissingExtraError
+        The packages for drawing are not installed.
+    """
+    check_installed()
+    from PIL import Image
+
+    topic = _camera_in(file, frame.trace)
+    data = b""
+    if topic:
+        with suppress(
+            StoreError
+        ):  # cameras are slower than frames: none of their pictures may belong to it
+            media = file.carried(frame.frame_id, topic)
+            data = media.data if media.form in _PICTURES else b""
+    if not data:
+        data = graph_picture(file.graph(frame.frame_id), _map_in(file, frame.trace))
+    try:
+        image = Image.open(io.BytesIO(data)).convert("RGB")
+    except (OSError, SyntaxError, ValueError) as error:
+        raise ExportError(f"{topic}: the picture cannot be read: {error}") from error
+    image.thumbnail((side, side))
+    small = io.BytesIO()
+    image.save(small, "JPEG", quality=85)
+    return small.getvalue()
+
+
+def graph_picture(graph: SceneGraph, road_map: RoadMap | None = None, **look: Any) -> bytes:
+    """A graph from above, as PNG; ``**look`` is that of :func:`sgstore.draw.draw_frame`.
+
+    Raises
+    ------
+    MissingExtraError
+        The packages for drawing are not installed.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "graph.png"
+        draw_frame(graph, road_map, file, **look)
+        return file.read_bytes()

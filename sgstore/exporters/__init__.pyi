@@ -2,6 +2,7 @@
 
 from ._clips import WrittenClip as WrittenClip
 from ._clips import WrittenFile as WrittenFile
+from ._frames import cloud_of as cloud_of
 from ._labels import FEW as FEW
 from ._labels import ClipFrames as ClipFrames
 from ._labels import Export as Export
@@ -34,6 +35,7 @@ __all__ = [
     "WrittenClip",
     "WrittenFile",
     "around_frames",
+    "cloud_of",
     "exporter_named",
     "exporters",
     "graphs_of",

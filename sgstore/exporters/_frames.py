@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     from sgstore.exporters._labels import ClipFrames, Export
     from sgstore.mcap import Messages, Recording
-    from sgstore.store import StoredTrace
+    from sgstore.store import StoredTrace, StoreFile
 
 
 WINDOW: Final = 2400
@@ -514,6 +514,31 @@ def sensor_of(channel: Channel, schema: Schema | None) -> Callable[[bytes], Sens
         return None if record is None else _of_record(record)
 
     return sensed
+
+
+def cloud_of(file: StoreFile, frame: int | str, channel: str) -> NDArray[Any]:
+    """The points in the message of a channel that belongs to a frame.
+
+    Returns
+    -------
+    (N,) structured array
+        A field for each number that the message has of a point, as it calls them; little endian.
+
+    Raises
+    ------
+    StoreError
+        There is no such frame or channel, or no message of the channel belongs to the frame.
+    TraceError
+        The recording is gone, was replaced, or is damaged there.
+    ExportError
+        The message holds no points.
+    """
+    known, schema, data = file.recorded(frame, channel)
+    found = sensor_of(known, schema)(data)
+    if found is None or found.holds != "cloud":
+        held = "" if found is None else f", but a {found.holds}"
+        raise ExportError(f"{channel}: the message holds no points{held}")
+    return found.data
 
 
 def _of_record(record: Record) -> Sensed | None:

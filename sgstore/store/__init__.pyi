@@ -27,6 +27,7 @@ from ._rebuild import remains_of as remains_of
 from ._rebuild import take_place as take_place
 from ._rows import Batches as Batches
 from ._rows import Given as Given
+from ._rows import IN_NOTEBOOK as IN_NOTEBOOK
 from ._rows import GivenTable as GivenTable
 from ._rows import ParquetTable as ParquetTable
 from ._rows import Rows as Rows
@@ -57,6 +58,7 @@ __all__ = [
     "FrameRef",
     "Given",
     "GivenTable",
+    "IN_NOTEBOOK",
     "Identity",
     "Mark",
     "MessagePlaces",

@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
     from duckdb import DuckDBPyConnection
+    from mcap.records import Channel as McapChannel
+    from mcap.records import Schema
     from numpy.typing import NDArray
 
     from sgstore.config import Config
@@ -511,6 +513,19 @@ class StoreFile:
 
         path, channel_id, place = self._payload_place(ref, channel)
         return read_carried(path, channel=channel_id, **place)
+
+    def recorded(self, ref: int | str, channel: str) -> tuple[McapChannel, Schema | None, bytes]:
+        """The message of a channel that belongs to a frame, with its definitions in the recording.
+
+        Parameters and errors are those of :meth:`payload`.
+        """
+        from sgstore.readers import open_recording, read_message
+
+        path, channel_id, place = self._payload_place(ref, channel)
+        data = read_message(path, **place)
+        with open_recording(path) as recording:
+            known = recording.channels[channel_id]
+            return known, recording.schemas.get(known.schema_id), data
 
     def _payload_place(self, ref: int | str, channel: str) -> tuple[Path, int, dict[str, int]]:
         """Recording, channel's id and place of the message that belongs to a frame."""

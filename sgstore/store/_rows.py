@@ -19,9 +19,15 @@ import duckdb
 
 from sgstore.arrays import np
 from sgstore.errors import ExportError, MissingExtraError, SqlError
-from sgstore.files import without_controls, working_folder, written_at, written_text
+from sgstore.files import (
+    temporary_folder,
+    without_controls,
+    working_folder,
+    written_at,
+    written_text,
+)
 from sgstore.quoting import literal, quoted
-from sgstore.store._locking import EngineError, engine_fault, spill_fault
+from sgstore.store._locking import EngineError, default_memory, engine_fault, spill_fault
 from sgstore.store._schema import INSIDE
 from sgstore.store._steps import interruptible
 
@@ -42,6 +48,9 @@ T = TypeVar("T")
 
 BATCH: Final = 10_000
 """Rows of a batch."""
+
+IN_NOTEBOOK: Final = 20
+"""Rows that a notebook shows of an answer."""
 
 MAX_SQL: Final = 1 << 20
 """Longest statement of a user; characters."""
@@ -140,6 +149,35 @@ class Tabular:
         """
         return write_csv(self._described()[0], self, Path(path))
 
+    def relation(self) -> duckdb.DuckDBPyRelation:
+        """All rows as a relation of DuckDB, to go on from: filter, join, aggregate, plot.
+
+        ::
+
+            gaps = store.find("MATCH (e:Ego), (v:Vehicle) RETURN v.kind AS kind, gap(e, v) AS metres")
+            gaps.relation().filter("metres < 5").aggregate("kind, count(*) AS often").df()
+
+        The rows are asked for once and copied into a database of their own, in memory or, where that does not
+        suffice, on disk; what is built on them is worked out when it is fetched. The store is not held.
+
+        Returns
+        -------
+        duckdb.DuckDBPyRelation
+            It is called ``answer`` in its own database.
+
+        Raises
+        ------
+        ExportError
+            There is no room for them.
+        """
+        with working_folder("relation") as folder:
+            file = folder / "answer.parquet"
+            self.parquet(file)
+            spill, memory = temporary_folder() / "relations", f"{default_memory() >> 20}MiB"
+            held = duckdb.connect(config={"temp_directory": str(spill), "memory_limit": memory})
+            held.execute(f"CREATE TABLE answer AS FROM read_parquet({literal(str(file))})")
+        return held.table("answer")
+
 
 class Rows(Tabular):
     """The result of a statement.
@@ -176,6 +214,14 @@ class Rows(Tabular):
     def __repr__(self) -> str:
         more = " and more" * self.truncated
         return f"<{len(self):,} rows{more} of {', '.join(self.columns)}>"
+
+    def _repr_html_(self) -> str:
+        """The first rows as a table, for notebooks."""
+        from sgstore.display import html_table
+
+        some = self._values[:IN_NOTEBOOK]
+        more = self.truncated or len(self._values) > len(some)
+        return html_table(self.columns, some, below=f"the first {len(some)} rows" if more else "")
 
     def __len__(self) -> int:
         return len(self.values)

@@ -5,8 +5,10 @@ A trace that lacks what a check needs has the verdict ``unknown``, with the reas
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from heapq import merge
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -19,6 +21,7 @@ from sgstore.lang import (
     traces_of,
 )
 from sgstore.matches import Interval, notes_in
+from sgstore.store import IN_NOTEBOOK
 from sgstore.temporal._formula import Formula, formula_text, tolerant
 from sgstore.temporal._matches import lacking
 from sgstore.temporal._offline import PlanValues, TraceReader, refuse_many, traces
@@ -264,6 +267,16 @@ class Verdict:
         why = f", {self.reason}" if self.reason else ""
         return f"<Verdict {self.check!r} of {self.trace!r}: {self.verdict}{more}{why}>"
 
+    def _repr_html_(self) -> str:
+        """The verdict with its violations as a table, for notebooks."""
+        from sgstore.display import html_table
+
+        margin = self.robustness is not None
+        rows = list(islice(verdict_rows(self, margin=margin), IN_NOTEBOOK + 1))
+        more = f"the first {IN_NOTEBOOK} rows" if len(rows) > IN_NOTEBOOK else ""
+        below = "; ".join(filter(None, [self.reason, more]))
+        return html_table(verdict_columns(margin=margin), rows[:IN_NOTEBOOK], below=below)
+
     @property
     def first_violation(self) -> Interval | None:
         """The first violation; ``None``: there is none."""
@@ -407,6 +420,22 @@ class CheckRun:
 
     def __repr__(self) -> str:
         return f"<CheckRun of {', '.join(self.names)}>"
+
+    def _repr_html_(self) -> str:
+        """The verdicts and the first violations as a table, for notebooks: the checks are asked."""
+        from sgstore.display import html_table
+
+        found = list(self)
+        words = Counter(one.verdict for one in found)
+        caption = ", ".join(f"{number} {word}" for word, number in words.items()) or "no trace"
+        margin = self.quantitative
+        every = (row for one in found for row in verdict_rows(one, margin=margin))
+        rows = list(islice(every, IN_NOTEBOOK + 1))
+        notes = unknown_notes((one.check, one.trace, one.reason) for one in found)
+        notes += [f"the first {IN_NOTEBOOK} rows"] if len(rows) > IN_NOTEBOOK else []
+        return html_table(
+            verdict_columns(margin=margin), rows[:IN_NOTEBOOK], caption, "; ".join(notes)
+        )
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -1,0 +1,82 @@
+"""Tables and pictures as HTML, for notebooks.
+
+Texts of recordings are escaped: none of them becomes a tag, a style or a script of the page.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from html import escape
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+LONGEST: Final = 200
+"""Characters of one value."""
+
+_CELL: Final = "text-align:{align};padding:0.15em 0.8em;white-space:pre-wrap"
+
+
+def cell(value: Any, longest: int = LONGEST) -> str:
+    """A value on one line, no longer than so many characters."""
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return f"{value:.6g}" if math.isfinite(value) else str(value)
+    text = json.dumps(value, ensure_ascii=False) if isinstance(value, list | dict) else str(value)
+    text = "".join(c if c.isprintable() else "�" for c in " ".join(text.split()))
+    return text if len(text) <= longest else f"{text[: longest - 1]}…"
+
+
+def html_table(
+    columns: Sequence[str], rows: Iterable[Sequence[Any]], caption: str = "", below: str = ""
+) -> str:
+    """A table of HTML, with a text above it and one below.
+
+    Parameters
+    ----------
+    columns : sequence of str
+    rows : iterable of sequences
+        Plain values; numbers stand to the right.
+    caption, below : str
+        Plain texts; empty: none.
+    """
+    lines = [f"<p style='margin:0.3em 0'>{escape(caption)}</p>"] if caption else []
+    if columns:
+        head = "".join(_html_cell("th", name) for name in columns)
+        body = "".join(f"<tr>{''.join(_html_cell('td', v) for v in row)}</tr>" for row in rows)
+        lines.append(f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
+    lines += [f"<p style='margin:0.3em 0'>{escape(below)}</p>"] if below else []
+    return f"<div>{''.join(lines)}</div>"
+
+
+def _html_cell(tag: str, value: Any) -> str:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    style = _CELL.format(align="right" if number else "left")
+    return f"<{tag} style='{style}'>{escape(cell(value))}</{tag}>"
+
+
+def html_media(data: bytes, kind: str, text: str = "") -> str:
+    """A picture or a video that the page holds itself, with a text below.
+
+    Parameters
+    ----------
+    data : bytes
+        The content of a file.
+    kind : str
+        ``image/png``, ``video/mp4``, …
+    text : str
+        Plain text; empty: none.
+    """
+    source = f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
+    shown = f"<img src='{source}' alt='{escape(text, quote=True)}'>"
+    if kind.startswith("video/"):
+        shown = f"<video src='{source}' controls loop muted></video>"
+    said = f"<figcaption>{escape(text)}</figcaption>" if text else ""
+    style = "display:inline-block;margin:0.3em 0.6em 0.3em 0"
+    return f"<figure style='{style}'>{shown}{said}</figure>"
