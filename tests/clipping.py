@@ -31,7 +31,12 @@ def source(path: Path) -> Source:
 
 
 def write_clips(
-    clips: Sequence[Clip], sources: Mapping[str, Source], to: Path, **provenance: str
+    clips: Sequence[Clip],
+    sources: Mapping[str, Source],
+    to: Path,
+    *,
+    rebased: bool = False,
+    **provenance: str,
 ) -> list[Any]:
     """Cut clips out of recordings, by the name of their trace."""
     file = SimpleNamespace(
@@ -40,4 +45,5 @@ def write_clips(
         snapshot=nullcontext,
     )
     store: Any = SimpleNamespace(file=file)
-    return write_export(Export(store, tuple(clips), provenance=provenance), to)
+    order = Export(store, tuple(clips), rebase_context=rebased, provenance=provenance)
+    return write_export(order, to)

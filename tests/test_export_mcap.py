@@ -120,6 +120,37 @@ def test_a_clip_brings_the_map_and_static_data_from_before_its_start(tmp_path: P
     assert messages(clip)[: len(carried)] == carried
 
 
+def test_what_is_carried_in_may_stand_right_beside_the_clip(tmp_path: Path) -> None:
+    path = drive(tmp_path / "drive.mcap", frames=300, chunk_size=3000)
+    (plain,) = cut(path, tmp_path / "plain", (20.0, 21.0))
+    (clip,) = cut(path, tmp_path / "out", (20.0, 21.0), rebased=True)
+    before, after = messages(plain), messages(clip)
+    inside = [m for m in after if ns(20.0) <= m[1] <= ns(21.0)]
+
+    # The same bytes, channels, sequence numbers and times of publication; log times within 1 ns of the clip.
+    assert sorted((m[0], *m[2:]) for m in after) == sorted((m[0], *m[2:]) for m in before)
+    assert inside == [m for m in before if ns(20.0) <= m[1] <= ns(21.0)]
+    assert len(after) > len(inside)
+    start, end = (
+        getattr(summary(clip).statistics, f"message_{name}_time") for name in ("start", "end")
+    )
+    assert ns(21.0) - ns(20.0) <= end - start < ns(1.01)
+    assert frames(clip) == frames(plain)
+
+
+def test_what_is_carried_in_from_behind_stands_behind(tmp_path: Path) -> None:
+    path = tmp_path / "drive.mcap"
+    with Recorder(path, chunk_size=300) as recorder:
+        for i in range(20):
+            recorder.ground_truth(i * 0.1, [car(1)], host=1)
+        recorder.map("<OpenDRIVE/>", 30.0)
+
+    (clip,) = cut(path, tmp_path / "out", (0.5, 1.0), rebased=True)
+
+    assert messages(clip)[-1][0] == "map"
+    assert ns(1.0) < messages(clip)[-1][1] < ns(1.01)
+
+
 def test_a_calibration_told_once_is_brought_and_a_later_event_is_not(tmp_path: Path) -> None:
     path = tmp_path / "drive.mcap"
     with Recorder(path, chunk_size=300) as recorder:

@@ -231,6 +231,7 @@ def test_options_that_a_format_does_not_mind_are_refused(
     ways = {
         "abstraction": "RSV",
         "with_graph": True,
+        "rebase_context": True,
         "channels": ("/ego/lidar/points",),
         "clouds": "npy",
     }

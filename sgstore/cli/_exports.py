@@ -64,6 +64,14 @@ class ClipOptions:
             help=f"{_formats('with_graph')}: with the scene graphs, as JSON and to draw.",
         ),
     ] = False
+    rebase_context: Annotated[
+        bool,
+        Option(
+            "--rebase-context",
+            help=f"{_formats('rebase_context')}: put the map and the like, which stand before a clip,"
+            " right beside it.",
+        ),
+    ] = False
     abstraction: Annotated[
         str,
         Option("--abstraction", help=f"{_formats('abstraction')}: abstraction of the graphs."),
@@ -133,6 +141,7 @@ def export(
             tuple(clips),
             abstraction=clip.abstraction,
             with_graph=clip.with_graph,
+            rebase_context=clip.rebase_context,
             channels=tuple(clip.channels or ()),
             clouds=clip.clouds,
             provenance=({"query": text} if text else {"lock": lock.name} if lock else {}),

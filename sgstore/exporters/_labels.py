@@ -217,6 +217,8 @@ class Export:
         What the graphs are seen as; empty: as the format has it by itself.
     with_graph : bool
         Whether clips of recordings bring the scene graphs with them.
+    rebase_context : bool
+        Whether messages from outside a clip, which later ones depend on, get log times at its ends.
     channels : tuple of str
         Topics of the sensors that are wanted; empty: all.
     clouds : str
@@ -232,6 +234,7 @@ class Export:
     labels: Labels | None = None
     abstraction: str = ""
     with_graph: bool = False
+    rebase_context: bool = False
     channels: tuple[str, ...] = ()
     clouds: str = "pcd"
     provenance: Mapping[str, str] = field(default_factory=dict[str, str])

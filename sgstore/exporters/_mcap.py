@@ -4,7 +4,8 @@ A clip has the schemas, channels, metadata and attachments of its source, and it
 bytes, times and sequence numbers; ids of schemas and channels are numbered anew. Messages that later ones
 depend on (the map, static data that was told only once) are carried in from before its start. The metadata
 record ``sgstore.clip`` says which interval the clip is, so that a reader takes them for context and not for
-frames. The same clip of the same source is the same bytes.
+frames. With ``rebase_context`` they stand a nanosecond beside it, at log times of their own, so that players do
+not show the time between. The same clip of the same source is the same bytes.
 
 A recording is read once as a whole, to see where everything is, and then once for each of its clips,
 only where that clip is; no more than one chunk, or one attachment, of it is in memory.
@@ -72,7 +73,14 @@ def write(export: Export, folder: Path) -> list[WrittenClip]:
             source = _survey(recording, trace, export.store.file.context(name))
             for number, clip in enumerate(export.clips, 1):
                 if clip.trace == name:
-                    cutting = _Cutting(recording, source, clip, dict(export.provenance), added)
+                    cutting = _Cutting(
+                        recording,
+                        source,
+                        clip,
+                        dict(export.provenance),
+                        added,
+                        rebased=export.rebase_context,
+                    )
                     file = folder / clip_name(name, number, ".mcap")
                     written[number] = cutting.write(file, number)
                     export.tell(len(written), len(export.clips))
@@ -150,7 +158,10 @@ class _Cutting:
         clip: Clip,
         told: dict[str, str],
         added: Added | None,
+        *,
+        rebased: bool = False,
     ) -> None:
+        self._rebased = rebased
         self._recording = recording
         self._source = source
         self._clip = clip
@@ -316,7 +327,11 @@ class _Cutting:
                 if channel not in self._kept or (behind and self._counts[channel]):
                     continue
                 self._carried += bool(carried[row])
-                times = int(time[row]), int(run.publish_time_ns[row])
+                log_time = int(time[row])
+                if carried[row] and self._rebased:
+                    # A nanosecond beside the clip: so whoever reads it still takes it for context.
+                    log_time = reach.end_ns + 1 if behind else reach.start_ns - 1
+                times = log_time, int(run.publish_time_ns[row])
                 yield (channel, int(run.sequence[row]), *times, run.data(row))
 
 

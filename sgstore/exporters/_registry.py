@@ -46,7 +46,8 @@ class Exporter:
     write : callable
         See :class:`Write`.
     options : frozenset of str
-        Which of ``abstraction``, ``with_graph``, ``channels`` and ``clouds`` of an export it minds.
+        Which options of an :class:`Export` it minds: ``abstraction``, ``with_graph``, ``rebase_context``,
+        ``channels``, ``clouds``.
     """
 
     name: str
@@ -65,7 +66,7 @@ def _of(module: str, *options: str) -> Exporter:
 
 
 EXPORTERS: Final = (
-    _of("mcap", "with_graph"),
+    _of("mcap", "with_graph", "rebase_context"),
     _of("parquet"),
     _of("frames", "channels", "clouds"),
     _of("nx", "abstraction"),

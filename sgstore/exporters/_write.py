@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 OPTIONS: Final = {
     "abstraction": "abstraction",
     "with_graph": "with-graph",
+    "rebase_context": "rebase-context",
     "channels": "channel",
     "clouds": "clouds",
 }
