@@ -604,3 +604,31 @@ def test_messages_that_are_hurt_at_random_are_read_or_refused() -> None:
                     cloud_file(found.data, form) is not None for form in ("pcd", "npy", "bin")
                 )
     assert outcomes >= {"refused", "picture", "cloud"}
+
+
+# Colours of scenes in a viewer ----------------------------------------------------------------------
+
+
+def luminance(colour: tuple[float, ...]) -> float:
+    """Relative luminance of sRGB. (WCAG 2.2.)"""
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in colour[:3]]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def contrast(colour: tuple[float, ...], ground: float) -> float:
+    """Contrast ratio of a colour, as far as it covers, to a grey ground."""
+    seen = [c * colour[3] + ground * (1 - colour[3]) for c in colour[:3]]
+    low, high = sorted((luminance((*seen,)), luminance((ground,) * 3)))
+    return (high + 0.05) / (low + 0.05)
+
+
+@pytest.mark.parametrize("ground", [0.0, 1.0], ids=["black", "white"])
+def test_a_scene_reads_on_light_and_on_dark(ground: float) -> None:
+    solid = [foxglove.EGO_COLOUR, foxglove.OTHERS]
+    solid += [*foxglove.COLOURS.values(), *foxglove.LIGHTS.values()]
+    edges = [*foxglove.RELATION_COLOURS.values(), foxglove.OTHER_RELATIONS]
+
+    assert contrast(foxglove.TEXT_COLOUR, ground) >= 4.5
+    assert min(contrast(one, ground) for one in solid) >= 3
+    assert min(contrast(one, ground) for one in edges) >= 1.5
+    assert contrast(foxglove.RELATION_COLOURS["overlaps"], ground) >= 3

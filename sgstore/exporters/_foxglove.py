@@ -195,30 +195,36 @@ _ALL, _LINE_LIST = 1, 2
 
 Colour = tuple[float, float, float, float]
 
-EGO_COLOUR: Final[Colour] = (0.1, 0.45, 0.95, 0.9)
+# Viewers have a white or a black ground. Each colour has a contrast of at least 3 to both, those of faint edges
+# of 1.5, of texts of 4.5. (WCAG 2.2, relative luminance and contrast ratio, 1.4.3 and 1.4.11.)
+EGO_COLOUR: Final[Colour] = (0.1, 0.45, 0.95, 1.0)
+TEXT_COLOUR: Final[Colour] = (0.46, 0.46, 0.46, 1.0)
 COLOURS: Final[dict[str, Colour]] = {
-    **dict.fromkeys(("person", "animal"), (0.95, 0.45, 0.1, 0.9)),
-    **dict.fromkeys(("bicycle", "motorcycle"), (0.95, 0.75, 0.1, 0.9)),
+    **dict.fromkeys(("person", "animal"), (0.9, 0.42, 0.08, 1.0)),
+    **dict.fromkeys(("bicycle", "motorcycle"), (0.7, 0.5, 0.05, 1.0)),
     **dict.fromkeys(
-        ("car", "truck", "van", "bus", "trailer", "train", "vehicle"), (0.45, 0.5, 0.55, 0.9)
+        ("car", "truck", "van", "bus", "trailer", "train", "vehicle"), (0.45, 0.5, 0.55, 1.0)
     ),
-    **dict.fromkeys(("lane", "road", "junction", "crosswalk"), (0.6, 0.6, 0.6, 0.6)),
+    **dict.fromkeys(("lane", "road", "junction", "crosswalk"), (0.5, 0.5, 0.5, 1.0)),
 }
 LIGHTS: Final[dict[str, Colour]] = {
     "red": (0.9, 0.1, 0.1, 1.0),
-    "yellow": (0.95, 0.8, 0.1, 1.0),
-    "red_yellow": (0.95, 0.5, 0.1, 1.0),
-    "green": (0.1, 0.7, 0.2, 1.0),
+    "yellow": (0.74, 0.54, 0.0, 1.0),
+    "red_yellow": (0.88, 0.42, 0.05, 1.0),
+    "green": (0.08, 0.62, 0.18, 1.0),
 }
-OTHERS: Final[Colour] = (0.7, 0.7, 0.65, 0.5)
+OTHERS: Final[Colour] = (0.52, 0.52, 0.48, 1.0)
 RELATION_COLOURS: Final[dict[str, Colour]] = {
-    **dict.fromkeys(DIRECTIONS, (0.3, 0.5, 0.9, 0.35)),
-    **{name: (0.9, 0.15 + 0.13 * i, 0.1, 0.9 - 0.12 * i) for i, name in enumerate(PROXIMITY)},
-    **dict.fromkeys(("toLeftOf", "toRightOf"), (0.5, 0.4, 0.8, 0.35)),
-    **dict.fromkeys(("leads", "follows"), (0.1, 0.65, 0.6, 0.9)),
-    **dict.fromkeys(("controlsTrafficOf", "mayAffect"), (0.8, 0.2, 0.6, 0.8)),
+    **dict.fromkeys(DIRECTIONS, (0.3, 0.5, 0.9, 0.45)),
+    **{
+        name: (0.9 - 0.04 * i, 0.15 + 0.07 * i, 0.1, 0.95 - 0.1 * i)
+        for i, name in enumerate(PROXIMITY)
+    },
+    **dict.fromkeys(("toLeftOf", "toRightOf"), (0.5, 0.4, 0.8, 0.5)),
+    **dict.fromkeys(("leads", "follows"), (0.08, 0.55, 0.52, 1.0)),
+    **dict.fromkeys(("controlsTrafficOf", "mayAffect"), (0.8, 0.2, 0.6, 1.0)),
     "overlaps": (1.0, 0.0, 0.0, 1.0),
-    "sees": (0.2, 0.7, 0.2, 0.4),
+    "sees": (0.2, 0.62, 0.2, 0.5),
 }
 OTHER_RELATIONS: Final[Colour] = (0.55, 0.55, 0.55, 0.5)
 
@@ -287,7 +293,7 @@ def _add_node(
         name.pose.position.x, name.pose.position.y = place[:2]
         name.pose.position.z = place[2] + about.get("height", 0.0) / 2 + DOT
         name.pose.orientation.w = 1.0
-        _paint(name.color, (1.0, 1.0, 1.0, 1.0))
+        _paint(name.color, TEXT_COLOUR)
 
 
 def _place(about: dict[str, Any]) -> tuple[float, float, float] | None:
