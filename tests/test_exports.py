@@ -232,6 +232,7 @@ def test_options_that_a_format_does_not_mind_are_refused(
         "abstraction": "RSV",
         "with_graph": True,
         "rebase_context": True,
+        "graphml": True,
         "channels": ("/ego/lidar/points",),
         "clouds": "npy",
     }
@@ -526,7 +527,7 @@ def test_parquet_has_labels_lanes_and_gaps(export: Export, written: Callable[...
 def test_networkx_reads_the_graphs_of_the_store(
     export: Export, written: Callable[..., Path]
 ) -> None:
-    folder = written("nx")
+    folder = written("nx", graphml=True)
     lines = (folder / "town_001.jsonl").read_text().splitlines()
     ids = [frame_id for clip, frame_id in frames_in(export) if clip == 1]
 
@@ -544,6 +545,12 @@ def test_networkx_reads_the_graphs_of_the_store(
         assert set(drawn.edges(keys=True)) == set(graph.edges(keys=True))
         assert drawn.nodes[0]["kind"] == graph.nodes[0]["kind"]
         assert drawn.graph["label_kmh"] == pytest.approx(graph.graph["label_kmh"])
+
+
+def test_graphml_is_written_where_it_is_asked_for(written: Callable[..., Path]) -> None:
+    assert not [*written("nx").rglob("*.graphml")]
+    with pytest.raises(ExportError, match="--graphml is not for the format 'parquet'"):
+        written("parquet", graphml=True)
 
 
 def test_networkx_reads_graphs_as_an_abstraction_has_them(

@@ -76,6 +76,10 @@ class ClipOptions:
         str,
         Option("--abstraction", help=f"{_formats('abstraction')}: abstraction of the graphs."),
     ] = ""
+    graphml: Annotated[
+        bool,
+        Option("--graphml", help=f"{_formats('graphml')}: each frame as GraphML, too, for Gephi."),
+    ] = False
     channels: Annotated[
         list[str] | None,
         Option(
@@ -142,6 +146,7 @@ def export(
             abstraction=clip.abstraction,
             with_graph=clip.with_graph,
             rebase_context=clip.rebase_context,
+            graphml=clip.graphml,
             channels=tuple(clip.channels or ()),
             clouds=clip.clouds,
             provenance=({"query": text} if text else {"lock": lock.name} if lock else {}),

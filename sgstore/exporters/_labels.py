@@ -219,6 +219,8 @@ class Export:
         Whether clips of recordings bring the scene graphs with them.
     rebase_context : bool
         Whether messages from outside a clip, which later ones depend on, get log times at its ends.
+    graphml : bool
+        Whether graphs for networkx come as GraphML, too: a file for each frame.
     channels : tuple of str
         Topics of the sensors that are wanted; empty: all.
     clouds : str
@@ -235,6 +237,7 @@ class Export:
     abstraction: str = ""
     with_graph: bool = False
     rebase_context: bool = False
+    graphml: bool = False
     channels: tuple[str, ...] = ()
     clouds: str = "pcd"
     provenance: Mapping[str, str] = field(default_factory=dict[str, str])

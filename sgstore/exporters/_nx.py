@@ -1,10 +1,10 @@
-"""Export for networkx: node-link JSON, a graph a line, and GraphML, a file a frame.
+"""Export for networkx: node-link JSON, a graph a line, and where it is asked for GraphML, a file a frame.
 
-For each clip there are ``CLIP.jsonl``, which ``networkx.node_link_graph(json.loads(line), edges="edges")``
-reads, and a folder ``CLIP`` of ``000123.graphml``, one for each frame, by its number in the trace. A graph's
-attributes say which frame it is, and have its labels as ``label_NAME``; what is not known is left out.
-Without an abstraction nodes are node ids with all that is known of them; with one they are names, with
-``base_class``.
+For each clip there is ``CLIP.jsonl``, which ``networkx.node_link_graph(json.loads(line), edges="edges")``
+reads; with ``graphml`` also a folder ``CLIP`` of ``000123.graphml``, one for each frame, by its number in the
+trace. A graph's attributes say which frame it is, and have its labels as ``label_NAME``; what is not known is
+left out. Without an abstraction nodes are node ids with all that is known of them; with one they are names,
+with ``base_class``.
 
 Graphs are read from the store a window of frames at a time, as :meth:`sgstore.query.Store.graph` reads one.
 """
@@ -52,15 +52,16 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
     for frames in export.frames():
         name = clip_name(frames.clip.trace, frames.number, "")
         lines, drawn = folder / f"{name}.jsonl", folder / name
-        drawn.mkdir()
+        if export.graphml:
+            drawn.mkdir()
         with lines.open("x", encoding="utf-8", newline="\n") as stream:
             for graph in _graphs(export, frames, abstraction):
                 stream.write(_line(graph) + "\n")
-                _write_graphml(graph, drawn / f"{graph.graph['seq']:06d}.graphml")
-        written += [
-            WrittenFile.of(lines, "graphs", len(frames)),
-            WrittenFile.of(drawn, "graphs", len(frames)),
-        ]
+                if export.graphml:
+                    _write_graphml(graph, drawn / f"{graph.graph['seq']:06d}.graphml")
+        written.append(WrittenFile.of(lines, "graphs", len(frames)))
+        if export.graphml:
+            written.append(WrittenFile.of(drawn, "graphs", len(frames)))
         export.tell(frames.number, len(export.clips))
     return written
 

@@ -47,7 +47,7 @@ class Exporter:
         See :class:`Write`.
     options : frozenset of str
         Which options of an :class:`Export` it minds: ``abstraction``, ``with_graph``, ``rebase_context``,
-        ``channels``, ``clouds``.
+        ``graphml``, ``channels``, ``clouds``.
     """
 
     name: str
@@ -69,7 +69,7 @@ EXPORTERS: Final = (
     _of("mcap", "with_graph", "rebase_context"),
     _of("parquet"),
     _of("frames", "channels", "clouds"),
-    _of("nx", "abstraction"),
+    _of("nx", "abstraction", "graphml"),
     _of("pyg", "abstraction"),
     _of("s3c", "abstraction"),
 )

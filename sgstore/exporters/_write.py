@@ -32,6 +32,7 @@ OPTIONS: Final = {
     "abstraction": "abstraction",
     "with_graph": "with-graph",
     "rebase_context": "rebase-context",
+    "graphml": "graphml",
     "channels": "channel",
     "clouds": "clouds",
 }
