@@ -19,32 +19,38 @@ def cells_of(path: Path) -> list[str]:
     return ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
 
 
-def shown(shell: InteractiveShell, result: Any) -> dict[str, Any]:
-    """What a notebook would show of a result, by type; of pictures their beginning."""
-    if result is None:
-        return {}
-    data, _ = shell.display_formatter.format(result)
-    return {
-        kind: value[:400] if isinstance(value, str) else repr(value[:8])
-        for kind, value in data.items()
-    }
+def watched(shell: InteractiveShell) -> dict[str, Any]:
+    """What a notebook would show of the latest result, by type; of pictures and long texts their beginning."""
+    held: dict[str, Any] = {}
+    formats = shell.displayhook.compute_format_data
+
+    def compute(result: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        data, _ = formats(result)
+        held.update(
+            {
+                kind: value[:400] if isinstance(value, str) else repr(value[:8])
+                for kind, value in data.items()
+            }
+        )
+        return {"text/plain": "…"}, {}
+
+    shell.displayhook.compute_format_data = compute
+    return held
 
 
 def main() -> int:
-    sys.displayhook = sys.__displayhook__
     shell = InteractiveShell.instance(history_load_length=0)
     shell.history_manager.enabled = False
     for formatter in shell.display_formatter.formatters.values():
         formatter.enabled = True  # as a notebook has it; a terminal shows plain texts
+    held = watched(shell)
     for number, text in enumerate(cells_of(Path(sys.argv[1]))):
-        done = shell.run_cell(text, store_history=False, silent=True)
+        held.clear()
+        done = shell.run_cell(text, store_history=False)
         error = done.error_before_exec or done.error_in_exec
-        told = {
-            "cell": number,
-            "error": repr(error) if error else "",
-            "shown": shown(shell, done.result),
-        }
+        told = {"cell": number, "error": repr(error) if error else "", "shown": held}
         sys.stdout.write(f"{json.dumps(told)}\n")
+        sys.stdout.flush()
         if error:
             return 1
     return 0
