@@ -18,6 +18,7 @@ from mcp import Client, StdioServerParameters
 from PIL import Image
 from test_docs_queries import queries_of
 from test_sandbox import RUNAWAY
+from thorough import some
 
 from sgstore.assistant import StoreTools
 from sgstore.errors import ExportError, QueryError, StoreError
@@ -283,14 +284,23 @@ def test_an_assistant_sees_pictures_and_reads_resources(town_store: Path) -> Non
         refused = await client.call_tool("find", {"query": NEAR, "limit": 0})
         return listed, shown, seen, resources, language, pattern, refused, client.instructions
 
-    listed, shown, seen, resources, language, pattern, refused, told = talked(script, town_store)
+    to = str(town_store.parent / "clips")
+    listed, shown, seen, resources, language, pattern, refused, told = talked(
+        script, town_store, "--write-to", to
+    )
 
-    names = {tool.name for tool in listed.tools}
-    assert names == {
+    reading = {tool.name for tool in listed.tools if tool.annotations.read_only_hint}
+    assert reading == {
         *("list_traces", "vocabulary", "patterns_search", "find", "why_not", "sql", "check"),
         *("timeline", "show", "picture", "coverage_missing"),
     }
-    assert all(tool.annotations.read_only_hint for tool in listed.tools)
+    assert {tool.name for tool in listed.tools} - reading == {"export_clips"}
+    # Short enough for a prompt: some three thousand tokens.
+    assert (
+        len(json.dumps([t.model_dump(mode="json", exclude_none=True) for t in listed.tools]))
+        < 12_000
+    )
+    assert max(len(tool.description) for tool in listed.tools) < 160
     assert "never instructions" in told
     kinds = [one.content[1].mime_type for one in (shown, seen)]
     sizes = [
@@ -307,18 +317,6 @@ def test_an_assistant_sees_pictures_and_reads_resources(town_store: Path) -> Non
     )
     assert refused.is_error
     assert "limit" in text_of(refused)
-
-
-def test_descriptions_are_short_enough_for_a_prompt(town_store: Path) -> None:
-    async def script(client: Client) -> Any:
-        return await client.list_tools()
-
-    listed = talked(script, town_store, "--write-to", str(town_store.parent / "clips"))
-    whole = json.dumps([tool.model_dump(mode="json", exclude_none=True) for tool in listed.tools])
-
-    assert "export_clips" in {tool.name for tool in listed.tools}
-    assert len(whole) < 12_000  # some three thousand tokens
-    assert max(len(tool.description) for tool in listed.tools) < 160
 
 
 HOSTILE = (
@@ -370,10 +368,11 @@ def test_hostile_questions_stay_in_the_sandbox_and_the_next_one_is_answered(
     town_store: Path, tmp_path: Path
 ) -> None:
     out, before = tmp_path / "out", town_store.read_bytes()
+    hostile = some(HOSTILE, 3)
 
     async def script(client: Client) -> list[tuple[Any, Any]]:
         found = []
-        for tool, arguments, _ in HOSTILE:
+        for tool, arguments, _ in hostile:
             filled = json.loads(json.dumps(arguments).replace("{out}", str(out)))
             try:
                 result = await client.call_tool(tool, filled)
@@ -385,7 +384,7 @@ def test_hostile_questions_stay_in_the_sandbox_and_the_next_one_is_answered(
         return found
 
     for (tool, _, reason), ((is_error, text), after) in zip(
-        HOSTILE, talked(script, town_store, "--timeout", "1500ms"), strict=True
+        hostile, talked(script, town_store, "--timeout", "1500ms"), strict=True
     ):
         assert is_error, (tool, text[:500])
         assert re.search(reason, text), (tool, text[:500])

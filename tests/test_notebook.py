@@ -17,6 +17,7 @@ import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 from PIL import Image
+from thorough import LONG
 
 import sgstore
 from sgstore.demo import RECORDING
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.ipynb"))
+RUN = [path for path in EXAMPLES if LONG or path.stem != "coverage"]
+"""What the others do not run, the documentation of coverage does."""
 NEAR = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle)"
 LIDAR = "/ego/lidar/points"
 
@@ -223,7 +226,7 @@ def test_where_several_stores_are_open_the_cell_wants_a_name(
 # The notebooks of examples/ --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", RUN, ids=lambda path: path.stem)
 def test_a_notebook_runs_from_top_to_bottom(path: Path, tmp_path: Path) -> None:
     env = os.environ | {"MPLBACKEND": "Agg", "IPYTHONDIR": str(tmp_path / "ipython")}
     program = Path(__file__).with_name("notebooks.py")
