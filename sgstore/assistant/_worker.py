@@ -110,7 +110,8 @@ def _find(store: Store, limit: int, query: str, parameters: Mapping[str, Any], f
 
 def _sql(store: Store, limit: int, statement: str) -> Reply:
     rows = store.sql(statement, max_rows=limit)
-    return _listed(rows.columns, rows.values, limit) | {"truncated": rows.truncated}
+    listed = _listed(rows.columns, rows.values, limit, left_out=dict(rows.reasons))
+    return listed | {"truncated": rows.truncated}
 
 
 def _why_not(
