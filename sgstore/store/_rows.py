@@ -19,15 +19,9 @@ import duckdb
 
 from sgstore.arrays import np
 from sgstore.errors import ExportError, MissingExtraError, SqlError
-from sgstore.files import (
-    temporary_folder,
-    without_controls,
-    working_folder,
-    written_at,
-    written_text,
-)
+from sgstore.files import without_controls, working_folder, written_at, written_text
 from sgstore.quoting import literal, quoted
-from sgstore.store._locking import EngineError, default_memory, engine_fault, spill_fault
+from sgstore.store._locking import EngineError, engine_fault, spill_fault
 from sgstore.store._schema import INSIDE
 from sgstore.store._steps import interruptible
 
@@ -158,25 +152,16 @@ class Tabular:
             gaps.relation().filter("metres < 5").aggregate("kind, count(*) AS often").df()
 
         The rows are asked for once and copied into a database of their own, in memory or, where that does not
-        suffice, on disk; what is built on them is worked out when it is fetched. The store is not held.
-
-        Returns
-        -------
-        duckdb.DuckDBPyRelation
-            It is called ``answer`` in its own database.
+        suffice, on disk, as the table ``answer``; what is built on it is worked out when it is fetched.
 
         Raises
         ------
         ExportError
             There is no room for them.
         """
-        with working_folder("relation") as folder:
-            file = folder / "answer.parquet"
-            self.parquet(file)
-            spill, memory = temporary_folder() / "relations", f"{default_memory() >> 20}MiB"
-            held = duckdb.connect(config={"temp_directory": str(spill), "memory_limit": memory})
-            held.execute(f"CREATE TABLE answer AS FROM read_parquet({literal(str(file))})")
-        return held.table("answer")
+        from sgstore.store._relation import relation_of
+
+        return relation_of(self.parquet)
 
 
 class Rows(Tabular):

@@ -1,0 +1,26 @@
+"""Answers as relations of DuckDB, to go on from."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import duckdb
+
+from sgstore.files import temporary_folder, working_folder
+from sgstore.quoting import literal
+from sgstore.store._locking import default_memory
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+
+def relation_of(write: Callable[[Path], object]) -> duckdb.DuckDBPyRelation:
+    """Make the table ``answer`` of what a function writes as Parquet, in a database of its own."""
+    with working_folder("relation") as folder:
+        file = folder / "answer.parquet"
+        write(file)
+        spill, memory = temporary_folder() / "relations", f"{default_memory() >> 20}MiB"
+        held = duckdb.connect(config={"temp_directory": str(spill), "memory_limit": memory})
+        held.execute(f"CREATE TABLE answer AS FROM read_parquet({literal(str(file))})")
+    return held.table("answer")
