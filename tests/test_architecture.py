@@ -172,7 +172,14 @@ def test_faces_name_what_is_there() -> None:
             a.asname or a.name for n in stub.body if isinstance(n, ast.ImportFrom) for a in n.names
         ]
         assert sorted(package.__all__) == sorted(set(told)), name
-        assert [one for one in package.__all__ if not hasattr(package, one)] == []
+        assert [one for one in package.__all__ if not _is_there(package, one)] == []
+
+
+def _is_there(package: object, name: str) -> bool:
+    try:
+        return hasattr(package, name)
+    except ModuleNotFoundError as error:  # of an extra that is not installed here
+        return error.name is not None and error.name.partition(".")[0] in OWNERS
 
 
 def test_files_import_one_another_in_one_direction() -> None:
