@@ -70,7 +70,7 @@ test: $(VENV)/.dev
 # pictures, exports, graphs and simulators of others, plug-ins of other programs, pages of the docs, and parts of the long
 # programs below. A file that is not listed is of the core.
 EDGES := coverage coverage_docs derive derive_using like locks selection selection_docs selection_overlapping prioritize \
-  draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap exports exports_docs timeline \
+  draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap export_viewers exports exports_docs timeline \
   assistant notebook carla_live importing junit lang_sgl pytest_plugin record sample \
   docs_house docs_queries lang_docs packaging views_page \
   fuzz mutants

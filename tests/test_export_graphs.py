@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from sgstore.query import Store
 
 S = 1_000_000_000
-OURS = {"/sgstore/graph", "/sgstore/scene", "/sgstore/labels"}
+OURS = {"/sgstore/graph", "/sgstore/scene", "/sgstore/tf", "/sgstore/labels"}
 
 
 @pytest.fixture(scope="module")
@@ -295,7 +295,7 @@ def test_graphs_in_clips_keep_to_their_own_numbers(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match="leaves no numbers"):
         list(Added(export).definitions({65535: Schema(65535, b"", "", "")}, {}))
     numbers = [one.id for one in Added(export).definitions({4: Schema(4, b"", "", "")}, {})]
-    assert numbers == [5, 1, 6, 2]
+    assert numbers == [5, 1, 6, 2, 7, 3]
 
 
 # The rules of MCAP -----------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from sgstore.exporters import (
     EXPORTERS,
     Export,
     Exporter,
+    Mount,
     WrittenFile,
     exporter_named,
     exporters,
@@ -231,6 +232,7 @@ def test_options_that_a_format_does_not_mind_are_refused(
     ways = {
         "abstraction": "RSV",
         "with_graph": True,
+        "mounts": (Mount("lidar", (0.0, 0.0, 1.75)),),
         "rebase_context": True,
         "graphml": True,
         "channels": ("/ego/lidar/points",),

@@ -28,7 +28,7 @@ from sgstore.exporters import EXPORTERS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from sgstore.exporters import WrittenClip, WrittenFile
+    from sgstore.exporters import Export, WrittenClip, WrittenFile
     from sgstore.matches import Matches
     from sgstore.query import Store
     from sgstore.world import Clip
@@ -64,6 +64,15 @@ class ClipOptions:
             help=f"{_formats('with_graph')}: with the scene graphs, as JSON and to draw.",
         ),
     ] = False
+    mounts: Annotated[
+        list[str] | None,
+        Option(
+            "--mount",
+            metavar="AXES=X,Y,Z[,YAW]",
+            help=f"{_formats('mounts')} with graphs: where a sensor sits on the ego, by the frame_id of its"
+            " messages; m, degrees; repeatable.",
+        ),
+    ] = None
     rebase_context: Annotated[
         bool,
         Option(
@@ -92,6 +101,23 @@ class ClipOptions:
         Literal["pcd", "npy", "bin"],
         Option("--clouds", help=f"{_formats('clouds')}: format of point clouds."),
     ] = "pcd"
+
+    def order(self, store: Store, clips: Sequence[Clip], **about: Any) -> Export:
+        """Make the export that they ask for."""
+        from sgstore.exporters import Export, parse_mounts
+
+        return Export(
+            store,
+            tuple(clips),
+            abstraction=self.abstraction,
+            with_graph=self.with_graph,
+            mounts=parse_mounts(self.mounts or ()),
+            rebase_context=self.rebase_context,
+            graphml=self.graphml,
+            channels=tuple(self.channels or ()),
+            clouds=self.clouds,
+            **about,
+        )
 
 
 @app.command(rich_help_panel=PANEL)
@@ -123,7 +149,7 @@ def export(
     networkx (nx), PyTorch Geometric (pyg) and S3C (s3c). RETURN CLIPS(-3s, +5s)
     in the query wins over --before and --after.
     """
-    from sgstore.exporters import Export, exporter_named, labelled, parse_labels, write_export
+    from sgstore.exporters import exporter_named, labelled, parse_labels, write_export
 
     exporter_named(form)  # before anything is searched
     texts = parse_labels(clip.labels or [])
@@ -140,18 +166,8 @@ def export(
         say("nothing matches: nothing to export")
         return 0
     with count_bar(to.name or "export", "clips") as progress:
-        order = Export(
-            opened,
-            tuple(clips),
-            abstraction=clip.abstraction,
-            with_graph=clip.with_graph,
-            rebase_context=clip.rebase_context,
-            graphml=clip.graphml,
-            channels=tuple(clip.channels or ()),
-            clouds=clip.clouds,
-            provenance=({"query": text} if text else {"lock": lock.name} if lock else {}),
-            progress=progress,
-        )
+        told = {"query": text} if text else {"lock": lock.name} if lock else {}
+        order = clip.order(opened, clips, provenance=told, progress=progress)
         written = write_export(labelled(order, texts, **values), to, form)
     _write(written, form_of(Format.table, as_json=as_json))
     return LOSS if any(one.losses for one in written) else 0

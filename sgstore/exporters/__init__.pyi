@@ -15,6 +15,8 @@ from ._registry import EXPORTERS as EXPORTERS
 from ._registry import GROUP as GROUP
 from ._registry import Exporter as Exporter
 from ._registry import Write as Write
+from ._transforms import Mount as Mount
+from ._transforms import parse_mounts as parse_mounts
 from ._write import around_frames as around_frames
 from ._registry import exporter_named as exporter_named
 from ._registry import exporters as exporters
@@ -29,6 +31,7 @@ __all__ = [
     "FEW",
     "GROUP",
     "Labels",
+    "Mount",
     "Recorder",
     "Write",
     "Written",
@@ -41,5 +44,6 @@ __all__ = [
     "graphs_of",
     "labelled",
     "parse_labels",
+    "parse_mounts",
     "write_export",
 ]

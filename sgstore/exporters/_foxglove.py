@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
@@ -29,6 +30,8 @@ from sgstore.readers import add_fields, png
 from sgstore.vocabulary import DIRECTIONS, PROXIMITY
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
     import numpy as np
     from numpy.typing import NDArray
 
@@ -67,6 +70,9 @@ _TYPES: Final = {
     " spheres=9:SpherePrimitive* cylinders=10:CylinderPrimitive* lines=11:LinePrimitive*"
     " triangles=12:TriangleListPrimitive* texts=13:TextPrimitive* models=14:ModelPrimitive*",
     "SceneUpdate": "deletions=1:SceneEntityDeletion* entities=2:SceneEntity*",
+    "FrameTransform": "timestamp=1:Timestamp parent_frame_id=2:string child_frame_id=3:string"
+    " translation=4:Vector3 rotation=5:Quaternion",
+    "FrameTransforms": "transforms=1:FrameTransform*",
 }
 """Fields of the messages, ``name=number:type``, with * if repeated; each after those that it needs."""
 _ENUMS: Final = {
@@ -78,7 +84,7 @@ _ENUMS: Final = {
 _NUMERIC_OF: Final = {"f4": 7, "f8": 8, "u4": 5, "i4": 6, "u1": 1}
 
 IMAGE, CALIBRATION, CLOUD = "CompressedImage", "CameraCalibration", "PointCloud"
-SCENE: Final = "SceneUpdate"
+SCENE, TRANSFORMS = "SceneUpdate", "FrameTransforms"
 
 
 def schema(name: str) -> bytes:
@@ -280,8 +286,7 @@ def _add_node(
     solid = node >= 0 and all(about.get(side) for side in ("length", "width", "height"))
     body = entity.cubes.add() if solid else entity.spheres.add()
     body.pose.position.x, body.pose.position.y, body.pose.position.z = place
-    half = math.radians(about.get("heading", 0.0)) / 2
-    body.pose.orientation.z, body.pose.orientation.w = math.sin(half), math.cos(half)
+    _turn(body.pose.orientation, quaternion(*turn_of(about)))
     size = (about["length"], about["width"], about["height"]) if solid else (DOT, DOT, DOT)
     body.size.x, body.size.y, body.size.z = size
     colour = LIGHTS.get(about.get("light_state", ""), COLOURS.get(about["kind"], OTHERS))
@@ -294,6 +299,61 @@ def _add_node(
         name.pose.position.z = place[2] + about.get("height", 0.0) / 2 + DOT
         name.pose.orientation.w = 1.0
         _paint(name.color, TEXT_COLOUR)
+
+
+@dataclass(frozen=True, slots=True)
+class AxesTransform:
+    """The place of axes in others.
+
+    Attributes
+    ----------
+    parent, child : str
+        Names of the axes.
+    place : tuple of float
+        x, y, z of the child's origin in the parent; m.
+    turn : tuple of float
+        Quaternion x, y, z, w.
+    """
+
+    parent: str
+    child: str
+    place: tuple[float, float, float]
+    turn: tuple[float, float, float, float]
+
+
+def transforms(told: Iterable[AxesTransform], log_time_ns: int) -> bytes:
+    """Places of axes at a time, as ``foxglove.FrameTransforms``."""
+    out = message_type(TRANSFORMS)()
+    for one in told:
+        found = out.transforms.add(parent_frame_id=one.parent, child_frame_id=one.child)
+        stamp(found, log_time_ns)
+        found.translation.x, found.translation.y, found.translation.z = one.place
+        _turn(found.rotation, one.turn)
+    return out.SerializeToString(deterministic=True)
+
+
+def turn_of(about: Mapping[str, Any]) -> tuple[float, float, float]:
+    """Heading, pitch and roll of a node; rad. What is not known is 0."""
+    heading, pitch, roll = (
+        math.radians(about.get(angle, 0.0)) for angle in ("heading", "pitch", "roll")
+    )
+    return heading, pitch, roll
+
+
+def quaternion(yaw: float, pitch: float, roll: float) -> tuple[float, float, float, float]:
+    """A turn about z, then about the new y, then about the new x, as x, y, z, w; rad."""
+    cy, cp, cr = (math.cos(angle / 2) for angle in (yaw, pitch, roll))
+    sy, sp, sr = (math.sin(angle / 2) for angle in (yaw, pitch, roll))
+    return (
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    )
+
+
+def _turn(orientation: Any, turn: tuple[float, float, float, float]) -> None:
+    orientation.x, orientation.y, orientation.z, orientation.w = turn
 
 
 def _place(about: dict[str, Any]) -> tuple[float, float, float] | None:

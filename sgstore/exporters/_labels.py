@@ -23,6 +23,7 @@ from sgstore.world import tolerance_ns
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
+    from sgstore.exporters._transforms import Mount
     from sgstore.matches import Matches
     from sgstore.query import Store
     from sgstore.store import StoredTrace
@@ -217,6 +218,8 @@ class Export:
         What the graphs are seen as; empty: as the format has it by itself.
     with_graph : bool
         Whether clips of recordings bring the scene graphs with them.
+    mounts : tuple of Mount
+        Where sensors sit: what clips with graphs tell of it; see :func:`sgstore.exporters.parse_mounts`.
     rebase_context : bool
         Whether messages from outside a clip, which later ones depend on, get log times at its ends.
     graphml : bool
@@ -236,6 +239,7 @@ class Export:
     labels: Labels | None = None
     abstraction: str = ""
     with_graph: bool = False
+    mounts: tuple[Mount, ...] = ()
     rebase_context: bool = False
     graphml: bool = False
     channels: tuple[str, ...] = ()

@@ -31,7 +31,8 @@ from mcap.writer import CompressionType, Writer
 
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import ChannelCount, WrittenClip, clip_name, tool
-from sgstore.exporters._mcap_graphs import Added, is_added
+from sgstore.exporters._layout import LAYOUT, layout
+from sgstore.exporters._mcap_graphs import GRAPH, SCENE, Added, is_added
 from sgstore.mcap import CLIP, HEAD, READ_ERRORS, Loss, McapFile, digest_of
 from sgstore.readers import open_recording
 from sgstore.world import Clip, TraceReport, tolerance_ns
@@ -63,10 +64,14 @@ _DAMAGED: Final = "an attachment has another checksum than it says"
 def write(export: Export, folder: Path) -> list[WrittenClip]:
     """Cut the clips of an export out of their recordings, recording by recording.
 
-    With ``with_graph`` or labels, every clip has channels more: see :mod:`sgstore.exporters._mcap_graphs`.
+    With ``with_graph`` or labels, every clip has channels more: see :mod:`sgstore.exporters._mcap_graphs`. With
+    graphs there is a layout for viewers beside them.
     """
+    if export.mounts and not export.with_graph:
+        raise ExportError("--mount is told in clips with graphs: add --with-graph")
     added = Added(export) if export.with_graph or export.labels is not None else None
     written: dict[int, WrittenClip] = {}
+    ego = ""
     for name in dict.fromkeys(clip.trace for clip in export.clips):
         trace = export.trace(name)
         with open_recording(trace.path) as recording:
@@ -84,6 +89,11 @@ def write(export: Export, folder: Path) -> list[WrittenClip]:
                     file = folder / clip_name(name, number, ".mcap")
                     written[number] = cutting.write(file, number)
                     export.tell(len(written), len(export.clips))
+        ego = ego or (added.transforms.ego if added is not None else "")
+    if export.with_graph:
+        channels = [one for number in sorted(written) for one in written[number].messages]
+        text = layout(channels, scene=SCENE, graph=GRAPH, ego=ego)
+        (folder / LAYOUT).write_text(text, encoding="utf-8", errors="backslashreplace")
     return [written[number] for number in sorted(written)]
 
 

@@ -4,6 +4,7 @@ Channels, each with one message a frame, at the frame's log time:
 
 * ``/sgstore/graph``: the scene graph as JSON (:data:`GRAPH_SCHEMA`), with the labels;
 * ``/sgstore/scene``: the same to be drawn, ``foxglove.SceneUpdate`` in protobuf;
+* ``/sgstore/tf``: where the ego and its sensors are in it, ``foxglove.FrameTransforms`` in protobuf;
 * ``/sgstore/labels``: the labels alone, as JSON, where no graph is wanted.
 
 The metadata of these channels says ``sgstore: derived``: they are made of the recording and no part of it.
@@ -20,6 +21,7 @@ import sgstore.exporters._foxglove as foxglove_scene
 from sgstore.errors import ExportError
 from sgstore.exporters._labels import FEW, ClipFrames
 from sgstore.exporters._nx import graphs_of
+from sgstore.exporters._transforms import FrameTransforms
 from sgstore.readers import DERIVED
 
 if TYPE_CHECKING:
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 
 GRAPH: Final = "/sgstore/graph"
 SCENE: Final = "/sgstore/scene"
+TRANSFORMS: Final = "/sgstore/tf"
 LABELS: Final = "/sgstore/labels"
 
 _LABEL_VALUES: Final[dict[str, Any]] = {
@@ -119,17 +122,22 @@ class Added:
         schema = ("jsonschema", _as_json(LABEL_SCHEMA), "json")
         self._kinds = [(LABELS, "sgstore.Labels", *schema)]
         if export.with_graph:
-            scene = foxglove_scene.schema(foxglove_scene.SCENE)
+            scene, tree = (
+                foxglove_scene.schema(name)
+                for name in (foxglove_scene.SCENE, foxglove_scene.TRANSFORMS)
+            )
             self._kinds = [
                 (GRAPH, "sgstore.SceneGraph", "jsonschema", _as_json(GRAPH_SCHEMA), "json"),
                 (SCENE, "foxglove.SceneUpdate", "protobuf", scene, "protobuf"),
+                (TRANSFORMS, "foxglove.FrameTransforms", "protobuf", tree, "protobuf"),
             ]
+        self.transforms = FrameTransforms((), export.mounts)
         self._first = 0  # the number of the first channel in the clip that is written
 
     def definitions(
         self, schemas: Mapping[int, Schema], channels: Mapping[int, Channel]
     ) -> Iterator[Schema | Channel]:
-        """Schemas and channels, with numbers that a recording does not use.
+        """Schemas and channels of a recording's next clip, with numbers that it does not use.
 
         Raises
         ------
@@ -140,6 +148,9 @@ class Added:
         if max(schema, channel) + len(self._kinds) >= 1 << 16:
             raise ExportError("the recording leaves no numbers for channels of scene graphs")
         self._first = channel + 1
+        own = {channels[number].schema_id for number in channels if not is_added(channels[number])}
+        names = {schemas[number].name for number in own & schemas.keys()}
+        self.transforms = FrameTransforms(names, self._export.mounts)
         for i, (topic, name, form, data, encoding) in enumerate(self._kinds, 1):
             yield Schema(schema + i, data, form, name)
             yield Channel(channel + i, topic, encoding, dict(DERIVED), schema + i)
@@ -175,8 +186,9 @@ class Added:
             yield from ((_as_json(head),) for head in heads)
             return
         for row, graph in enumerate(graphs_of(self._export, frames)):
-            told = _as_json(heads[row] | _graph(graph))
-            yield told, foxglove_scene.message(graph, int(frames.log_time_ns[row]))
+            told, time = _as_json(heads[row] | _graph(graph)), int(frames.log_time_ns[row])
+            where = foxglove_scene.transforms(self.transforms.of(graph), time)
+            yield told, foxglove_scene.message(graph, time), where
 
 
 def _head(frames: ClipFrames, row: int) -> dict[str, Any]:

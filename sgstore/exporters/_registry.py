@@ -46,8 +46,8 @@ class Exporter:
     write : callable
         See :class:`Write`.
     options : frozenset of str
-        Which options of an :class:`Export` it minds: ``abstraction``, ``with_graph``, ``rebase_context``,
-        ``graphml``, ``channels``, ``clouds``.
+        Which options of an :class:`Export` it minds: ``abstraction``, ``with_graph``, ``mounts``,
+        ``rebase_context``, ``graphml``, ``channels``, ``clouds``.
     """
 
     name: str
@@ -66,7 +66,7 @@ def _of(module: str, *options: str) -> Exporter:
 
 
 EXPORTERS: Final = (
-    _of("mcap", "with_graph", "rebase_context"),
+    _of("mcap", "with_graph", "mounts", "rebase_context"),
     _of("parquet"),
     _of("frames", "channels", "clouds"),
     _of("nx", "abstraction", "graphml"),

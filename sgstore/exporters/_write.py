@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 OPTIONS: Final = {
     "abstraction": "abstraction",
     "with_graph": "with-graph",
+    "mounts": "mount",
     "rebase_context": "rebase-context",
     "graphml": "graphml",
     "channels": "channel",
@@ -122,7 +123,10 @@ def write_export(
         clips = [one for one in written if isinstance(one, WrittenClip)]
         files = [one for one in written if isinstance(one, WrittenFile)]
         if clips and not files:
-            content = {"clips": [one.as_dict() for one in clips]}
+            content: dict[str, Any] = {"clips": [one.as_dict() for one in clips]}
+            beside = sorted({*folder.iterdir()} - {one.file for one in clips})
+            if beside:
+                content["files"] = [WrittenFile.of(one, "layout", 1).as_dict() for one in beside]
             write_manifest(folder, "sgstore.clips", content)
         else:
             content = {"form": form, **told.about(), "files": [one.as_dict() for one in files]}
