@@ -5,12 +5,14 @@ from __future__ import annotations
 import ast
 import importlib
 import re
+from fnmatch import filter as fitting
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import networkx
 import pytest
+from check import TESTS, WHOLE, patterns_of
 from slow import SECONDS
 
 if TYPE_CHECKING:
@@ -282,6 +284,17 @@ def test_tests_that_are_called_slow_or_long_are_there() -> None:
 
     assert set(SECONDS) | set(edges) <= set(tests)
     assert sorted(name for name in tests if asking.search(source_of(tests[name]))) == sorted(long)
+
+
+def test_every_file_of_tests_belongs_to_a_room() -> None:
+    tests = {path.stem.removeprefix("test_") for path in Path(__file__).parent.glob("test_*.py")}
+    patterns = [one for room in ROOMS | {*TESTS} for one in patterns_of(room)]
+
+    assert [one for one in WHOLE if one not in tests] == []
+    assert [
+        one for names in TESTS.values() for one in names.split() if not fitting(tests, one)
+    ] == []
+    assert tests - WHOLE - {one for pattern in patterns for one in fitting(tests, pattern)} == set()
 
 
 def test_masks_are_a_secret_of_the_store() -> None:
