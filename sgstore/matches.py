@@ -266,7 +266,7 @@ class Matches(Tabular):
     def _rows(self, *, whole: bool) -> Iterator[Row]:
         with self._compiled() as compiled:
             layout, rows = compiled.layout, self._stream(Compiled.rows, whole=whole)
-            row = _row_type(self.columns)
+            row = row_type(self.columns)
             yield from map(row._make, rows if layout is None else map(layout.row, rows))
 
     def rows(self) -> list[Row]:
@@ -589,7 +589,7 @@ class UnionMatches(Matches):
         return tuple(dict.fromkeys(note for part in self._parts for note in part.notes))
 
     def _rows(self, *, whole: bool) -> Iterator[Row]:
-        row = _row_type(self.columns)
+        row = row_type(self.columns)
         with self._file.snapshot():
             if self.graphs:
                 parts = [part._rows(whole=whole) for part in self._parts]  # noqa: SLF001
@@ -709,7 +709,7 @@ class TooMuchError(QueryError):
 
 
 @lru_cache(maxsize=64)
-def _row_type(columns: tuple[str, ...]) -> Any:
+def row_type(columns: tuple[str, ...]) -> Any:
     """A named tuple for rows of some columns; a column whose name no field can have is named by its number."""
     names = [re.sub(r"\W+", "_", name).strip("_") for name in columns]
     return namedtuple("Row", names, rename=True)  # pyright: ignore[reportUntypedNamedTuple]

@@ -102,6 +102,7 @@ def test_values_come_in_order(windowed: Store, told: str) -> None:
         "RETURN FRAMES, a.name",
         "RETURN FRAMES, a.speed > 1000 AS fast ORDER BY fast",
         "RETURN FRAMES SAMPLE 5 PER trace",
+        "RETURN DISTINCT *",
         "RETURN SUBGRAPHS",
     ],
 )

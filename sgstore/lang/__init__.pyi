@@ -50,6 +50,13 @@ from ._needs import of_check as of_check
 from ._needs import of_query as of_query
 from ._operators import Column as Column
 from ._operators import all_known as all_known
+from ._parts import ClassQuestion as ClassQuestion
+from ._parts import LOG_TIME_COLUMN as LOG_TIME_COLUMN
+from ._parts import PARTS as PARTS
+from ._parts import Parted as Parted
+from ._parts import Pruning as Pruning
+from ._parts import class_questions as class_questions
+from ._parts import parted as parted
 from ._parse import joined as joined
 from ._parse import parse as parse
 from ._patterns import Pattern as Pattern
@@ -88,10 +95,12 @@ __all__ = [
     "Attribute",
     "Binding",
     "CheckInCatalog",
+    "CLASSES_GIVEN",
     "CLOCK",
     "CLOCK_OF_TRACES",
     "CONSTANTS",
     "Catalog",
+    "ClassQuestion",
     "Compared",
     "Compiled",
     "EDGE_ATTRIBUTES",
@@ -103,13 +112,17 @@ __all__ = [
     "FUTURE",
     "FrameView",
     "Gathered",
+    "LOG_TIME_COLUMN",
     "Layout",
     "MOTION",
     "NODE_ATTRIBUTES",
     "NamedPattern",
     "Need",
+    "PARTS",
+    "Parted",
     "Pattern",
     "PatternTable",
+    "Pruning",
     "RelationScope",
     "ScopeSearch",
     "SqlStatement",
@@ -128,6 +141,7 @@ __all__ = [
     "about_frame",
     "bind_checks",
     "bind_query",
+    "class_questions",
     "compared_in_check",
     "compared_in_query",
     "compile_checks",
@@ -146,6 +160,7 @@ __all__ = [
     "of_check",
     "of_query",
     "parse",
+    "parted",
     "pattern_named",
     "pattern_of",
     "pattern_tables",
@@ -161,4 +176,5 @@ __all__ = [
     "why_not",
     "with_places",
 ]
+from ._symbols import CLASSES_GIVEN as CLASSES_GIVEN
 from ._symbols import regex as regex

@@ -211,7 +211,7 @@ def chosen(settings: Sequence[s.Setting], session: Session, catalog: Catalog) ->
             _choose(found, setting, value, session)
         elif name == "ego":
             egos = {trace.ego for trace in catalog.traces if trace.ego}
-            if value not in egos:
+            if value not in egos and not catalog.part:
                 session.unknown("ego", value, setting.span, egos)
             found.ego = value
         elif name == "dataset":

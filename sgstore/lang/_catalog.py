@@ -11,7 +11,7 @@ its constants in ``entity``; a static entity has everything in ``entity``, a par
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import field, replace
 from enum import StrEnum
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
@@ -145,6 +145,8 @@ class Attribute:
         All values that it can have, if they are a closed list.
     enum : str
         The enumeration of the vocabulary that its values are of; empty for all others.
+    given : str
+        The table that tells it where a store is part of a collection: see :attr:`Catalog.part`.
     meaning : str
         For the documentation; with unit.
     table : str
@@ -163,6 +165,7 @@ class Attribute:
     table: str = ""
     traces: tuple[int, ...] = ()
     enum: str = ""
+    given: str = ""
 
     @property
     def kinds(self) -> frozenset[str]:
@@ -687,6 +690,9 @@ class Catalog:
         Traces that do not know what a query needs (:mod:`sgstore.lang._needs`): it leaves them out.
     lacks : dict
         Which traces lack what, as far as it was asked; it is remembered with the catalog.
+    part : bool
+        Whether the store is a part of a collection. Then a dataset, an ego or a derived set that it has not is
+        one that other parts have, and what is counted over all parts is given as a table.
     """
 
     edges: Mapping[Triple, int] = field(default_factory=dict[Triple, int])
@@ -711,9 +717,12 @@ class Catalog:
     lacks: dict[Any, frozenset[int]] = field(
         default_factory=dict[Any, frozenset[int]], compare=False, repr=False
     )
+    part: bool = False
 
     def under(self, abstraction: str) -> Catalog | None:
         """Return the catalog under an abstraction, in any spelling; ``None`` if there is none of that name."""
         wanted = normalize_name(abstraction)
         found = [made for name, made in self.sets.items() if normalize_name(name) == wanted]
+        if not found and self.part:
+            return replace(self, name=abstraction, only=frozenset())
         return found[-1](self) if found else None

@@ -538,6 +538,11 @@ class Compiled:
     finder: Callable[[tuple[Bound, ...], Window | None], ExternalRelation] | None = None
 
     @property
+    def whole(self) -> Query:
+        """As the binder gave it; of one that returns graphs, what rows these are made of."""
+        return self.bound if self.layout is None else Layout.of(self.bound).query
+
+    @property
     def layout(self) -> Layout | None:
         """If it returns graphs: how they are made of its rows."""
         return Layout.of(self.bound) if self.bound.result.form == "subgraphs" else None
@@ -630,15 +635,7 @@ class Compiled:
 
     def told_apart(self) -> Compiled:
         """The query with further columns: the owner of each node that it returns, where no frame tells it."""
-        result = self.query.result
-        if result.names:
-            return self
-        owners = (
-            ReturnColumn(f":owner {place}", results.owner_of(column.value.node))
-            for place, column in enumerate(result.columns)
-            if isinstance(column.value, NodeValue)
-        )
-        result = replace(result, columns=(*result.columns, *owners))
+        result = results.with_owners(self.query.result)
         return replace(self, query=replace(self.query, result=result))
 
     def limited(self, most: int) -> Compiled:
@@ -756,5 +753,6 @@ def _seen(statements: Sequence[object], catalog: Catalog, parameters: Mapping[st
             if normalize_name(setting.name) == "abstraction":
                 seen = replace(catalog.under(name) or catalog, only=seen.only)
             elif normalize_name(setting.name) == "dataset":
-                seen = replace(seen, only=traces_in(name, catalog.traces, catalog.tables))
+                only = traces_in(name, catalog.traces, catalog.tables, part=catalog.part)
+                seen = replace(seen, only=only)
     return seen

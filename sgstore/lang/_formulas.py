@@ -356,6 +356,8 @@ def _looked_up(attribute: Attribute, frame: str) -> str:
     if attribute.unit in {DisplayUnit.weather, DisplayUnit.clock}:
         return _weather_text(column, frame)
     held = f'"k"."abstraction" = {literal(column)}'
+    if attribute.given:
+        return _given_text(attribute, column, frame)
     if attribute.unit is DisplayUnit.seen:
         classes = Select(['"k"."class"'], ['"classes" AS "k"'], [held, '"k"."class" IS NOT NULL'])
         if attribute.table:
@@ -368,6 +370,20 @@ def _looked_up(attribute: Attribute, frame: str) -> str:
     counts.group = ['"k"."class"']
     number = Select(['any_value("n"."frames")'], [nested(counts.text(), "n")])
     number.where = [f'"n"."class" = {_class_text(column, frame)}']
+    return f"({number.text()})"
+
+
+def _given_text(attribute: Attribute, abstraction: str, frame: str) -> str:
+    """Return the SQL of what the classes of all parts of a collection tell of a frame."""
+    seen = attribute.unit is DisplayUnit.seen
+    dataset = attribute.name.removeprefix(f"class_{abstraction} in ") if seen else ""
+    on = [f'"k"."abstraction" = {literal(abstraction)}', f'"k"."dataset" = {literal(dataset)}']
+    classed = _class_text(abstraction, frame)
+    if seen:
+        classes = Select(['"k"."class"'], [f'{quoted(attribute.given)} AS "k"'], on)
+        return f"({classed} IN ({classes.text()}))"
+    on.append(f'"k"."class" = {classed}')
+    number = Select(['any_value("k"."frames")'], [f'{quoted(attribute.given)} AS "k"'], on)
     return f"({number.text()})"
 
 

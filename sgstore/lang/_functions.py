@@ -220,11 +220,12 @@ def _text_function(e: s.Call, names: SymbolTable) -> b.Operation:
 def _class_count(e: s.Call, names: SymbolTable) -> b.FrameAttribute:
     _expect(e, 0, 1, names)
     if not e.arguments:
-        return class_count("RSV")
+        return class_count("RSV", part=names.session.part)
     found = names.bind(e.arguments[0])
     if not isinstance(found, b.Value) or not isinstance(found.value, str):
         names.session.refuse(f"{e.name}() takes the name of an abstraction", e.arguments[0].span)
-    return class_count(abstraction_named(found.value, e.arguments[0].span, names.session))
+    abstraction = abstraction_named(found.value, e.arguments[0].span, names.session)
+    return class_count(abstraction, part=names.session.part)
 
 
 def _after_in(e: s.Call, names: SymbolTable) -> b.Bound:

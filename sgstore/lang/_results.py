@@ -90,6 +90,18 @@ def owners_of(values: Iterable[Bound], query: Query, catalog: Catalog) -> list[N
     return list(dict.fromkeys(owner_of(v.node) for v in values if isinstance(v, NodeValue)))
 
 
+def with_owners(result: Result) -> Result:
+    """A result with further columns: the owner of each node that it returns, where no frame tells it."""
+    if result.names:
+        return result
+    owners = (
+        ReturnColumn(f":owner {place}", owner_of(column.value.node))
+        for place, column in enumerate(result.columns)
+        if isinstance(column.value, NodeValue)
+    )
+    return replace(result, columns=(*result.columns, *owners))
+
+
 def counted_apart(query: Query, catalog: Catalog) -> Query:
     """A query in which ``COUNT(DISTINCT v)`` of nodes counts those of each trace, or map, by themselves."""
     keys = [column.value for column in query.result.columns]
@@ -114,6 +126,8 @@ def _tells_trace(keys: Iterable[Bound]) -> bool:
 
 
 def _several(query: Query, catalog: Catalog) -> bool:
+    if catalog.part:  # others have traces, too
+        return True
     chosen, _ = traces_of(query, catalog)
     return len(catalog.traces if chosen is None else chosen) != 1
 
@@ -122,6 +136,10 @@ def _several(query: Query, catalog: Catalog) -> bool:
 # A frame *goes on* with a run if the same holds in the frame before it and the recording has no gap between the
 # two (``bucket.joined``). Frames of a mask that do not go on are the first of a run; those with which none goes
 # on are the last. So runs are found a bucket at a time, and only their ends are looked at as frames.
+
+FIRST, OWNER_KEY, TOP_OWNER = ":first", ":owner", ":top owner"
+"""Columns of intervals that are keyed: the id of the first frame, and whose the nodes are of which samples,
+or the first ones, are taken."""
 
 _LAST: Final = 59
 """The bit of the last frame of a bucket."""
@@ -362,7 +380,8 @@ class _RowStatement:
             self.nodes = frozenset(k for k, n in scope.nodes.items() if n.role == "named")
             self.edges = frozenset(edge.key for edge in scope.edges if edge.named)
         # A row tells of several frames.
-        self.grouped = (self.result.distinct or self.result.aggregated) and not self.result.framed
+        listed = self.result.framed or self.result.whole
+        self.grouped = (self.result.distinct or self.result.aggregated) and not listed
         # Of what samples are taken of, and of what the first ones are taken of.
         self.owners, self.top_owners = (
             [] if per is None else owners_of([per], query, writer.catalog)
@@ -374,7 +393,7 @@ class _RowStatement:
         values = [column.value for column in self.result.columns]
         keys = [c.value for c in self.result.columns if not _aggregates(c)]
         apart: list[NodeAttribute] = []
-        if self.result.aggregated or (self.result.distinct and not self.result.framed):
+        if self.grouped:
             apart = owners_of(keys, self.query, self.writer.catalog)
         values += apart
         values += self.result.values[len(self.result.columns) :]
@@ -461,33 +480,34 @@ class _RowStatement:
 
     def _ordered(self, select: Select, names: list[str], tops: list[str]) -> str:
         """The statement in the order of the query, or else of traces, frames, bindings; as many as wanted."""
-        keys = [_directed(self._key(k.value), k.descending) for k in self.result.order]
+        keys = [directed(self._key(k.value), k.descending) for k in self.result.order]
         frame, own, writer = f'{_ROWS}."frame_id"', len(keys), self.writer
-        framed, grouped = self.result.framed, self.grouped
+        grouped = self.grouped
+        once = self.result.framed or (self.result.distinct and not grouped)  # with their frames
         if not grouped:
             keys.append(frame_key(select, frame, writer.catalog, writer.window, writer.values))
-        if framed and keys[own] == frame:  # it is the first of the names
+        if once and keys[own] == frame:  # it is the first of the names
             del keys[own]
-        moved = framed and len(keys) > own
+        moved = once and len(keys) > own
         bindings = [f"{_ROWS}.{column}" for column in columns_of(self.nodes, self.edges)]
-        keys += names if framed or grouped else bindings
+        keys += names if once or grouped else bindings
         sample, top = self.result.sample, self.result.top
         named = self._named_traces(keys, own) if grouped else []
         if sample is not None:
             per = [] if sample.per is None else [self._key(sample.per)]
             per += [self._text(owner) for owner in self.owners]
-            chosen = _Chosen(sample.number, per, frame, first=own)
-            select, keys = _sampled(select, [*names, *tops], names, keys, chosen)
+            chosen = Chosen(sample.number, per, frame, first=own)
+            select, keys = sampled(select, [*names, *tops], names, keys, chosen)
         elif moved or named or top is not None:
-            order = _keyed(select, names, keys)
+            order = keyed(select, names, keys)
             select = Select([*names, *tops], [nested(select.text(), ":all")])
             for place in named:
                 order[place] = name_key(select, place, keys[place], writer.catalog, writer.values)
             keys = order
         if top is not None:
             per = [quoted(top.per)] if isinstance(top.per, str) else []
-            chosen = _Chosen(top.number, [*per, *tops])
-            select, keys = _sampled(select, names, names, keys, chosen)
+            chosen = Chosen(top.number, [*per, *tops])
+            select, keys = sampled(select, names, names, keys, chosen)
         select.order = keys
         select.limit, select.offset = self.result.limit, self.result.skip
         return select.text()
@@ -528,15 +548,16 @@ class _IntervalStatement:
         clips = self.result.form == "clips"
         own = self._clip_columns() if clips else self._interval_columns()
         told = dict(own) | {column.name: self._told(column.value) for column in columns}
-        select = Select([_named(text, name) for name, text in told.items()])
+        hidden = self._hidden(told) if self.result.keyed else {}
+        select = Select([_named(text, name) for name, text in (told | hidden).items()])
         select.join(nested(self._between(spans), ":runs"), [])
         select.join(f'"trace" AS {_TRACE}', [f'{_TRACE}."trace_id" = ":runs"."trace_id"'])
         first = '":runs"."first"'
-        order = [_directed(_named_key(k.value), k.descending) for k in self.result.order]
+        order = [directed(_named_key(k.value), k.descending) for k in self.result.order]
         writer = self.writer
         order.append(frame_key(select, first, writer.catalog, writer.window, writer.values))
         order += [self._told(column.value) for column in columns]
-        names = (*(name for name, _ in own), *(column.name for column in columns))
+        names = (*(name for name, _ in own), *(column.name for column in columns), *hidden)
         if self.result.having is not None:
             select.where.append(self._having(self.result.having, told))
         shown, keys = [quoted(name) for name in names], len(self.result.order)
@@ -544,13 +565,21 @@ class _IntervalStatement:
         tops = {f'":top {n}"': text for n, text in enumerate(self._per(top, told))}
         select.columns += [f"{text} AS {name}" for name, text in tops.items()]
         if sample is not None:
-            chosen = _Chosen(sample.number, self._per(sample, told), first, first=keys)
-            select, order = _sampled(select, [*shown, *tops], shown, order, chosen)
+            chosen = Chosen(sample.number, self._per(sample, told), first, first=keys)
+            select, order = sampled(select, [*shown, *tops], shown, order, chosen)
         if top is not None:
-            select, order = _sampled(select, shown, shown, order, _Chosen(top.number, [*tops]))
+            select, order = sampled(select, shown, shown, order, Chosen(top.number, [*tops]))
         select.order = order
         select.limit, select.offset = self.result.limit, self.result.skip
         return finished(self.writer, select.text(), names)
+
+    def _hidden(self, told: dict[str, str]) -> dict[str, str]:
+        """What tells the places of intervals of several stores: their first frames, and whose the nodes are."""
+        hidden = {FIRST: '":runs"."first"'}
+        for name, chosen in ((OWNER_KEY, self.result.sample), (TOP_OWNER, self.result.top)):
+            for owner in self._per(chosen, told)[1:]:
+                hidden[name] = owner
+        return hidden
 
     def _having(self, condition: Bound, columns: dict[str, str]) -> str:
         """The condition on an interval, given the names of its columns and what they are."""
@@ -692,7 +721,7 @@ def _named_key(value: Bound | str) -> str:
     return quoted(value)
 
 
-def _directed(text: str, descending: bool) -> str:  # noqa: FBT001
+def directed(text: str, descending: bool) -> str:  # noqa: FBT001
     return f"{text} {'DESC' if descending else 'ASC'} NULLS LAST"
 
 
@@ -711,7 +740,7 @@ def _told_apart(select: Select, names: list[str], apart: list[NodeAttribute]) ->
 
 
 @dataclass(frozen=True, slots=True)
-class _Chosen:
+class Chosen:
     """How many rows are chosen of each combination of some values.
 
     Without a frame, or if ``first`` of the keys are those of an order, they are the first ones; else they are
@@ -724,8 +753,8 @@ class _Chosen:
     first: int = 0
 
 
-def _sampled(
-    select: Select, columns: list[str], names: list[str], keys: list[str], chosen: _Chosen
+def sampled(
+    select: Select, columns: list[str], names: list[str], keys: list[str], chosen: Chosen
 ) -> tuple[Select, list[str]]:
     """The statement of the rows that are chosen, with some columns, and the keys of their order."""
     partition = [f'":per {place}"' for place in range(len(chosen.per))]
@@ -734,7 +763,7 @@ def _sampled(
     select.columns += [
         f"{text} AS {name}" for text, name in zip(chosen.per, partition, strict=True)
     ]
-    order = _keyed(select, names, keys)
+    order = keyed(select, names, keys)
     mixed = chosen.frame is not None and not chosen.first
     over = ", ".join(['":mixed"', *order] if mixed else order)
     by = f"PARTITION BY {', '.join(partition)} " if partition else ""
@@ -745,7 +774,7 @@ def _sampled(
     return outer, order
 
 
-def _keyed(select: Select, names: list[str], keys: list[str]) -> list[str]:
+def keyed(select: Select, names: list[str], keys: list[str]) -> list[str]:
     """Add keys to a statement as columns, where they are none; what a statement around it is ordered by."""
     ordered = [key.removesuffix(" NULLS LAST") for key in keys]
     plain = [key.removesuffix(" ASC").removesuffix(" DESC") for key in ordered]
@@ -754,7 +783,7 @@ def _keyed(select: Select, names: list[str], keys: list[str]) -> list[str]:
         f"{key} AS {name}" for key, name in zip(plain, inner, strict=True) if name not in names
     ]
     down = [key.endswith(" DESC") for key in ordered]
-    return [_directed(name, descending) for name, descending in zip(inner, down, strict=True)]
+    return [directed(name, descending) for name, descending in zip(inner, down, strict=True)]
 
 
 def _in_order(part: Bound) -> bool:

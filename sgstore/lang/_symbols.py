@@ -87,6 +87,8 @@ class Session:
         Of the store.
     own : mapping of str to Type
         Attributes of a client's own, by name.
+    part : bool
+        Whether the store is a part of a collection: see :attr:`sgstore.lang.Catalog.part`.
     the_ego : str or None
         The key of the ego, once the query has named it ``ego``, wherever that is.
     numbers, blocks : int
@@ -107,6 +109,7 @@ class Session:
     traces: tuple[TraceFacts, ...] = ()
     own: Mapping[str, Type] = field(default_factory=dict[str, Type])
     own_edges: Mapping[str, Type] = field(default_factory=dict[str, Type])
+    part: bool = False
     the_ego: str | None = None
     numbers: int = 0
     blocks: int = 0
@@ -114,7 +117,7 @@ class Session:
     def ask(self, catalog: Catalog) -> None:
         """Take over what a catalog says of the store that is asked."""
         self.classed, self.tables, self.traces = catalog.classed, catalog.tables, catalog.traces
-        self.own, self.own_edges = catalog.own, catalog.own_edges
+        self.own, self.own_edges, self.part = catalog.own, catalog.own_edges, catalog.part
 
     def key(self, name: str | None) -> str:
         """A key that is not taken: the name itself if it can be; ``#1``, ``#2``, … for what has none."""
@@ -346,12 +349,20 @@ def call_hint(name: str) -> str | None:
 
 # Datasets in queries: traces whose names are alike, or a table of one's own that says which -----
 
+CLASSES_GIVEN: Final = "sgstore_classes"
+"""The table with the classes of all parts of a collection: ``dataset`` (empty: of all frames), ``abstraction``,
+``class``, ``frames``."""
+
 CLASSES: Final = "datasetclasses"
 """The function after ``IN``, folded: ``frame.class IN dataset_classes('train')``."""
 
 
 def traces_in(
-    name: str, traces: Iterable[TraceFacts], tables: Mapping[str, TableFacts]
+    name: str,
+    traces: Iterable[TraceFacts],
+    tables: Mapping[str, TableFacts],
+    *,
+    part: bool = False,
 ) -> frozenset[int] | None:
     """Ids of the traces of a dataset; ``None`` if nothing is called so.
 
@@ -362,10 +373,13 @@ def traces_in(
         anything.
     traces : iterable of TraceFacts
     tables : mapping of str to TableFacts
+    part : bool
+        Whether there are other stores, which may have what is not here.
     """
     if name in tables:
         return tables[name].traces
-    return frozenset(t.trace_id for t in traces if fnmatchcase(t.name, name)) or None
+    found = frozenset(t.trace_id for t in traces if fnmatchcase(t.name, name))
+    return found if found or part else None
 
 
 def asked(name: str, span: TextSpan, session: Session) -> frozenset[int]:
@@ -376,7 +390,7 @@ def asked(name: str, span: TextSpan, session: Session) -> frozenset[int]:
     QueryError
         There is no such dataset, or it is a table of single frames.
     """
-    found = traces_in(name, session.traces, session.tables)
+    found = traces_in(name, session.traces, session.tables, part=session.part)
     if found is None and name in session.tables:
         session.refuse(
             f"'{name}' is a table of single frames, and USING DATASET chooses traces",
@@ -396,7 +410,7 @@ def seen_in(
     QueryError
         There is no such dataset.
     """
-    found = traces_in(name, session.traces, session.tables)
+    found = traces_in(name, session.traces, session.tables, part=session.part)
     table = session.tables.get(name)
     if found is None and table is not None and not table.joins:
         session.refuse(f"the rows of '{name}' belong to no frames", span)
@@ -411,15 +425,21 @@ def seen_in(
         DisplayUnit.seen,
         table=name if found is None else "",
         traces=tuple(sorted(found or ())),
+        given=CLASSES_GIVEN if session.part else "",
     )
     return b.FrameAttribute(attribute, Type.boolean)
 
 
-def class_count(abstraction: str) -> b.FrameAttribute:
-    """Return the number of frames in the store that are of the class of the frame."""
-    home = {Home.state: abstraction}
-    name = f"class_count({abstraction})"
-    attribute = Attribute(name, Type.number, home, "frames of its class", DisplayUnit.counted)
+def class_count(abstraction: str, *, part: bool = False) -> b.FrameAttribute:
+    """Return the number of frames in the store, or in all parts, that are of the class of the frame."""
+    attribute = Attribute(
+        f"class_count({abstraction})",
+        Type.number,
+        {Home.state: abstraction},
+        "frames of its class",
+        DisplayUnit.counted,
+        given=CLASSES_GIVEN if part else "",
+    )
     return b.FrameAttribute(attribute, Type.number)
 
 

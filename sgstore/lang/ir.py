@@ -459,6 +459,9 @@ class Result:
     limit : int or None
     before, after : int
         Offsets of clips; ns, negative is earlier.
+    keyed : bool
+        Whether intervals and clips also have what puts those of several stores in order: see
+        :mod:`sgstore.lang._parts`.
     """
 
     form: Form = "rows"
@@ -474,6 +477,7 @@ class Result:
     limit: int | None = None
     before: int = 0
     after: int = 0
+    keyed: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:

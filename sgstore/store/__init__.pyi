@@ -1,5 +1,9 @@
 # The face of this package: what others may import from it.
 
+from ._merge import PartFile as PartFile
+from ._merge import merged_parts as merged_parts
+from ._merge import write_classes as write_classes
+from ._merge import write_part as write_part
 from ._contents import DIGEST_BYTES as DIGEST_BYTES
 from ._contents import WINDOW as WINDOW
 from ._contents import Mark as Mark
@@ -66,6 +70,7 @@ __all__ = [
     "OldTrace",
     "OnMap",
     "ParquetTable",
+    "PartFile",
     "PresentError",
     "Remains",
     "Rows",
@@ -87,6 +92,7 @@ __all__ = [
     "graph_digests",
     "lengths_of_messages",
     "marks",
+    "merged_parts",
     "messages_of",
     "named_as",
     "remains_of",
@@ -95,7 +101,9 @@ __all__ = [
     "trace_id_of",
     "trace_of",
     "verify_file",
+    "write_classes",
     "write_csv",
     "write_batches",
     "write_parquet",
+    "write_part",
 ]

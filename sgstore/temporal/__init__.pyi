@@ -3,6 +3,7 @@
 from ._checks import CheckRun as CheckRun
 from ._checks import Verdict as Verdict
 from ._checks import margin_cells as margin_cells
+from ._checks import Witness as Witness
 from ._checks import unknown_notes as unknown_notes
 from ._checks import verdict_columns as verdict_columns
 from ._checks import verdict_rows as verdict_rows
@@ -24,6 +25,7 @@ __all__ = [
     "Robustness",
     "TemporalMatches",
     "Verdict",
+    "Witness",
     "evaluate",
     "margin_cells",
     "opened",

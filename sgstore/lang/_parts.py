@@ -1,0 +1,637 @@
+"""Questions that are asked of parts of a collection, and statements that make one answer of theirs.
+
+A trace is in one part. So rows, intervals and clips of the whole are those of the parts, and only their order,
+and how many are wanted, need a second look: each row comes with *hidden* columns, named ``:0``, ``:1``, …, by
+which one store would have ordered it. What is counted or summed is so in each part, group by group, and once
+more over the parts; what is to be distinct comes from each part as a set.
+
+The statements speak of tables ``parts``, ``parts 1``, …, one for each question that a part is asked.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from itertools import count
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.errors import QueryError
+from sgstore.lang._aggregates import PLACE, sql_of
+from sgstore.lang._catalog import FRAME_ATTRIBUTES, TRACE_ATTRIBUTES, Catalog, DisplayUnit, Type
+from sgstore.lang._compile import Compiled, Layout
+from sgstore.lang._formulas import BoundValues, Select, expression_text, nested
+from sgstore.lang._plan import frame_key, name_key
+from sgstore.lang._results import (
+    FIRST,
+    OWNER_KEY,
+    TOP_OWNER,
+    Chosen,
+    directed,
+    keyed,
+    names_of,
+    owner_of,
+    sampled,
+    with_bindings,
+    with_owners,
+)
+from sgstore.lang._rewrite import FALSE, narrowed, rewritten
+from sgstore.lang.ir import (
+    Aggregate,
+    BlockValue,
+    Bound,
+    BoundCheck,
+    EdgeRelation,
+    FrameAttribute,
+    GroupKey,
+    NodeValue,
+    Query,
+    Result,
+    ReturnColumn,
+    Sampling,
+    Scope,
+    SortKey,
+    TraceAttribute,
+    is_counted,
+    walk,
+    with_operands,
+)
+from sgstore.quoting import quoted
+from sgstore.records import dataclass
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+    from sgstore.lang._catalog import Triple
+
+PARTS: Final = "parts"
+"""The table with the answers to the first question; the others have a number behind it."""
+
+LOG_TIME_COLUMN: Final = ":log_time_ns"
+
+_FRAME_ID: Final = FrameAttribute(FRAME_ATTRIBUTES["id"], Type.number)
+_LOG_TIME: Final = FrameAttribute(FRAME_ATTRIBUTES["logtimens"], Type.number)
+_TRACE_NAME: Final = TraceAttribute(TRACE_ATTRIBUTES["name"], Type.text)
+
+Terms = list[str]
+"""Expressions of an ``ORDER BY``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parted:
+    """A question as parts are asked it, and as their answers are merged.
+
+    Attributes
+    ----------
+    queries : tuple of Query
+        Asked of each part; the answers to the first are the table ``parts``, to the second ``parts 1``, ….
+    columns : tuple of str
+        Of the merged rows.
+    merge : function
+        Given the catalog of the whole and the values of the statement: the statement over these tables.
+    """
+
+    queries: tuple[Query, ...]
+    columns: tuple[str, ...]
+    merge: Callable[[Catalog, BoundValues], str]
+
+    def compiled(self, whole: Compiled) -> tuple[Compiled, ...]:
+        """The questions, compiled against the catalog that a query was compiled against."""
+        found: list[Compiled] = []
+        for query in self.queries:
+            ready = query if query.steps else rewritten(query, whole.catalog)
+            found.append(replace(whole, bound=query, query=ready))
+        return tuple(found)
+
+    def statement(self, catalog: Catalog) -> tuple[str, tuple[Any, ...]]:
+        """The statement that merges, with the values that it binds."""
+        values = BoundValues()
+        text = self.merge(catalog, values)
+        return text, tuple(values.items)
+
+
+def parted(compiled: Compiled, form: str = "rows", before: int = 0, after: int = 0) -> Parted:
+    """A query as parts of a collection are asked it.
+
+    Parameters
+    ----------
+    compiled : Compiled
+        Against the whole, or against a part: the questions are the same.
+    form : str
+        ``rows``: what the query asks for; ``apart``: the same, with columns that tell nodes of several traces
+        apart which have the same number; or, whatever ``RETURN`` says, ``frames``, ``intervals``, ``clips`` or
+        ``subgraphs``.
+    before, after : int
+        What is added to clips at both ends, unless the query says it; ns.
+
+    Raises
+    ------
+    QueryError
+        No rule says how answers to it are merged.
+    """
+    query = compiled.whole
+    _refuse_strange(query.result)
+    match form:
+        case "frames":
+            query = _frames(query)
+        case "apart":
+            query = replace(query, result=with_owners(query.result))
+        case "subgraphs":
+            query = Layout.of(compiled.bound).query
+        case "intervals":
+            query = _intervals(query, graphs=compiled.layout is not None)
+        case "clips" if query.result.form != "clips":
+            clips = Result(form="clips", whole=False, before=-before, after=after)
+            query = replace(query, result=clips)
+        case _:
+            pass
+    result = query.result
+    if result.form in {"intervals", "clips"}:
+        return _parted_intervals(query)
+    if result.aggregated:
+        return _Grouping(query).parted()
+    if result.distinct and not (result.whole or result.framed):
+        return _parted_sets(query)
+    return _parted_rows(query)
+
+
+MERGED: Final = frozenset(
+    {
+        *("form", "columns", "whole", "framed", "distinct", "having", "order", "sample", "top"),
+        *("skip", "limit", "before", "after", "keyed"),
+    }
+)
+"""What a :class:`Result` may say: how the answers of parts are merged is known of these."""
+
+SUMMED: Final = frozenset({"count", "sum", "min", "max", "avg"})
+"""Aggregates whose numbers of parts are merged."""
+
+LISTED: Final = frozenset({"stddev", "median", "percentile", "collect"})
+"""Aggregates for which parts give all the values."""
+
+
+def _refuse_strange(result: Result) -> None:
+    """Refuse what no rule of merging speaks of: a new clause must not be answered wrongly."""
+    for one in fields(result):
+        if one.name not in MERGED and getattr(result, one.name) != one.default:
+            raise QueryError(
+                f"a collection cannot say what '{one.name}' of a query is over all its bundles",
+                hint="'sgstore collection unpack' makes one store of all, which can be asked",
+            )
+
+
+def _frames(query: Query) -> Query:
+    """A query for the frames that match with their log times; of limited rows, for the frame of each."""
+    result, time = query.result, ReturnColumn(LOG_TIME_COLUMN, _LOG_TIME)
+    if not result.chooses or result.form != "rows" or result.aggregated:
+        return replace(query, result=Result(whole=False, framed=True, columns=(time,)))
+    framed = replace(result, framed=True, columns=(*result.columns, time))
+    return replace(query, result=framed)
+
+
+def _intervals(query: Query, *, graphs: bool) -> Query:
+    result = query.result
+    if result.whole or result.aggregated or graphs:
+        return with_bindings(query)
+    if result.form == "intervals":
+        return query
+    return replace(query, result=Result(form="intervals", columns=result.columns, whole=False))
+
+
+# Which parts may answer -----------------------------------------------------------------------------
+
+
+class Pruning:
+    """Tells of a query whether a part may have an answer, by the triples and kinds that it holds.
+
+    It is the compiler's own narrowing: a pattern that becomes false for what a part holds has no match there.
+
+    Parameters
+    ----------
+    compiled : Compiled
+        Against the whole.
+    """
+
+    def __init__(self, compiled: Compiled) -> None:
+        query = compiled.query
+        self._scopes = [step.scope for step in query.steps if not step.absent] or [query.scope]
+        self._known: dict[tuple[object, ...], bool] = {}
+        self._relations = sorted(
+            {r for scope in self._scopes for e in scope.edges if e.high == 1 for r in e.relations}
+        )
+
+    def may_answer(
+        self, triples: Mapping[str, frozenset[Triple]], kinds: Sequence[frozenset[str]]
+    ) -> bool:
+        """Tell whether a part may have a match.
+
+        Parameters
+        ----------
+        triples : mapping of str to frozenset
+            Relation → its triples that occur in the part.
+        kinds : sequence of frozenset
+            Kinds that move, that are fixed, and those of the map.
+        """
+        nothing = frozenset["Triple"]()
+        held = tuple(triples.get(one, nothing) for one in self._relations)
+        key = (held, *kinds)
+        if key not in self._known:
+            edges = {triple: 1 for some in held for triple in some}
+            moving, fixed, mapped = kinds
+            catalog = Catalog(edges=edges, moving=moving, fixed=fixed, mapped=mapped)
+            self._known[key] = all(_possible(scope, catalog) for scope in self._scopes)
+        return self._known[key]
+
+
+def _possible(scope: Scope, catalog: Catalog) -> bool:
+    return scope.where != (FALSE,) and narrowed(scope, catalog).where != (FALSE,)
+
+
+@dataclass(frozen=True, slots=True)
+class ClassQuestion:
+    """Classes of frames that a query speaks of, and that all parts have to tell.
+
+    Attributes
+    ----------
+    abstraction : str
+    dataset : str
+        Whose classes are wanted; empty: how many frames each class has, of all.
+    traces : tuple of int
+        Those of the dataset.
+    table : str
+        The table of single frames that it is; empty if it is one of traces.
+    """
+
+    abstraction: str
+    dataset: str = ""
+    traces: tuple[int, ...] = ()
+    table: str = ""
+
+
+def class_questions(asked: Query | BoundCheck) -> tuple[ClassQuestion, ...]:
+    """The classes of frames that a query or a check speaks of, bound against the whole; each once."""
+    if isinstance(asked, BoundCheck):
+        values = [asked.formula, *(q.where for q in asked.quantifiers if q.where is not None)]
+        values += [*asked.scope.where, *([] if asked.reset is None else [asked.reset])]
+    else:
+        values = [*asked.scope.where, *asked.result.values]
+        values += [v for step in asked.steps for v in (*step.scope.where, *step.when)]
+    return tuple(dict.fromkeys(_class_questions(values)))
+
+
+def _class_questions(values: Iterable[Bound]) -> Iterator[ClassQuestion]:
+    for part in (part for value in values for part in walk(value)):
+        if isinstance(part, BlockValue):
+            yield from _class_questions(part.inside)
+        if not isinstance(part, FrameAttribute):
+            continue
+        attribute = part.attribute
+        (column,) = attribute.columns.values()
+        if attribute.unit is DisplayUnit.counted:
+            yield ClassQuestion(column)
+        elif attribute.unit is DisplayUnit.seen:
+            dataset = attribute.name.removeprefix(f"class_{column} in ")
+            yield ClassQuestion(column, dataset, attribute.traces, attribute.table)
+
+
+# Rows: in the order of the query, or else of traces, frames and bindings --------------------------
+
+
+def _parted_rows(query: Query) -> Parted:
+    result, hidden = query.result, _Hidden()
+    own = [directed(hidden.key(k.value), k.descending) for k in result.order]
+    pers = _per(result, result.sample, hidden), _per(result, result.top, hidden)
+    framed = result.whole or result.framed
+    frame = quoted("frame_id") if framed else hidden.add(_FRAME_ID)
+    visible = names_of(query)
+    rest = list(map(quoted, visible))
+    if not (result.framed or result.distinct):
+        rest = [hidden.add(value) for value in _bindings(query)]
+    asked = _of_part(replace(result, columns=(*result.columns, *hidden.columns)))
+
+    def merge(catalog: Catalog, values: BoundValues) -> str:
+        names = list(map(quoted, visible))
+        select = Select(list(names), [quoted(PARTS)])
+        keys = [*own, frame_key(select, frame, catalog, None, values)]
+        keys += [key for key in rest if key != keys[-1]]
+        return _chosen(result, select, (names, keys, frame), pers)
+
+    return Parted((replace(query, result=asked),), visible, merge)
+
+
+Placed = tuple[Terms, Terms, str]
+"""Names of rows, the keys of their order, and the column of their frames."""
+
+
+def _chosen(result: Result, select: Select, placed: Placed, pers: tuple[Terms, Terms]) -> str:
+    """The rows of a statement that a query wants, in their order.
+
+    ``pers``: the columns of whose values samples are taken, and those of whose values the first ones are.
+    """
+    (names, keys, frame), (per, top_per) = placed, pers
+    tops = [f'":top {number}"' for number in range(len(top_per))]
+    select.columns += [f"{text} AS {name}" for text, name in zip(top_per, tops, strict=True)]
+    if result.sample is not None:
+        chosen = Chosen(result.sample.number, per, frame, first=len(result.order))
+        select, keys = sampled(select, [*names, *tops], names, keys, chosen)
+    if result.top is not None:
+        select, keys = sampled(select, names, names, keys, Chosen(result.top.number, tops))
+    if result.sample is None and result.top is None:
+        keys = keyed(select, names, keys)
+        select = Select(names, [nested(select.text(), ":all")])
+    select.order = keys
+    select.limit, select.offset = result.limit, result.skip
+    return select.text()
+
+
+def _of_part(result: Result) -> Result:
+    """What a part is asked for, so that all is there that the whole may choose.
+
+    A sample of a part may have rows that the sample of the whole has not: so many rows of it are not enough.
+    """
+    if result.sample is not None:
+        return replace(result, top=None, skip=0, limit=None)
+    if result.top is not None:
+        return replace(result, skip=0, limit=None)
+    if result.limit is not None:
+        return replace(result, skip=0, limit=result.skip + result.limit)
+    return replace(result, order=(), skip=0)
+
+
+def _bindings(query: Query) -> Iterator[Bound]:
+    """What rows of one frame are ordered by: the nodes and edges that a match is told apart by."""
+    roles = {"named"} if query.result.whole else {"named", "unnamed"}
+    nodes = (key for key, node in query.scope.nodes.items() if node.role in roles)
+    yield from (NodeValue(key) for key in sorted(nodes))
+    yield from (EdgeRelation(key) for key in sorted(e.key for e in query.scope.edges if e.named))
+
+
+def _per(result: Result, chosen: Sampling | None, hidden: _Hidden) -> Terms:
+    """The columns of whose values rows are chosen."""
+    if chosen is None or chosen.per is None:
+        return []
+    value = _value_of(result, chosen.per)
+    per = [hidden.key(chosen.per)]
+    if isinstance(value, NodeValue):
+        per.append(hidden.add(owner_of(value.node)))
+    return per
+
+
+def _value_of(result: Result, per: Bound | str) -> Bound | str:
+    """The value of a column that is named, if it is one of the query's own."""
+    if not isinstance(per, str):
+        return per
+    return next((column.value for column in result.columns if column.name == per), per)
+
+
+class _Hidden:
+    """Columns that rows have beside those that are shown."""
+
+    def __init__(self, first: int = 0) -> None:
+        self.columns: list[ReturnColumn] = []
+        self._numbers = count(first)
+
+    def add(self, value: Bound) -> str:
+        """A column with a value; its name, quoted."""
+        column = ReturnColumn(f":{next(self._numbers)}", value)
+        self.columns.append(column)
+        return quoted(column.name)
+
+    def key(self, value: Bound | str) -> str:
+        """The column of a key, quoted: that of the result, if it is the name of one."""
+        return quoted(value) if isinstance(value, str) else self.add(value)
+
+
+# Intervals and clips ---------------------------------------------------------------------------------
+
+
+def _parted_intervals(query: Query) -> Parted:
+    result = query.result
+    asked = _of_part(replace(result, keyed=True))
+    visible = names_of(query)
+
+    def merge(catalog: Catalog, values: BoundValues) -> str:
+        names = list(map(quoted, visible))
+        select = Select(list(names), [quoted(PARTS)])
+        own = [directed(_name(key), key.descending) for key in result.order]
+        first = quoted(FIRST)
+        keys = [*own, frame_key(select, first, catalog, None, values)]
+        keys += [quoted(column.name) for column in result.columns]
+        pers = (
+            _per_of_intervals(result, result.sample, OWNER_KEY),
+            _per_of_intervals(result, result.top, TOP_OWNER),
+        )
+        return _chosen(result, select, (names, keys, first), pers)
+
+    return Parted((replace(query, result=asked),), visible, merge)
+
+
+def _per_of_intervals(result: Result, chosen: Sampling | None, owner: str) -> Terms:
+    if chosen is None or chosen.per is None:
+        return []
+    assert isinstance(chosen.per, str)  # noqa: S101 - the binder knows the names of intervals only
+    owned = isinstance(_value_of(result, chosen.per), NodeValue)
+    return [quoted(chosen.per), *([quoted(owner)] if owned else [])]
+
+
+def _name(key: SortKey) -> str:
+    assert isinstance(key.value, str)  # noqa: S101 - the binder knows the names of intervals only
+    return quoted(key.value)
+
+
+# Sets and groups -----------------------------------------------------------------------------------------
+
+
+def _parted_sets(query: Query) -> Parted:
+    result, hidden = query.result, _Hidden()
+    owners = {
+        column.name: hidden.add(owner_of(column.value.node))
+        for column in result.columns
+        if isinstance(column.value, NodeValue)
+    }
+    asked = replace(result, columns=(*result.columns, *hidden.columns), top=None)
+    asked = _of_part(asked) if result.top is None else replace(asked, order=(), skip=0, limit=None)
+    visible = names_of(query)
+
+    def merge(catalog: Catalog, values: BoundValues) -> str:
+        every = Select(["*"], [quoted(PARTS)], distinct=True)
+        own = [directed(_name(key), key.descending) for key in result.order]
+        return _in_names(every.text(), visible, own, result, (catalog, values), owners)
+
+    return Parted((replace(query, result=asked),), visible, merge)
+
+
+def _in_names(
+    text: str,
+    visible: Sequence[str],
+    own: Terms,
+    result: Result,
+    bound: tuple[Catalog, BoundValues],
+    owners: Mapping[str, str],
+) -> str:
+    """Rows in the order of a query, then of their columns, names of traces as people count.
+
+    ``owners``: the columns that say whose the nodes of a column are.
+    """
+    catalog, values = bound
+    names = list(map(quoted, visible))
+    select = Select(list(names), [nested(text, ":rows")])
+    keys = [*own, *names]
+    known = [trace.name for trace in catalog.traces]
+    told = {quoted(c.name) for c in result.columns if c.value == _TRACE_NAME}
+    for place in range(len(own), len(keys)) if known != sorted(known) else ():
+        if keys[place] in told:
+            keys[place] = name_key(select, place, keys[place], catalog, values)
+    per = result.top and result.top.per
+    tops = [quoted(per), *([owners[per]] if per in owners else [])] if isinstance(per, str) else []
+    return _chosen(result, select, (names, keys, ""), ([], tops))
+
+
+class _Grouping:
+    """A query that counts or sums over matches, for parts.
+
+    What a part is asked first has a column for each value by which rows are grouped, and for each number of a
+    group one or two that can be added up. A number of *different* values is a question of its own, whose answer
+    is the set of them for each group; and one for which all values are wanted is one, too, with a row a match.
+    """
+
+    def __init__(self, query: Query) -> None:
+        self._query, self._result = query, query.result
+        self._groups, self._numbers = _Hidden(), _Hidden(1_000)
+        self._more: list[tuple[Query, Callable[[Catalog, BoundValues], str]]] = []
+        self._known: dict[Aggregate, str] = {}
+        self._partial: list[ReturnColumn] = []
+        self._keys: dict[str, str] = {}
+        self._owners: dict[str, str] = {}
+        for column in self._result.columns:
+            if not is_counted(column.value):
+                self._keys[column.name] = self._groups.add(column.value)
+        for column in self._result.columns:
+            if isinstance(column.value, NodeValue):
+                self._owners[column.name] = self._groups.add(owner_of(column.value.node))
+
+    def parted(self) -> Parted:
+        result = self._result
+        outputs = [(column.name, self._column(column)) for column in result.columns]
+        own: Terms = []
+        for i, key in enumerate(result.order):
+            if not isinstance(key.value, str):
+                outputs.append((f":order {i}", self._text(key.value)))
+            name = key.value if isinstance(key.value, str) else f":order {i}"
+            own.append(directed(quoted(name), key.descending))
+        having = None if result.having is None else self._text(result.having)
+        if not self._partial:  # a part says which groups it has
+            self._part(Aggregate("count", None, distinct=False, type=Type.number))
+        columns = (*self._groups.columns, *self._partial)
+        first = Result(columns=columns, whole=False)
+        queries = (replace(self._query, result=first), *(query for query, _ in self._more))
+        visible = names_of(self._query)
+        owners = {name: f'":whose {i}"' for i, name in enumerate(self._owners)}
+
+        def merge(catalog: Catalog, values: BoundValues) -> str:
+            select = Select([f"{_sql(v, values)} AS {quoted(n)}" for n, v in outputs])
+            whose = zip(self._owners.values(), owners.values(), strict=True)
+            select.columns += [f"{column} AS {name}" for column, name in whose]
+            select.tables = [nested(self._every(catalog, values), ":every")]
+            select.group = [quoted(column.name) for column in self._groups.columns]
+            select.having = [] if having is None else [_sql(having, values)]
+            return _in_names(select.text(), visible, own, result, (catalog, values), owners)
+
+        return Parted(queries, visible, merge)
+
+    def _column(self, column: ReturnColumn) -> Bound:
+        if column.name in self._keys:
+            return EdgeRelation(self._keys[column.name])
+        return self._text(column.value)
+
+    def _text(self, value: Bound) -> Bound:
+        """A value with leaves in place of the numbers of its groups, and of what tells these apart."""
+        match value:
+            case GroupKey(name=name):
+                return EdgeRelation(self._keys[name])
+            case Aggregate():
+                return EdgeRelation(self._number(value))
+            case _:
+                return with_operands(value, self._text)
+
+    def _number(self, number: Aggregate) -> str:
+        """The SQL of a number of a group, of the columns of the parts."""
+        if number not in self._known:
+            self._known[number] = self._merged(number)
+        return self._known[number]
+
+    def _merged(self, number: Aggregate) -> str:
+        if number.word in {"min", "max"}:
+            return f"{number.word}({self._part(replace(number, distinct=False))})"
+        if number.word in LISTED or (number.distinct and number.word in SUMMED):
+            found = f"any_value({self._each(number)})"
+            if number.word == "count":
+                return f"CAST(coalesce({found}, 0) AS BIGINT)"
+            return f"coalesce({found}, [])" if number.word == "collect" else found
+        if number.word not in SUMMED:
+            raise QueryError(
+                f"a collection cannot say what {number.word}() is over all its bundles",
+                hint="'sgstore collection unpack' makes one store of all, which can be asked",
+            )
+        if number.word == "avg":
+            total = self._part(replace(number, word="sum"))
+            many = self._part(replace(number, word="count"))
+            return f"(CAST(sum({total}) AS DOUBLE) / nullif(sum({many}), 0))"
+        column = self._part(number)
+        if number.word == "count":
+            return f"CAST(coalesce(sum({column}), 0) AS BIGINT)"
+        return f"{number.word}({column})"
+
+    def _part(self, number: Aggregate) -> str:
+        name = self._numbers.add(number)
+        self._partial.append(self._numbers.columns[-1])
+        return name
+
+    def _each(self, number: Aggregate) -> str:
+        """The column with a number of a group that is made of all its values, or of the different ones."""
+        assert number.operand is not None  # noqa: S101 - COUNT(*) alone has none
+        hidden = _Hidden(2_000)
+        value = hidden.add(number.operand)
+        if isinstance(number.operand, NodeValue):
+            hidden.add(owner_of(number.operand.node))
+        ordered = number.word == "collect" and not number.distinct
+        frame = hidden.add(_FRAME_ID) if ordered else ""
+        bindings = [hidden.add(one) for one in _bindings(self._query)] if ordered else []
+        columns = (*self._groups.columns, *hidden.columns)
+        result = Result(columns=columns, whole=False, distinct=number.distinct)
+        groups = [quoted(column.name) for column in self._groups.columns]
+        place = len(self._more) + 1
+        name, table = quoted(f":each {place}"), quoted(f"{PARTS} {place}")
+
+        def text(catalog: Catalog, values: BoundValues) -> str:
+            rows = Select(["*"], [table], distinct=number.distinct)
+            rows.where = [f"{value} IS NOT NULL"] if number.distinct else []
+            made = sql_of(replace(number, distinct=False), value)
+            if ordered:
+                order = [frame_key(rows, frame, catalog, None, values), *bindings]
+                rows.columns.append(f"row_number() OVER (ORDER BY {', '.join(order)}) AS {_PLACE}")
+            elif number.word == "collect":
+                made = f"list({value} ORDER BY {value})"
+            made = made.replace(PLACE, _PLACE)
+            select = Select([*groups, f"{made} AS {name}"], [nested(rows.text(), ":each")])
+            select.group = list(groups)
+            return select.text()
+
+        self._more.append((replace(self._query, result=result), text))
+        return name
+
+    def _every(self, catalog: Catalog, values: BoundValues) -> str:
+        """The rows of all parts: groups with their numbers, and with what is made of all values in them."""
+        rows = [Select(["*"], [quoted(PARTS)]).text()]
+        rows += [text(catalog, values) for _, text in self._more]
+        return "\nUNION ALL BY NAME\n".join(f"({text})" for text in rows)
+
+
+_PLACE: Final = '":place"'
+
+
+def _sql(value: Bound, values: BoundValues) -> str:
+    """An expression about groups, whose leaves are columns already."""
+
+    def leaf(found: Any) -> str:
+        return found.edge
+
+    return expression_text(value, leaf, values)
