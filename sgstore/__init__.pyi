@@ -1,5 +1,7 @@
 # The public API: what people import from ``sgstore``; loaded when it is used.
 
+from .collection import Collection as Collection
+from .collection import open as open
 from .config import Config as Config
 from .errors import AbstractionError as AbstractionError
 from .errors import ConfigError as ConfigError
@@ -19,7 +21,6 @@ from .matches import Matches as Matches
 from .query import ClipAnimation as ClipAnimation
 from .query import Store as Store
 from .query import StoreFrame as StoreFrame
-from .query import open as open
 from .sgg import SceneGraphGenerator as SceneGraphGenerator
 from .step import Frame as Frame
 from .store import FrameRef as FrameRef
@@ -38,6 +39,7 @@ __all__ = [
     "CheckRun",
     "Clip",
     "ClipAnimation",
+    "Collection",
     "Config",
     "ConfigError",
     "ExportError",

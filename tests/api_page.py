@@ -16,6 +16,7 @@ PAGE = Path(__file__).parents[1] / "docs" / "api.md"
 
 PARTS: dict[str, tuple[str, ...]] = {
     "A store": ("open", "Store", "StoreFrame"),
+    "A collection of stores": ("Collection",),
     "Answers": (
         *("Matches", "Interval", "Clip", "ClipAnimation", "FrameRef"),
         *("Rows", "CheckRun", "Verdict"),
@@ -31,6 +32,7 @@ PARTS: dict[str, tuple[str, ...]] = {
 LEFT_OUT = {
     "Store": {"catalog", "info"},
     "Matches": {"as_table", "for_people"},
+    "Collection": {"ask", "bundles", "catalog", "classes", "engine", "info", "may_answer"},
     "Config": {"unknown", "mapped"},
 }
 """Public methods that are for other parts of sgstore."""

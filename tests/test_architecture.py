@@ -45,6 +45,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"derive", "importing", "matches", "segments"}),
     frozenset({"doctor", "exporters", "ingest", "temporal"}),
     frozenset({"query", "rebuild", "record"}),
+    frozenset({"collection"}),
     frozenset({"demo", "locks", "notebook", "sandbox"}),
     frozenset({"coverage", "pytest_plugin"}),
     frozenset({"assistant", "diff", "selection"}),
@@ -73,6 +74,8 @@ OWNERS = {
     "carla": {"readers"},
     "mcp": {"assistant"},
     "pydantic": {"assistant"},
+    "obstore": {"collection"},
+    "ray": {"collection"},
 }
 MASKS_ARE_KNOWN_TO = {"store", "lang/_sql_masks", "lang/_results"}
 SQL_OF_MASKS = re.compile(r"\bmask\b|\bbit_or\b|\bbit_count\b|<<")

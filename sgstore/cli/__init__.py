@@ -36,6 +36,7 @@ VERBS: Final = {
     "coverage": ("coverage", "select", "prioritize", "diff", "lock"),
     "exports": ("show", "export"),
     "assistant": ("mcp",),
+    "collections": ("collection",),
 }
 """The modules of the verbs, and what is in them; help lists the modules in this order.
 

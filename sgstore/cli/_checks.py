@@ -21,8 +21,11 @@ from sgstore.cli._options import (
     LOSS,
     NO_MATCH,
     AsJson,
+    AskedPath,
     AskOptions,
+    EngineName,
     Parameters,
+    Partial,
     PatternNames,
     QueryLimits,
     ReadingOptions,
@@ -37,13 +40,15 @@ from sgstore.cli._options import (
     text_of,
 )
 from sgstore.cli._output import json_text, say
+from sgstore.cli._places import collection_at, say_missing, url_of
 from sgstore.files import without_controls, write_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
+    from sgstore.collection import PartedChecks
     from sgstore.matches import Interval
-    from sgstore.temporal import MonitorEvent, Verdict
+    from sgstore.temporal import CheckRun, MonitorEvent, Verdict
 
 PANEL: Final = "Rules over time"
 
@@ -111,7 +116,7 @@ def _plain(text: str) -> str:
 
 @app.command(rich_help_panel=PANEL)
 def check(
-    store: StorePath,
+    store: AskedPath,
     files: Annotated[
         list[Path] | None,
         Argument(metavar="[FILE…]", help="Files of CHECK statements; - is stdin."),
@@ -126,6 +131,8 @@ def check(
         Path | None,
         Option(metavar="FILE", help="Write the verdicts as JUnit's XML, too, for build servers."),
     ] = None,
+    engine: EngineName = "local",
+    partial: Partial = False,
     *,
     statements: Statements,
     ask: AskOptions,
@@ -140,7 +147,24 @@ def check(
 
     asked, values = statements.asked(files)
     text = joined([*chain.from_iterable(asked.values())])
+    if (url := url_of(store)) is not None:
+        with collection_at(url, ask, engine, None, partial=partial, safe=False) as whole:
+            asked_of = whole.check(text, sgsm_compat=statements.sgsm_compat, **values)
+            code = _reported(asked_of, ask, explain=explain, require=require, junit=junit)
+            return say_missing(whole) or code
     run = ask.opened(store).check(text, sgsm_compat=statements.sgsm_compat, **values)
+    return _reported(run, ask, explain=explain, require=require, junit=junit)
+
+
+def _reported(
+    run: CheckRun | PartedChecks,
+    ask: AskOptions,
+    *,
+    explain: bool,
+    require: bool,
+    junit: Path | None,
+) -> int:
+    """Print verdicts, or how the checks are understood; the exit code."""
     if explain:
         typer.echo(run.explain())
         return 0

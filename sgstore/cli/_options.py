@@ -24,6 +24,7 @@ from sgstore.records import dataclass
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
+    from sgstore.collection import PartedMatches
     from sgstore.config import Config
     from sgstore.coverage import ChosenFrames, ReportTable
     from sgstore.matches import Matches
@@ -242,6 +243,27 @@ IN_TABLE: Final = 40
 """Rows of a report on a terminal, unless more are asked for."""
 
 StorePath = Annotated[Path, Argument(metavar="STORE", help="The store: one DuckDB file.")]
+AskedPath = Annotated[
+    Path, Argument(metavar="STORE", help="The store: one DuckDB file; or a collection of them.")
+]
+COLLECTIONS: Final = "Collections"
+EngineName = Annotated[
+    str,
+    Option(
+        "--engine",
+        metavar="NAME",
+        help="Of a collection: local:N processes, ray, or ray://HOST:PORT.",
+        rich_help_panel=COLLECTIONS,
+    ),
+]
+Partial = Annotated[
+    bool,
+    Option(
+        "--partial",
+        help="Of a collection: answer without bundles that cannot be asked; exit code 3.",
+        rich_help_panel=COLLECTIONS,
+    ),
+]
 FrameName = Annotated[str, Argument(metavar="FRAME", help="A frame_id, TRACE#SEQ, or TRACE@12.3s.")]
 Parameters = Annotated[
     list[str] | None,
@@ -662,7 +684,9 @@ def bytes_of(text: str, option: str) -> int:
     return size
 
 
-def say_left_out(matches: Matches | Answer | ChosenFrames | UserStatement) -> None:
+def say_left_out(
+    matches: Matches | Answer | ChosenFrames | UserStatement | PartedMatches,
+) -> None:
     """Say which traces cannot answer a query, and why, and what may be a mistake in it."""
     of: dict[str, list[str]] = {}
     for name, reason in matches.reasons.items():

@@ -11,12 +11,16 @@ import typer
 from typer import Argument, Option
 
 from sgstore.cli._options import (
+    COLLECTIONS,
     NO_MATCH,
     Abstraction,
     AsJson,
+    AskedPath,
     AskOptions,
+    EngineName,
     FrameName,
     Output,
+    Partial,
     QueryFile,
     QueryLimits,
     Question,
@@ -34,10 +38,12 @@ from sgstore.cli._options import (
     text_of,
 )
 from sgstore.cli._output import BINARY, Format, say, write_binary, write_document, write_text
+from sgstore.cli._places import collection_at, say_missing, url_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Mapping
 
+    from sgstore.collection import Collection, PartedMatches
     from sgstore.lang.library import NamedPattern
     from sgstore.matches import Interval, Matches
     from sgstore.sandbox import Answer, Sandbox
@@ -54,7 +60,7 @@ MaxRows = Annotated[int, Option("--max-rows", min=0, help="With --safe: maximum 
 
 @app.command(rich_help_panel=PANEL)
 def find(
-    store: StorePath,
+    store: AskedPath,
     question: Question,
     count: Annotated[
         bool, Option("--count", help="Print the number of distinct frames and nothing else.")
@@ -68,6 +74,8 @@ def find(
     safe: Safe = False,
     max_rows: MaxRows = 10_000,
     tables: With = None,
+    engine: EngineName = "local",
+    partial: Partial = False,
     *,
     ask: AskOptions,
 ) -> int:
@@ -76,6 +84,11 @@ def find(
     One row a match: the frame, its time, and what each variable is bound to; or what RETURN asks for.
     """
     text, values = question.asked()
+    if (url := url_of(store)) is not None:
+        with collection_at(url, ask, engine, tables, partial=partial, safe=safe) as whole:
+            return _found_in(
+                whole, text, values, ask, count=count, explain=explain, require=require
+            )
     if safe:
         if count or explain:
             raise typer.BadParameter("--safe gives rows: not with --count or --explain")
@@ -102,6 +115,33 @@ def find(
     return _ended(number, ask, require=require)
 
 
+def _found_in(
+    whole: Collection,
+    text: str,
+    values: Mapping[str, Any],
+    ask: AskOptions,
+    *,
+    count: bool,
+    explain: bool,
+    require: bool,
+) -> int:
+    """Print what a collection has for a query; the exit code."""
+    matches = whole.find(text, **values)
+    if explain:
+        typer.echo(matches.explain())
+        return 0
+    if count:
+        number = matches.count()
+        typer.echo(number)
+    else:
+        number = ask.write(*_as_shown(matches, matches, ask.chosen))
+    say_left_out(matches)
+    missing = say_missing(whole)
+    if missing or (count and not require):
+        return missing
+    return _ended(number, ask, require=require) if not count else NO_MATCH * (not number)
+
+
 def _ended(number: int, ask: AskOptions, *, require: bool) -> int:
     """Tell people that there are no rows; the exit code."""
     if not number and ask.for_people:
@@ -110,7 +150,7 @@ def _ended(number: int, ask: AskOptions, *, require: bool) -> int:
 
 
 def _as_shown(
-    answer: Matches | Answer, rows: Iterable[tuple[Any, ...]], form: Format
+    answer: Matches | Answer | PartedMatches, rows: Iterable[tuple[Any, ...]], form: Format
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
     """Columns and rows as a form has them: names for people; graphs in JSON as networkx reads them."""
     from sgstore.lang import for_people
@@ -121,7 +161,7 @@ def _as_shown(
 
 
 def _node_link(
-    answer: Matches | Answer, rows: Iterable[tuple[Any, ...]], form: Format
+    answer: Matches | Answer | PartedMatches, rows: Iterable[tuple[Any, ...]], form: Format
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
     """Rows that end in a graph: in JSON as networkx reads them."""
     if form not in {Format.json, Format.ndjson}:
@@ -229,7 +269,7 @@ def translate(
 
 @app.command(rich_help_panel=PANEL)
 def sql(
-    store: StorePath,
+    store: AskedPath,
     statement: Annotated[
         str | None, Argument(metavar="SQL", help="'SELECT … FROM frames, nodes, edges …'")
     ] = None,
@@ -237,6 +277,16 @@ def sql(
     safe: Safe = False,
     max_rows: MaxRows = 10_000,
     tables: With = None,
+    each: Annotated[
+        bool,
+        Option(
+            "--each",
+            help="Of a collection: run it in every bundle, with a column 'bundle'.",
+            rich_help_panel=COLLECTIONS,
+        ),
+    ] = False,
+    engine: EngineName = "local",
+    partial: Partial = False,
     *,
     ask: AskOptions,
 ) -> int:
@@ -245,6 +295,11 @@ def sql(
     Views: frames, nodes, edges, lane_states, lane_gaps, pairs, lanes, entities, payloads; DESCRIBE them.
     What a pattern returns is a table, too: FROM sgql('MATCH … RETURN …').
     """
+    if (url := url_of(store)) is not None:
+        with collection_at(url, ask, engine, tables, partial=partial, safe=safe) as whole:
+            rows = whole.sql(query_of(statement, file), each=each)
+            ask.write(rows.columns, rows)
+            return say_missing(whole)
     if safe:
         with _sandbox(store, ask, max_rows, tables) as box:
             answer = box.sql(query_of(statement, file))

@@ -12,6 +12,9 @@ in arrays that wait in a file of ``_staging``, sorted and summed by ``_columns``
 messages to its frames, and ``_publish`` brings it into the store. ``_classes`` adds classes of frames,
 ``_derive`` other sets of relations; ``_similarity`` compares frames. ``_verify`` looks whether all is as it
 was published, ``_rebuild`` makes stores, and makes them anew.
+
+Collections: ``_bundles`` copies traces into stores of their own and says what is in them, and ``_merge``
+makes one answer of those of several bundles.
 """
 
 import lazy_loader

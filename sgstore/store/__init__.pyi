@@ -1,5 +1,16 @@
 # The face of this package: what others may import from it.
 
+from ._bundles import CATALOGUE as CATALOGUE
+from ._bundles import Facts as Facts
+from ._bundles import answers_of as answers_of
+from ._bundles import facts_of as facts_of
+from ._bundles import join_bundles as join_bundles
+from ._bundles import maps_of_traces as maps_of_traces
+from ._bundles import names_of_traces as names_of_traces
+from ._bundles import parquet_rows as parquet_rows
+from ._bundles import write_bundle as write_bundle
+from ._catalog import relations_of_set as relations_of_set
+from ._catalog import subset_catalogs as subset_catalogs
 from ._merge import PartFile as PartFile
 from ._merge import merged_parts as merged_parts
 from ._merge import write_classes as write_classes
@@ -57,7 +68,9 @@ from ._write import Segment as Segment
 __all__ = [
     "BUCKET_BITS",
     "Batches",
+    "CATALOGUE",
     "DIGEST_BYTES",
+    "Facts",
     "Folder",
     "FrameRef",
     "Given",
@@ -83,24 +96,33 @@ __all__ = [
     "StoredTrace",
     "UserTables",
     "WINDOW",
+    "answers_of",
     "arrow_file",
     "as_told_batches",
     "begins",
     "count_parquet",
+    "facts_of",
     "frame_ids",
     "free_name",
     "graph_digests",
+    "join_bundles",
     "lengths_of_messages",
     "marks",
+    "maps_of_traces",
     "merged_parts",
     "messages_of",
+    "names_of_traces",
     "named_as",
+    "parquet_rows",
+    "relations_of_set",
     "remains_of",
     "seq_of",
+    "subset_catalogs",
     "take_place",
     "trace_id_of",
     "trace_of",
     "verify_file",
+    "write_bundle",
     "write_classes",
     "write_csv",
     "write_batches",

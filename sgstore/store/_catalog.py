@@ -68,9 +68,7 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
         own=_own(connection, "relation IS NULL"),
         own_edges=_own(connection, "relation IS NOT NULL"),
     )
-    sets: dict[str, Callable[[Catalog], Catalog]] = {
-        name: partial(_narrowed, name=name, of=of) for name, of in SUBSETS.items()
-    }
+    sets = subset_catalogs()
     derived: dict[str, list[DerivedSet]] = {}
     for one in _sets(connection):
         derived.setdefault(one.name, []).append(one)
@@ -78,6 +76,11 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
         changes = _derived(connection, whole, name, of)
         sets[name] = lambda catalog, changes=changes: replace(catalog, **changes)
     return replace(whole, sets=sets)
+
+
+def subset_catalogs() -> dict[str, Callable[[Catalog], Catalog]]:
+    """Abstractions that have some of the nodes and edges: what makes the catalog of each from a store's."""
+    return {name: partial(_narrowed, name=name, of=of) for name, of in SUBSETS.items()}
 
 
 def _sets(connection: DuckDBPyConnection) -> tuple[DerivedSet, ...]:
@@ -201,12 +204,28 @@ def _relations(
             None  # a function of ours or a client's made it, of which we only know what it has made
         )
     numbers = {one.trace_id for one in of}
-    answered = {relation for one in of for relation in one.answers}
+    answered = frozenset(relation for one in of for relation in one.answers)
     told = connection.execute("SELECT trace_id FROM trace WHERE map_id IS NOT NULL").fetchall()
-    if numbers & {number for (number,) in told}:
-        return frozenset(answered)
     known = (t.answers for t in whole.traces if t.trace_id in numbers)
-    return frozenset(RELATIONS) - (frozenset[str]().union(*known) - answered)
+    mapped = bool(numbers & {number for (number,) in told})
+    return relations_of_set(answered, frozenset[str]().union(*known), mapped=mapped)
+
+
+def relations_of_set(
+    answered: frozenset[str], known: frozenset[str], *, mapped: bool
+) -> frozenset[str]:
+    """The relations that a derived set has by its settings.
+
+    Parameters
+    ----------
+    answered : frozenset of str
+        What its traces can answer in it.
+    known : frozenset of str
+        What they can answer in the store.
+    mapped : bool
+        Whether one of them has a road map.
+    """
+    return answered if mapped else frozenset(RELATIONS) - (known - answered)
 
 
 def _words(names: Iterable[str]) -> str:

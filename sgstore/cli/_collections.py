@@ -1,0 +1,107 @@
+"""The verbs of collections: collection pack, unpack, verify, gc."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Final
+
+from typer import Argument, Option
+
+from sgstore.cli._options import (
+    ERROR,
+    PrintedRows,
+    StorePath,
+    Verbs,
+    app,
+    seconds_of,
+)
+from sgstore.cli._output import count_bar, say
+from sgstore.cli._places import url_of
+
+PANEL: Final = "More than one machine"
+
+Place = Annotated[
+    Path, Argument(metavar="URL", help="The collection: a folder, or s3://bucket/prefix.")
+]
+
+collection = Verbs(no_args_is_help=True)
+app.add_typer(
+    collection,
+    name="collection",
+    help="Collections of stores, in a folder or an object store: make and look after them.",
+    rich_help_panel=PANEL,
+)
+
+
+@collection.command()
+def pack(
+    store: StorePath,
+    url: Place,
+    bundle_traces: Annotated[
+        int | None,
+        Option("--bundle-traces", min=1, help="Most traces of a bundle.", show_default="1000"),
+    ] = None,
+    *,
+    out: PrintedRows,
+) -> int:
+    """Bring the traces of a store into a collection, which is made if there is none."""
+    from sgstore.collection import pack as pack_store
+
+    with count_bar("packing", "bundles") as on_bundle:
+        done = pack_store(
+            store, url_of(url) or url, bundle_traces=bundle_traces, on_bundle=on_bundle
+        )
+    rows = [(name, "added") for name in done.added] + [(name, "present") for name in done.present]
+    out.write(("trace", "status"), rows)
+    for old, new in done.renamed.items():
+        say(f"{old}: the collection has another trace of this name, so it is {new!r} there")
+    say(f"{url}: {len(done.added)} traces in {len(done.bundles)} bundles, snapshot {done.number}")
+    return 0
+
+
+@collection.command()
+def unpack(
+    url: Place,
+    store: Annotated[Path, Argument(metavar="STORE", help="The store that is made.")],
+) -> int:
+    """Put all traces of a collection into one new store."""
+    from sgstore.collection import unpack as unpack_all
+
+    names = unpack_all(url_of(url) or url, store)
+    say(f"{store}: {len(names)} traces")
+    return 0
+
+
+@collection.command()
+def verify(url: Place, *, out: PrintedRows) -> int:
+    """Verify that all bundles are as they were committed, and the catalogue true; list every fault."""
+    from sgstore.collection import verify as verify_all
+
+    found = verify_all(url_of(url) or url)
+    out.write(("what", "check", "detail"), found.faults)
+    wrong = f"{len(found.faults)} faults" if found.faults else "no fault"
+    say(f"{url}: snapshot {found.number}, {found.bundles} bundles, {found.traces} traces: {wrong}")
+    return ERROR if found.faults else 0
+
+
+@collection.command()
+def gc(
+    url: Place,
+    keep: Annotated[int, Option("--keep", min=1, help="Snapshots that stay, the last ones.")] = 1,
+    older: Annotated[
+        str,
+        Option("--older", metavar="TIME", help="Remove only files that were written so long ago."),
+    ] = "86400s",
+    dry_run: Annotated[bool, Option("--dry-run", help="Only say what would be removed.")] = False,
+    *,
+    out: PrintedRows,
+) -> int:
+    """Remove old snapshots, and files that no snapshot speaks of."""
+    from sgstore.collection import gc as collect
+
+    seconds = seconds_of(older, "--older")
+    found = collect(url_of(url) or url, keep=keep, older_s=seconds, dry_run=dry_run)
+    out.write(("file",), [(name,) for name in found.names])
+    verb = "would be removed" if dry_run else "removed"
+    say(f"{url}: {len(found.names)} files, {found.size} bytes {verb}; {found.young} are too young")
+    return 0

@@ -1,0 +1,29 @@
+# The face of this package: what others may import from it.
+
+from ._open import open as open
+from ._pack import CollectionFaults as CollectionFaults
+from ._pack import Commit as Commit
+from ._pack import Garbage as Garbage
+from ._pack import gc as gc
+from ._pack import pack as pack
+from ._pack import unpack as unpack
+from ._pack import verify as verify
+from ._questions import Collection as Collection
+from ._questions import PartedChecks as PartedChecks
+from ._questions import PartedMatches as PartedMatches
+from ._questions import PartialAnswerError as PartialAnswerError
+
+__all__ = [
+    "Collection",
+    "CollectionFaults",
+    "Commit",
+    "Garbage",
+    "PartedChecks",
+    "PartedMatches",
+    "PartialAnswerError",
+    "gc",
+    "open",
+    "pack",
+    "unpack",
+    "verify",
+]

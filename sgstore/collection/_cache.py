@@ -1,0 +1,117 @@
+"""Bundles on this machine: fetched once, and looked at once whether they are what the catalogue says.
+
+A bundle is called by the SHA-256 of its file. Of a collection in a folder it is used where it is; what was
+found right is remembered by the file's number, size and time, so that it is not read as a whole for each
+question.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from sgstore.collection._place import digest_of_file
+from sgstore.errors import StoreError
+
+if TYPE_CHECKING:
+    from sgstore.collection._place import Place
+
+CACHE: Final = "SGSTORE_CACHE"
+"""Variable of the environment: the folder for bundles that were fetched."""
+
+
+def cache_folder() -> Path:
+    """The folder for bundles that were fetched, and for what is remembered of others; it is made.
+
+    Raises
+    ------
+    StoreError
+        It cannot be made.
+    """
+    told = os.environ.get(CACHE)
+    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    folder = Path(told) if told else Path(base).expanduser() / "sgstore"
+    try:
+        (folder / "bundles").mkdir(parents=True, exist_ok=True)
+        (folder / "seen").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreError(
+            f"{folder}: cannot be written: {error.strerror}; {CACHE} names another folder for bundles"
+        ) from error
+    return folder
+
+
+def bundle_path(place: Place, sha: str, *, again: bool = False) -> Path:
+    """The file of a bundle on this machine, after it was seen to be what its name says.
+
+    Parameters
+    ----------
+    place : Place
+    sha : str
+    again : bool
+        Whether it is looked at even if it was found right before.
+
+    Raises
+    ------
+    StoreError
+        It is not there, cannot be fetched, or is not as it was committed.
+    """
+    folder, name = cache_folder(), f"bundles/{sha}.sgstore"
+    path = place.local(name)
+    if path is None:
+        path = folder / name
+        if not path.exists():
+            _fetch(place, name, sha, path)
+            return path
+    if again or not _seen(folder, sha, path):
+        if (held := digest_of_file(path)) != sha:
+            raise StoreError(
+                f"{place.url}/{name}: not as it was committed: its SHA-256 is {held[:12]}…;"
+                " put the file back from a copy, or remove its traces from the collection"
+            )
+        _remember(folder, sha, path)
+    return path
+
+
+def _fetch(place: Place, name: str, sha: str, path: Path) -> None:
+    fresh = path.with_name(f".{sha}.{os.getpid()}-{secrets.token_hex(4)}")
+    try:
+        place.fetch(name, fresh)
+        if (held := digest_of_file(fresh)) != sha:
+            raise StoreError(
+                f"{place.url}/{name}: not as it was committed: its SHA-256 is {held[:12]}…"
+            )
+        fresh.replace(path)
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        with suppress(OSError):
+            fresh.unlink(missing_ok=True)
+
+
+def _stamp(path: Path) -> list[int]:
+    about = path.stat()
+    return [about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns]
+
+
+def _seen(folder: Path, sha: str, path: Path) -> bool:
+    """Tell whether a file was found right, and looks the same since."""
+    try:
+        return json.loads((folder / "seen" / sha).read_text()) == _stamp(path)
+    except FileNotFoundError:
+        if not path.exists():
+            raise StoreError(f"{path}: a bundle that the catalogue speaks of is gone") from None
+        return False
+    except (OSError, ValueError):
+        return False
+
+
+def _remember(folder: Path, sha: str, path: Path) -> None:
+    fresh = folder / "seen" / f".{sha}.{os.getpid()}"
+    with suppress(OSError):  # then it is looked at again
+        fresh.write_text(json.dumps(_stamp(path)))
+        fresh.replace(folder / "seen" / sha)

@@ -1,0 +1,415 @@
+"""The catalogue of a collection: snapshots, each of which says all that is in it.
+
+A snapshot has a number, a folder of Parquet files and one of JSON beside that, which is written last, and only
+if there is none of that number: so a snapshot is there as a whole or not at all, and of two commits at once
+one has to look again. Questions keep to the snapshot that they began with.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.collection._place import digest_of_file
+from sgstore.errors import ExportError, StoreError
+from sgstore.files import working_folder
+from sgstore.lang import Catalog, RelationScope, TraceFacts, Type
+from sgstore.store import (
+    CATALOGUE,
+    SCHEMA_VERSION,
+    answers_of,
+    parquet_rows,
+    relations_of_set,
+    subset_catalogs,
+    write_parquet,
+)
+from sgstore.vocabulary import NAMES, natural
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from sgstore.collection._place import Place
+    from sgstore.store import Facts
+
+ABOUT: Final = "COLLECTION.json"
+FORMAT: Final = 1
+"""Version of the layout."""
+
+BUNDLE_TRACES: Final = 1_000
+"""Most traces of a bundle, unless the collection says otherwise."""
+
+BUNDLE_BYTES: Final = 512 << 20
+"""About how many bytes a bundle should have at most."""
+
+_SNAPSHOTS: Final = "catalogue"
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What a collection says of itself, once for all.
+
+    Attributes
+    ----------
+    schema_version : str
+        Of its bundles.
+    bundle_traces, bundle_bytes : int
+        How large its bundles are to be at most.
+    """
+
+    schema_version: str = SCHEMA_VERSION
+    bundle_traces: int = BUNDLE_TRACES
+    bundle_bytes: int = BUNDLE_BYTES
+
+
+def about(place: Place) -> About:
+    """What a collection says of itself.
+
+    Raises
+    ------
+    StoreError
+        There is no collection, or one of another version.
+    """
+    try:
+        told = json.loads(place.read(ABOUT))
+        known = (
+            told["format"],
+            About(
+                str(told["schema_version"]), int(told["bundle_traces"]), int(told["bundle_bytes"])
+            ),
+        )
+    except StoreError as error:
+        raise StoreError(
+            f"{place.url}: not a collection, or it cannot be read ({error});"
+            " 'sgstore collection pack STORE URL' makes one"
+        ) from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise StoreError(f"{place.url}/{ABOUT}: cannot be read: {error!r}") from error
+    if known[0] != FORMAT:
+        raise StoreError(
+            f"{place.url}: a collection of format {known[0]}; this version of sgstore reads {FORMAT}"
+        )
+    return known[1]
+
+
+def create(place: Place, wanted: About) -> About:
+    """Make a collection where there is none; what it says of itself."""
+    told = {
+        "format": FORMAT,
+        "schema_version": wanted.schema_version,
+        "bundle_traces": wanted.bundle_traces,
+        "bundle_bytes": wanted.bundle_bytes,
+    }
+    place.write_new(ABOUT, json.dumps(told, indent=2).encode() + b"\n")
+    return about(place)
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A state of a collection.
+
+    Attributes
+    ----------
+    number : int
+        0: nothing was committed yet.
+    facts : dict
+        Rows of the tables of the catalogue, by table.
+    """
+
+    number: int = 0
+    facts: Facts = field(default_factory=lambda: {table: [] for table in CATALOGUE})
+
+    @cached_property
+    def bundles(self) -> tuple[dict[str, Any], ...]:
+        """The rows of table ``bundle``, in the order in which they were committed."""
+        names = [*CATALOGUE["bundle"]]
+        return tuple(dict(zip(names, row, strict=True)) for row in self.facts["bundle"])
+
+    @cached_property
+    def traces(self) -> tuple[dict[str, Any], ...]:
+        """The rows of table ``trace``, by name in natural order."""
+        names = [*CATALOGUE["trace"]]
+        found = (dict(zip(names, row, strict=True)) for row in self.facts["trace"])
+        return tuple(sorted(found, key=lambda row: natural(row["name"])))
+
+    def of(self, table: str, bundle: str) -> list[tuple[Any, ...]]:
+        """The rows of a table that speak of a bundle."""
+        return self._by_bundle(table).get(bundle, [])
+
+    def _by_bundle(self, table: str) -> dict[str, list[tuple[Any, ...]]]:
+        if table not in self._grouped:
+            found: dict[str, list[tuple[Any, ...]]] = {}
+            for row in self.facts[table]:
+                found.setdefault(row[0], []).append(row)
+            self._grouped[table] = found
+        return self._grouped[table]
+
+    @cached_property
+    def _grouped(self) -> dict[str, dict[str, list[tuple[Any, ...]]]]:
+        return {}
+
+    @cached_property
+    def words(self) -> dict[str, tuple[str, ...]]:
+        """Enumeration → values that bundles have beside those of every store, in one order."""
+        found: dict[str, dict[str, None]] = {enum: {} for enum in NAMES}
+        for _, what, word, _, _ in sorted(
+            self.facts["word"], key=lambda row: (row[1], row[4], row[2])
+        ):
+            if what in found:
+                found[what][word] = None
+        return {enum: tuple(words) for enum, words in found.items()}
+
+    @cached_property
+    def own(self) -> dict[str, dict[str, Type]]:
+        """``own`` and ``own_edges`` → attributes of a client's own, with their types over all bundles."""
+        found: dict[str, dict[str, Type]] = {"own": {}, "own_edges": {}}
+        for _, what, word, kind, _ in self.facts["word"]:
+            if what in found:
+                known = found[what].setdefault(word, Type(kind))
+                found[what][word] = known if known is Type(kind) else Type.text
+        return found
+
+    @cached_property
+    def classed(self) -> tuple[str, ...]:
+        """Abstractions in which classes of frames are known in some bundle."""
+        return tuple(sorted({row[2] for row in self.facts["word"] if row[1] == "classed"}))
+
+    @cached_property
+    def catalog(self) -> Catalog:
+        """What all bundles hold together, for the compiler."""
+        return self.catalog_of([bundle["bundle"] for bundle in self.bundles])
+
+    def catalog_of(self, bundles: Sequence[str]) -> Catalog:
+        """What some bundles hold together; names are those of all."""
+        edges, map_edges = Counter[Any](), Counter[Any]()
+        kinds: dict[str, set[str]] = {home: set() for home in ("moving", "fixed", "mapped")}
+        for bundle in bundles:
+            for _, name, moving, relation, src, dst, rows in self.of("triple", bundle):
+                if not name:
+                    (edges if moving else map_edges)[relation, src, dst] += rows
+            for _, home, kind in self.of("kind", bundle):
+                kinds[home].add(kind)
+        chosen = frozenset(bundles)
+        whole = Catalog(
+            edges=dict(edges),
+            map_edges=dict(map_edges),
+            moving=frozenset(kinds["moving"]),
+            fixed=frozenset(kinds["fixed"]),
+            mapped=frozenset(kinds["mapped"]),
+            traces=tuple(
+                facts
+                for bundle, facts in zip(self._homes, self._facts, strict=True)
+                if bundle in chosen
+            ),
+            classed=self.classed,
+            names=self.words,
+            own=self.own["own"],
+            own_edges=self.own["own_edges"],
+        )
+        sets = subset_catalogs()
+        sets |= {name: partial(self._derived, name, chosen) for name in self.sets}
+        return replace(whole, sets=sets)
+
+    @cached_property
+    def _homes(self) -> tuple[str, ...]:
+        return tuple(row["bundle"] for row in self.traces)
+
+    @cached_property
+    def _facts(self) -> tuple[TraceFacts, ...]:
+        settings: dict[str, RelationScope | None] = {}
+        for digest, text in self.facts["config"]:
+            settings[digest] = RelationScope.of(json.loads(text))
+        answers: dict[str, frozenset[str]] = {}
+        for row in self.traces:
+            if row["answers"] not in answers:
+                answers[row["answers"]] = frozenset(answers_of(row["answers"]))
+        return tuple(
+            TraceFacts(
+                row["trace_id"],
+                row["name"],
+                row["ego"],
+                answers[row["answers"]],
+                settings.get(row["config"]),
+                row["period_ns"],
+                (row["first_bucket"], row["buckets"]),
+            )
+            for row in self.traces
+        )
+
+    @cached_property
+    def sets(self) -> dict[str, list[tuple[Any, ...]]]:
+        """Derived sets by name: their rows of table ``set``."""
+        found: dict[str, list[tuple[Any, ...]]] = {}
+        for row in self.facts["set"]:
+            found.setdefault(row[1], []).append(row)
+        return found
+
+    def _derived(self, name: str, bundles: frozenset[str], whole: Catalog) -> Catalog:
+        """The catalog of a derived set, of the traces that have it."""
+        edges = Counter[Any]()
+        for bundle in bundles:
+            for _, of, moving, relation, src, dst, rows in self.of("triple", bundle):
+                if of == name and moving:
+                    edges[relation, src, dst] += rows
+        own = {row[2]: row for row in self.sets[name] if row[0] in bundles}
+        traces = tuple(
+            TraceFacts(
+                one.trace_id,
+                one.name,
+                one.ego,
+                frozenset(answers_of(own[one.trace_id][5])),
+                RelationScope.of(json.loads(own[one.trace_id][4])),
+                one.period_ns,
+                one.extent,
+            )
+            for one in whole.traces
+            if one.trace_id in own
+        )
+        relations = self.relations_of(name)
+        return replace(
+            whole, name=name, edges=dict(edges), traces=traces, relations=relations, lacks={}
+        )
+
+    def relations_of(self, name: str) -> frozenset[str] | None:
+        """The relations that a derived set has by its settings, over all bundles; ``None``: unknown."""
+        rows = self.sets[name]
+        numbers = {row[2] for row in rows}
+        if any("abstraction" in json.loads(row[4]) for row in rows):
+            return None
+        answered = frozenset(one for row in rows for one in answers_of(row[5]))
+        of = [row for row in self.traces if row["trace_id"] in numbers]
+        known = frozenset(one for row in of for one in answers_of(row["answers"]))
+        mapped = any(row["map_digest"] for row in of)
+        return relations_of_set(answered, known, mapped=mapped)
+
+
+# Snapshots of a place -------------------------------------------------------------------------------
+
+
+def _name(number: int) -> str:
+    return f"{_SNAPSHOTS}/{number:08d}"
+
+
+def numbers(place: Place) -> list[int]:
+    """The numbers of all snapshots."""
+    found: list[int] = []
+    for name, _, _ in place.names(_SNAPSHOTS):
+        head, _, tail = name.removeprefix(f"{_SNAPSHOTS}/").partition(".")
+        if tail == "json" and head.isdecimal():
+            found.append(int(head))
+    return sorted(found)
+
+
+def latest(place: Place) -> Snapshot:
+    """The last snapshot of a collection.
+
+    Raises
+    ------
+    StoreError
+        There is no collection, or the catalogue is damaged.
+    """
+    about(place)
+    known = numbers(place)
+    return read(place, known[-1]) if known else Snapshot()
+
+
+def read(place: Place, number: int) -> Snapshot:
+    """A snapshot by its number.
+
+    Raises
+    ------
+    StoreError
+        A file of it is gone, or is not as it was written.
+    """
+    try:
+        told = json.loads(place.read(f"{_name(number)}.json"))
+        digests: Mapping[str, str] = told["tables"]
+        folder: str = told["folder"]
+        missing = set(CATALOGUE) - set(digests)
+    except (ValueError, KeyError, TypeError) as error:
+        raise StoreError(f"{place.url}/{_name(number)}.json: cannot be read: {error!r}") from error
+    if missing:
+        raise StoreError(
+            f"{place.url}/{_name(number)}.json: has no {', '.join(sorted(missing))}; was it made by another"
+            " version of sgstore?"
+        )
+    facts: Facts = {}
+    with working_folder("catalogue") as held:
+        for table, columns in CATALOGUE.items():
+            name = f"{folder}/{table}.parquet"
+            path = place.local(name)
+            if path is None:
+                path = held / f"{table}.parquet"
+                place.fetch(name, path)
+            if digest_of_file(path) != digests[table]:
+                raise StoreError(
+                    f"{place.url}/{name}: not as it was committed: its SHA-256 differs"
+                )
+            facts[table] = parquet_rows(path, columns)
+    return Snapshot(number, facts)
+
+
+def write(place: Place, number: int, facts: Facts) -> bool:
+    """Commit a snapshot; tell whether it was the first one of that number.
+
+    The files of one that came too late are removed.
+    """
+    with working_folder("catalogue") as held:
+        digests: dict[str, str] = {}
+        for table, columns in CATALOGUE.items():
+            path = held / f"{table}.parquet"
+            try:
+                write_parquet([*columns], facts[table], path, [*columns.values()])
+            except ExportError as error:
+                raise StoreError(str(error)) from error
+            digests[table] = digest_of_file(path)
+        mark = hashlib.sha256(json.dumps(digests, sort_keys=True).encode()).hexdigest()[:12]
+        folder = f"{_name(number)}-{mark}"
+        names = {table: f"{folder}/{table}.parquet" for table in CATALOGUE}
+        for table, name in names.items():
+            place.upload(held / f"{table}.parquet", name)
+        told = {"format": FORMAT, "number": number, "folder": folder, "tables": digests}
+        data = json.dumps(told, indent=2).encode() + b"\n"
+        if place.write_new(f"{_name(number)}.json", data):
+            return True
+    if json.loads(place.read(f"{_name(number)}.json")).get("folder") != folder:
+        for name in names.values():
+            with suppress(StoreError):
+                place.remove(name)
+    return False
+
+
+def joined(facts: Iterable[Facts]) -> Facts:
+    """The rows of several catalogues as one; of settings that are the same, one row."""
+    found: Facts = {table: [] for table in CATALOGUE}
+    for one in facts:
+        for table, rows in one.items():
+            found[table] += rows
+    found["config"] = sorted(set(found["config"]))
+    return found
+
+
+def without(facts: Facts, bundles: Iterable[str]) -> Facts:
+    """The rows of a catalogue that do not speak of some bundles."""
+    gone = frozenset(bundles)
+    kept = {
+        table: rows if table == "config" else [row for row in rows if row[0] not in gone]
+        for table, rows in facts.items()
+    }
+    place = [*CATALOGUE["trace"]].index("config")
+    used = {row[place] for row in kept["trace"]}
+    return kept | {"config": [row for row in kept["config"] if row[0] in used]}
+
+
+def files(place: Place, known: Iterable[int]) -> set[str]:
+    """Names of the files that some snapshots are made of."""
+    found: set[str] = set()
+    for number in known:
+        told = json.loads(place.read(f"{_name(number)}.json"))
+        found.add(f"{_name(number)}.json")
+        found |= {f"{told['folder']}/{table}.parquet" for table in told["tables"]}
+    return found

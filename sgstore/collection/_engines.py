@@ -1,0 +1,227 @@
+"""Engines: who does the tasks of a question. One seam, ``map``; nobody here knows what a task is about.
+
+``local:N`` does them in N processes of this machine, ``local`` or ``local:1`` in this one. ``ray`` and
+``ray://HOST:PORT`` hand them to Ray.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections import deque
+from contextlib import suppress
+from importlib import import_module
+from queue import SimpleQueue
+from typing import TYPE_CHECKING, Any, Final, Protocol, TextIO
+
+from sgstore.errors import MissingExtraError, SgstoreError, StoreError
+from sgstore.processes import command
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+RETRIES: Final = 3
+"""How often a task is done again whose process or machine was lost."""
+
+Task = dict[str, Any]
+Outcome = dict[str, Any]
+
+
+class Engine(Protocol):
+    """Who does tasks.
+
+    Attributes
+    ----------
+    shares_files : bool
+        Whether what a task writes to a folder of this machine can be read here.
+    """
+
+    shares_files: bool
+
+    def map(self, function: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[Outcome]:
+        """Yield the outcome of each task, as they come; ``{"bundle": …, "error": …}`` of one that failed."""
+        ...
+
+
+def engine_named(name: str) -> Engine:
+    """An engine by its name: ``local``, ``local:4``, ``ray``, ``ray://HOST:PORT``.
+
+    Raises
+    ------
+    StoreError
+        There is none of that name.
+    MissingExtraError
+        Its package is not installed.
+    """
+    word, _, rest = name.partition(":")
+    if word == "local":
+        number = int(rest) if rest.isdecimal() else 1 if not rest else -1
+        if number < 0:
+            raise StoreError(f"engine {name!r}: expected local:N, such as local:4 (0: all cores)")
+        count = number or os.cpu_count() or 1
+        return _Here() if count == 1 else _Processes(count)
+    if word == "ray":
+        return _Ray(name if rest else None)
+    raise StoreError(f"no engine {name!r}; there are: local, local:N, ray, ray://HOST:PORT")
+
+
+def refusal(task: Task, error: SgstoreError) -> Outcome:
+    """The outcome of a task that was refused: to do it again would not help."""
+    return {"bundle": task["bundle"], "error": str(error)}
+
+
+class _Here:
+    shares_files = True
+
+    def map(self, function: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[Outcome]:
+        for task in tasks:
+            try:
+                yield function(task)
+            except SgstoreError as error:
+                yield refusal(task, error)
+
+
+class _Processes:
+    """Processes of this machine; whoever is free takes the next task, and one that dies is replaced."""
+
+    shares_files = True
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+
+    def map(self, function: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[Outcome]:
+        name = f"{function.__module__}:{function.__qualname__}"
+        waiting = deque(enumerate(tasks))
+        tries = [0] * len(tasks)
+        events: SimpleQueue[tuple[_Process, str | None]] = SimpleQueue()
+        workers: set[_Process] = set()
+        left = len(tasks)
+        try:
+            while left:
+                while waiting and len(workers) < self._count:
+                    workers.add(_Process(name, events))
+                for worker in workers:
+                    if worker.task is None and waiting:
+                        worker.begin(waiting.popleft())
+                worker, line = events.get()
+                held, worker.task = worker.task, None
+                if line is not None:
+                    left -= 1
+                    yield json.loads(line)
+                    continue
+                workers.discard(worker)
+                code = worker.end()
+                if held is None:
+                    continue
+                tries[held[0]] += 1
+                if tries[held[0]] <= RETRIES:
+                    waiting.appendleft(held)
+                else:
+                    left -= 1
+                    how = f"signal {-code}" if code < 0 else f"code {code}"
+                    reason = f"the process that asked it ended with {how}, {tries[held[0]]} times"
+                    yield {"bundle": held[1]["bundle"], "error": reason}
+        finally:
+            for worker in workers:
+                worker.end()
+
+
+class _Process:
+    """A process that does tasks, one after the other."""
+
+    def __init__(self, name: str, events: SimpleQueue[tuple[_Process, str | None]]) -> None:
+        separate: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
+        self.task: tuple[int, Task] | None = None
+        self._events = events
+        self._process = subprocess.Popen(  # noqa: S603  a module of ours
+            [*command("sgstore.collection._engines"), name],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            encoding="utf-8",
+            **separate,
+        )
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
+
+    def _listen(self) -> None:
+        for line in self._process.stdout or ():
+            self._events.put((self, line))
+        self._events.put((self, None))
+
+    def begin(self, task: tuple[int, Task]) -> None:
+        """Hand over a task. If the process has died, that is told where its stdout ends."""
+        self.task = task
+        with suppress(OSError):
+            assert self._process.stdin is not None  # noqa: S101 - it was asked for
+            self._process.stdin.write(f"{json.dumps(task[1])}\n")
+            self._process.stdin.flush()
+
+    def end(self) -> int:
+        """End the process if it still runs; its exit code."""
+        self._process.kill()
+        code = self._process.wait()
+        self._listener.join()
+        for pipe in (self._process.stdin, self._process.stdout):
+            with suppress(OSError):
+                if pipe is not None:
+                    pipe.close()
+        return code
+
+
+class _Ray:
+    """Tasks of Ray: one that is lost with its worker or its node is done again, by Ray itself."""
+
+    shares_files = False
+
+    def __init__(self, address: str | None) -> None:
+        try:
+            self._ray: Any = import_module("ray")
+        except ImportError as error:
+            raise MissingExtraError("the engine ray", "ray") from error
+        if not self._ray.is_initialized():
+            self._ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+
+    def map(self, function: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[Outcome]:
+        run = self._ray.remote(max_retries=RETRIES)(_done)
+        name = f"{function.__module__}:{function.__qualname__}"
+        pending = {run.remote(name, task): task for task in tasks}
+        while pending:
+            ready, _ = self._ray.wait([*pending], num_returns=1)
+            for one in ready:
+                task = pending.pop(one)
+                try:
+                    yield self._ray.get(one)
+                except self._ray.exceptions.RayError as error:
+                    (first, *_) = str(error).strip().splitlines() or [type(error).__name__]
+                    yield {"bundle": task["bundle"], "error": first}
+
+
+# A process that does tasks for another -----------------------------------------------------------
+
+
+def _function(name: str) -> Callable[[Task], Outcome]:
+    module, _, function = name.partition(":")
+    return getattr(import_module(module), function)
+
+
+def _done(name: str, task: Task) -> Outcome:
+    try:
+        return _function(name)(task)
+    except SgstoreError as error:
+        return refusal(task, error)
+
+
+def main(name: str, stdin: TextIO, answers: TextIO) -> None:
+    """Do the tasks that come as lines of JSON, until there are no more."""
+    for line in stdin:
+        answers.write(f"{json.dumps(_done(name, json.loads(line)))}\n")
+        answers.flush()
+
+
+if __name__ == "__main__":
+    out = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    sys.stdout = sys.stderr  # what anything prints is no answer
+    main(sys.argv[1], sys.stdin, out)

@@ -1,0 +1,78 @@
+"""The one way to open what is there: a store, or with an engine a collection of stores."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, overload
+
+from sgstore.query import Store
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from sgstore.collection._questions import Collection
+
+
+@overload
+def open(
+    path: str | Path,
+    *,
+    create: bool = False,
+    memory: int = 0,
+    tables: Mapping[str, object] | None = None,
+    max_spill: int = 0,
+    root: str | Path | None = None,
+) -> Store: ...
+
+
+@overload
+def open(
+    path: str | Path,
+    *,
+    engine: str,
+    tables: Mapping[str, object] | None = None,
+    partial: bool = False,
+) -> Collection: ...
+
+
+def open(  # noqa: PLR0913  those of a store, and those of a collection
+    path: str | Path,
+    *,
+    create: bool = False,
+    memory: int = 0,
+    tables: Mapping[str, object] | None = None,
+    max_spill: int = 0,
+    root: str | Path | None = None,
+    engine: str = "",
+    partial: bool = False,
+) -> Store | Collection:
+    """Open a store, or with ``engine`` a collection of stores.
+
+    ::
+
+        with sgstore.open("drives.sgstore", create=True) as store:
+            store.ingest("recordings/")
+        with sgstore.open("fleet/", engine="local:8") as fleet:
+            print(fleet.find("MATCH (e:Ego)-[:near_coll]->(p:Person)").count())
+
+    Parameters
+    ----------
+    path : str or Path
+        Of a collection its place: a folder, or ``s3://bucket/prefix``.
+    create, memory, tables, max_spill, root
+        As :class:`sgstore.Store` takes them; of a collection ``tables`` only.
+    engine : str
+        Who asks the stores of a collection: ``local``, ``local:8``, ``ray``, ``ray://HOST:PORT``.
+    partial : bool
+        Whether an answer of a collection may lack stores that cannot be asked.
+
+    Raises
+    ------
+    StoreError
+        There is no store, or no collection, or it is one of another version.
+    """
+    if not engine:
+        return Store(path, create=create, memory=memory, tables=tables, max_spill=max_spill, root=root)
+    from sgstore.collection._questions import Collection
+
+    return Collection(path, engine=engine, tables=tables, partial=partial)

@@ -1,0 +1,622 @@
+"""Questions to a collection: asked of the bundles that may answer, and one answer made of theirs.
+
+A question is compiled once, against what all bundles hold together: that says what is wrong with it, and which
+bundles need not be opened. The rows of each bundle come into a folder of this process as Parquet files, and a
+statement makes one answer of them, which is the answer of one store with all the traces.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from copy import copy
+from dataclasses import replace
+from functools import cached_property
+from heapq import merge
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from sgstore.collection import _catalogue as catalogue
+from sgstore.collection import _worker as worker
+from sgstore.collection._engines import engine_named
+from sgstore.collection._pack import refuse_others
+from sgstore.collection._place import place_at
+from sgstore.errors import SqlError, StoreError
+from sgstore.files import working_folder
+from sgstore.lang import (
+    CLASSES_GIVEN,
+    PARTS,
+    Layout,
+    Pruning,
+    TableFacts,
+    Type,
+    class_questions,
+    compile_checks,
+    compile_query,
+    for_people,
+    parted,
+    traces_of,
+)
+from sgstore.matches import Interval, merged, row_type
+from sgstore.store import (
+    SEQ_BITS,
+    FrameRef,
+    PartFile,
+    StoreFile,
+    Tabular,
+    UserTables,
+    merged_parts,
+    write_parquet,
+)
+from sgstore.vocabulary import natural
+from sgstore.world import Clip, tolerance_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+    import networkx as nx
+
+    from sgstore.collection._catalogue import Snapshot
+    from sgstore.collection._engines import Engine
+    from sgstore.lang import Catalog, CheckInCatalog, ClassQuestion, Compiled, Pattern
+    from sgstore.temporal import Verdict
+
+_SHOWN: Final = 8
+"""Bundles that a message names; the others are counted."""
+
+
+_ALL: Final = f"FROM {PARTS}"
+
+
+class PartialAnswerError(StoreError):
+    """Some bundles did not answer.
+
+    Attributes
+    ----------
+    bundles : dict of str to str
+        Those that did not, and why.
+    """
+
+    def __init__(self, message: str, bundles: Mapping[str, str]) -> None:
+        super().__init__(message)
+        self.bundles = dict(bundles)
+
+
+class Collection:
+    """A collection of stores, by its place: the questions of a store, asked of all its bundles.
+
+    Parameters
+    ----------
+    url : str or Path
+        A folder, or ``s3://bucket/prefix``.
+    engine : str
+        Who asks the bundles: ``local`` (this process), ``local:4`` (4 processes), ``ray``, ``ray://HOST:PORT``.
+    tables : mapping of str to path or data frame, optional
+        Tables of one's own that are joined to the frames, as :class:`sgstore.Store` takes them.
+    partial : bool
+        Whether an answer may lack bundles that cannot be asked; ``missing`` says which.
+
+    Raises
+    ------
+    StoreError
+        There is no collection, its catalogue cannot be read, or bundles are of another version.
+
+    Attributes
+    ----------
+    snapshot : Snapshot
+        What it holds; questions keep to it.
+    missing : dict of str to str
+        Bundles that did not answer a question so far, and why; only with ``partial``.
+    opened : list of str
+        Bundles that the last question was asked of.
+    """
+
+    def __init__(
+        self,
+        url: str | Path,
+        *,
+        engine: str = "local",
+        tables: Mapping[str, object] | None = None,
+        partial: bool = False,
+    ) -> None:
+        self.place = place_at(url)
+        self.snapshot: Snapshot = catalogue.latest(self.place)
+        refuse_others(self.place, self.snapshot)
+        self.missing: dict[str, str] = {}
+        self.opened: list[str] = []
+        self._engine_name, self._partial = engine, partial
+        self._tables = UserTables(tables) if tables else None
+
+    def __repr__(self) -> str:
+        return f"Collection({self.place.url!r})"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Do nothing: no file stays open between questions."""
+
+    @cached_property
+    def engine(self) -> Engine:
+        """Who asks the bundles; begun with the first question."""
+        return engine_named(self._engine_name)
+
+    @cached_property
+    def catalog(self) -> Catalog:
+        """What all bundles hold together, with the tables of one's own."""
+        found = self.snapshot.catalog
+        return found if self._tables is None else replace(found, tables=self._table_facts())
+
+    def _table_facts(self) -> dict[str, TableFacts]:
+        """What the compiler must know of tables of one's own: how their rows fit the frames of all bundles."""
+        told: dict[str, dict[str, Any]] = {}
+        for result in self.ask({"kind": "tables"}, self.bundles() or [worker.EMPTY]):
+            for name, one in result["tables"].items():
+                known = told.setdefault(name, {**one, "matched": 0, "frames": 0, "traces": None})
+                known["matched"] += one["matched"]
+                known["frames"] += one["frames"]
+                if one["traces"] is not None:
+                    known["traces"] = frozenset({*(known["traces"] or ()), *one["traces"]})
+        return {name: _facts_of_table(name, one) for name, one in told.items()}
+
+    def bundles(self) -> list[str]:
+        """All bundles, the largest first."""
+        ordered = sorted(self.snapshot.bundles, key=lambda one: (-one["bytes"], one["bundle"]))
+        return [one["bundle"] for one in ordered]
+
+    def traces(self) -> tuple[dict[str, Any], ...]:
+        """What the catalogue says of each trace, by name in natural order (``run2`` before ``run10``)."""
+        return self.snapshot.traces
+
+    info = traces
+
+    def find(self, query: str | Pattern | nx.Graph[Any], /, **parameters: object) -> PartedMatches:
+        """Return the matches of a pattern; see :meth:`sgstore.Store.find`.
+
+        Raises
+        ------
+        QueryError
+            The text is no query, or names what the collection does not know; it says where.
+        """
+        if not isinstance(query, str):
+            from sgstore.lang import Pattern
+
+            pattern = query if isinstance(query, Pattern) else Pattern.of(query)
+            query, parameters = str(pattern), {**pattern.parameters, **parameters}
+        return PartedMatches(self, query, parameters)
+
+    def check(
+        self,
+        text: str,
+        /,
+        *,
+        sgsm_compat: bool = False,
+        status: bool = False,
+        **parameters: object,
+    ) -> PartedChecks:
+        """Verdicts of ``CHECK`` statements for every trace; see :meth:`sgstore.Store.check`.
+
+        Raises
+        ------
+        QueryError
+            The text has no checks, or names what the collection does not know; it says where.
+        """
+        about = {"sgsm_compat": sgsm_compat, "status": status}
+        return PartedChecks(self, text, parameters, about)
+
+    def sql(self, text: str, *, each: bool = False) -> PartedRows:
+        """The rows of a statement that is run in every bundle, with a column ``bundle`` before them.
+
+        Parameters
+        ----------
+        text : str
+        each : bool
+            That it is meant so: a statement cannot be split, and what it counts it counts in each bundle.
+
+        Raises
+        ------
+        SqlError
+            ``each`` is not said, or the database refuses the statement.
+        """
+        if not each:
+            raise SqlError(
+                "a statement in SQL cannot be split over bundles: say --each (each=True) to run it in"
+                " every bundle, with a column 'bundle'; or 'sgstore collection unpack' makes one store of all"
+            )
+        return PartedRows(self, text)
+
+    # How a question is asked ----------------------------------------------------------------------
+
+    def ask(self, question: dict[str, Any], bundles: Sequence[str]) -> Iterator[dict[str, Any]]:
+        """Yield what each of some bundles answers, as they come.
+
+        Raises
+        ------
+        PartialAnswerError
+            Some did not answer, and an answer must be whole.
+        """
+        self.opened = list(bundles)
+        failed: dict[str, str] = {}
+        with working_folder("answers") as folder:
+            base = self._task(question, folder)
+            tasks = [base | {"bundle": bundle} for bundle in bundles]
+            done = set[str]()
+            for result in self.engine.map(worker.answer, tasks):
+                if result["bundle"] in done:
+                    continue
+                done.add(result["bundle"])
+                if "error" in result:
+                    failed[result["bundle"]] = result["error"]
+                    if not self._partial:
+                        break
+                    continue
+                yield worker.brought(result, folder)
+            self._judge(failed, len(tasks))
+
+    def _judge(self, failed: Mapping[str, str], asked: int) -> None:
+        if failed and not self._partial:
+            told = [f"{name[:12]}…: {why}" for name, why in failed.items()]
+            more = [f"… and {len(told) - _SHOWN} more"] if len(told) > _SHOWN else []
+            listed = "\n  ".join([*told[:_SHOWN], *more])
+            raise PartialAnswerError(
+                f"{self.place.url}: not all of {asked} bundles could be asked:\n  {listed}", failed
+            )
+        self.missing |= failed
+
+    def _task(self, question: dict[str, Any], folder: Path) -> dict[str, Any]:
+        snapshot, tables = self.snapshot, dict[str, str]()
+        for table in self._tables.tables if self._tables is not None else ():
+            tables[table.name] = self._sent(table.place)
+        for name, path in question.pop("given", {}).items():
+            tables[name] = self._sent(path)
+        whole = {
+            "words": {enum: [*words] for enum, words in snapshot.words.items()},
+            "own": {name: kind.value for name, kind in snapshot.own["own"].items()},
+            "own_edges": {name: kind.value for name, kind in snapshot.own["own_edges"].items()},
+            "classed": [*snapshot.classed],
+            "sets": {
+                name: None if (known := snapshot.relations_of(name)) is None else sorted(known)
+                for name in snapshot.sets
+            },
+        }
+        to = str(folder) if self.engine.shares_files else ""
+        about = {"url": self.place.url, "whole": whole, "tables": tables, "to": to}
+        return {"text": "", "parameters": {}, "limit": None} | question | about
+
+    def _sent(self, path: Path) -> str:
+        """A table as a task names it: its file, or its bytes where files are not shared."""
+        if self.engine.shares_files:
+            return str(path)
+        return "base64:" + base64.b64encode(path.read_bytes()).decode()
+
+    def classes(self, questions: Iterable[ClassQuestion], folder: Path) -> dict[str, Path]:
+        """The table of classes that all bundles have, for those that are asked; nothing if none is asked."""
+        rows: list[tuple[str, str, str, int]] = []
+        asked = False
+        for one in questions:
+            asked = True
+            if not one.dataset:
+                rows += self._counted(one.abstraction)
+                continue
+            about = {"abstraction": one.abstraction, "table": one.table, "traces": [*one.traces]}
+            chosen = frozenset(one.traces)
+            homes = {r["bundle"] for r in self.snapshot.traces if r["trace_id"] in chosen}
+            bundles = [b for b in self.bundles() if one.table or b in homes]
+            found = set[str]()
+            for result in self.ask({"kind": "classes"} | about, bundles):
+                parts = [PartFile.from_dict(part) for part in result["parts"]]
+                with merged_parts({PARTS: parts}, {}, _ALL, ()) as batches:
+                    found |= {row[0] for batch in batches for row in batch.values}
+            rows += [(one.dataset, one.abstraction, name, 0) for name in sorted(found)]
+        if not asked:
+            return {}
+        path = folder / "classes.parquet"
+        types = ("VARCHAR", "VARCHAR", "VARCHAR", "BIGINT")
+        write_parquet(("dataset", "abstraction", "class", "frames"), rows, path, types)
+        return {CLASSES_GIVEN: path}
+
+    def _counted(self, abstraction: str) -> list[tuple[str, str, str, int]]:
+        """How many frames each class of an abstraction has in all bundles, as the catalogue says."""
+        counts: dict[str, int] = {}
+        for _, of, name, frames, _ in self.snapshot.facts["class_count"]:
+            if of == abstraction:
+                counts[name] = counts.get(name, 0) + frames
+        return [("", abstraction, name, frames) for name, frames in counts.items()]
+
+    def may_answer(self, compiled: Compiled) -> list[str]:
+        """The bundles in which a query may have a match, the largest first."""
+        chosen, left = traces_of(compiled.query, compiled.catalog)
+        every = {t.trace_id for t in compiled.catalog.traces}
+        asked = (every if chosen is None else chosen) - left
+        homes = {row["bundle"] for row in self.snapshot.traces if row["trace_id"] in asked}
+        pruning = Pruning(compiled)
+        name = compiled.catalog.name
+        return [
+            b for b in self.bundles() if b in homes and pruning.may_answer(*self._held(b, name))
+        ]
+
+    def _held(self, bundle: str, name: str) -> tuple[Mapping[str, Any], tuple[frozenset[str], ...]]:
+        """The triples of a bundle by relation, and its kinds, under an abstraction."""
+        held = self._memo.get((bundle, name))
+        if held is None:
+            seen = self.snapshot.catalog_of([bundle])
+            seen = (seen.under(name) if name else seen) or seen
+            triples: dict[str, set[Any]] = {}
+            for triple in (*seen.edges, *seen.map_edges):
+                triples.setdefault(triple[0], set()).add(triple)
+            kinds = seen.moving, seen.fixed, seen.mapped
+            held = {of: frozenset(some) for of, some in triples.items()}, kinds
+            self._memo[bundle, name] = held
+        return held
+
+    @cached_property
+    def _memo(self) -> dict[tuple[str, str], Any]:
+        return {}
+
+
+def _facts_of_table(name: str, told: Mapping[str, Any]) -> TableFacts:
+    """What the compiler must know of a table of one's own, given how its rows fit the frames of all bundles."""
+    refused = None
+    if not told["joins"]:
+        refused = "no rows that belong to frames"
+    elif told["frames"] != told["matched"]:
+        refused = f"{told['matched']} rows for {told['frames']} frames"
+    columns = {column: Type(kind) for column, kind in told["columns"].items()}
+    return TableFacts(name, columns, refused, told["traces"], joins=told["joins"])
+
+
+class PartedMatches(Tabular):
+    """Matches of a query in a collection, as :class:`sgstore.matches.Matches` has them for a store.
+
+    Each way of asking searches anew.
+
+    Attributes
+    ----------
+    columns : tuple of str
+        Names of the columns of the rows.
+    graphs : bool
+        Whether each row ends in a graph, as ``RETURN SUBGRAPHS`` asks.
+    """
+
+    def __init__(self, whole: Collection, text: str, parameters: Mapping[str, object]) -> None:
+        self._whole, self._text, self._parameters = whole, text, dict(parameters)
+        self._limit: int | None = None
+        self._ready: Compiled = compile_query(text, whole.catalog, parameters)
+        self.graphs = self._ready.layout is not None
+        self.columns = self._ready.columns
+        self._reasons: dict[str, str] = {}
+
+    def __repr__(self) -> str:
+        return f"<PartedMatches of {' '.join(self._text.split())[:80]!r}>"
+
+    def limit(self, most: int) -> Self:
+        """The same matches, but no more rows than so many, as if the query ended in ``LIMIT``.
+
+        Raises
+        ------
+        ValueError
+            The number is below zero.
+        """
+        if most < 0:
+            raise ValueError(f"limit is {most}, expected 0 or more")
+        fewer = copy(self)
+        fewer._limit = most if self._limit is None else min(self._limit, most)  # noqa: SLF001
+        fewer._ready = self._ready.limited(most)  # noqa: SLF001
+        return fewer
+
+    @property
+    def reasons(self) -> dict[str, str]:
+        """Traces that cannot answer the query, and why: as the catalogue and bundles asked so far tell."""
+        found = {**self._ready.reasons, **self._reasons}
+        return {name: found[name] for name in sorted(found, key=natural)}
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Traces that cannot answer the query, because something that it needs is not known of them."""
+        return tuple(self.reasons)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes on likely mistakes: none are looked for in a collection."""
+        return ()
+
+    def __iter__(self) -> Iterator[Any]:
+        layout, row = self._ready.layout, row_type(self.columns)
+        rows = self._answered("rows")
+        yield from map(row._make, rows if layout is None else map(layout.row, rows))
+
+    def rows(self) -> list[Any]:
+        """All rows at once."""
+        return list(self)
+
+    def count(self) -> int:
+        """The number of distinct frames."""
+        if self._ready.limited_to_frames is not None:
+            return len({row[0] for row in self._frames()})
+        with working_folder("classes") as folder:
+            bundles = self._whole.may_answer(self._ready)
+            total = 0
+            for result in self._whole.ask(self._question("count", folder), bundles):
+                self._reasons |= result["reasons"]
+                parts = [PartFile.from_dict(part) for part in result["parts"]]
+                with merged_parts({PARTS: parts}, {}, _ALL, ()) as batches:
+                    total += sum(row[0] for batch in batches for row in batch.values)
+            return total
+
+    def frames(self) -> Iterator[FrameRef]:
+        """The distinct frames, by name of the trace and number; of limited rows, in the order of the rows."""
+        for frame_id, trace, seq, time_ns, t, log_time_ns in self._frames():
+            yield FrameRef(frame_id, frame_id >> SEQ_BITS, trace, seq, time_ns, log_time_ns, t)
+
+    def _frames(self) -> Iterator[tuple[Any, ...]]:
+        rows = ((*row[:5], row[-1]) for row in self._answered("frames"))
+        yield from rows if self._ready.limited_to_frames is None else dict.fromkeys(rows)
+
+    def subgraphs(self) -> Iterator[nx.MultiDiGraph[int]]:
+        """Each match as a graph of the nodes and edges that it binds; see :meth:`sgstore.Matches.subgraphs`."""
+        from sgstore.graph import graph_of_records
+
+        layout = Layout.of(self._ready.bound)
+        for row in self._answered("subgraphs"):
+            *values, nodes, edges = layout.row(row)
+            about = dict(zip(layout.columns, values, strict=False))
+            yield graph_of_records(nodes, edges, **about)
+
+    def intervals(self) -> Iterator[Interval]:
+        """Maximal runs of consecutive frames in which the same holds; see :meth:`sgstore.Matches.intervals`."""
+        width = 8
+        names = parted(self._ready, "intervals").columns[width:]
+        for row in self._answered("intervals"):
+            yield Interval(*row[:width], values=dict(zip(names, row[width:], strict=True)))
+
+    def clips(self, before: float = 0.0, after: float = 0.0) -> Iterator[Clip]:
+        """Clips around the frames that match, in log time; see :meth:`sgstore.Matches.clips`."""
+        start, end = round(before * 1e9), round(after * 1e9)
+        traces = self._ready.catalog.traces
+        slack = {trace.name: tolerance_ns(trace.period_ns) for trace in traces}
+        if self._ready.limited_to_frames is not None:
+            around = (Clip(row[1], row[-1] - start, row[-1] + end) for row in self._frames())
+            clips = sorted(around, key=lambda clip: (natural(clip.trace), clip.start_ns))
+            yield from merged(clips, slack)
+            return
+        rows = self._answered("clips", (start, end))
+        yield from merged((Clip(*row[:3]) for row in rows), slack)
+
+    def explain(self) -> str:
+        """Explain the query, stage by stage, and how its answers are merged."""
+        asked = parted(self._ready)
+        bundles = self._whole.may_answer(self._ready)
+        text, _ = asked.statement(self._ready.catalog)
+        number = len(self._whole.snapshot.bundles)
+        told = f"---- bundles\n{len(bundles)} of {number} may answer\n\n---- merge\n{text}"
+        return f"{self._ready.stages()}\n\n{told}"
+
+    def for_people(self) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
+        """Columns and rows as a person wants to read them."""
+        return for_people(self.columns, self, graphs=self.graphs)
+
+    def _described(self) -> tuple[tuple[str, ...], None]:
+        return self.columns, None
+
+    def _question(
+        self, form: str, folder: Path, offsets: tuple[int, int] = (0, 0)
+    ) -> dict[str, Any]:
+        given = self._whole.classes(class_questions(self._ready.bound), folder)
+        return {
+            "kind": "find",
+            "form": form,
+            "text": self._text,
+            "parameters": self._parameters,
+            "limit": self._limit,
+            "before": offsets[0],
+            "after": offsets[1],
+            "given": given,
+        }
+
+    def _answered(self, form: str, offsets: tuple[int, int] = (0, 0)) -> Iterator[tuple[Any, ...]]:
+        """The rows of a form in which the matches are asked for."""
+        asked = parted(self._ready, form, *offsets)
+        with working_folder("parts") as folder:
+            bundles = self._whole.may_answer(self._ready) or [worker.EMPTY]
+            tables: dict[str, list[PartFile]] = {}
+            for answer in self._whole.ask(self._question(form, folder, offsets), bundles):
+                self._reasons |= answer["reasons"]
+                for number, told in enumerate(answer["parts"]):
+                    part = PartFile.from_dict(told)
+                    kept = folder / part.path.name
+                    part.path.replace(kept)
+                    name = PARTS if not number else f"{PARTS} {number}"
+                    tables.setdefault(name, []).append(replace(part, path=kept))
+            text, values = asked.statement(self._ready.catalog)
+            words = self._whole.snapshot.words
+            with merged_parts(tables, words, text, values) as batches:
+                for batch in batches:
+                    yield from batch.values
+
+
+class PartedChecks:
+    """The checks of a text, ready to be asked of a collection. Iterating asks: verdicts, check by check."""
+
+    def __init__(
+        self,
+        whole: Collection,
+        text: str,
+        parameters: Mapping[str, object],
+        about: Mapping[str, bool],
+    ) -> None:
+        self._whole, self._text = whole, text
+        self._parameters, self._about = dict(parameters), dict(about)
+        self._checks: Sequence[CheckInCatalog] = compile_checks(text, whole.catalog, parameters)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the checks, in order."""
+        return tuple(one.check.name for one in self._checks)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes on likely mistakes: none are looked for in a collection."""
+        return ()
+
+    def explain(self) -> str:
+        """Explain the checks: formulas over atoms, and each atom."""
+        from sgstore.temporal import CheckRun
+
+        with working_folder("empty") as folder:
+            file = StoreFile.create(folder / "empty.sgstore")
+            catalog = self._whole.catalog
+            return CheckRun(file, lambda: catalog, self._text, self._parameters).explain()
+
+    def __iter__(self) -> Iterator[Verdict]:
+        places = {name: place for place, name in enumerate(self.names)}
+        with working_folder("verdicts") as folder:
+            questions = dict.fromkeys(q for one in self._checks for q in class_questions(one.check))
+            question = {
+                "kind": "check",
+                "text": self._text,
+                "parameters": self._parameters,
+                "given": self._whole.classes(questions, folder),
+                **self._about,
+            }
+            files: list[Path] = []
+            for result in self._whole.ask(question, self._whole.bundles()):
+                path = Path(result["lines"])
+                files.append(path.replace(folder / path.name))
+            ordered = merge(
+                *map(_verdicts, files), key=lambda one: (places[one.check], natural(one.trace))
+            )
+            yield from ordered
+
+
+def _verdicts(path: Path) -> Iterator[Verdict]:
+    with path.open(encoding="utf-8") as lines:
+        for line in lines:
+            yield worker.as_verdict(json.loads(line))
+
+
+class PartedRows(Tabular):
+    """The rows of a statement in every bundle; iterating runs it."""
+
+    def __init__(self, whole: Collection, text: str) -> None:
+        self._whole, self._text = whole, text
+        self._columns: tuple[str, ...] = ()
+
+    def __iter__(self) -> Iterator[tuple[Any, ...]]:
+        for result in self._whole.ask({"kind": "sql", "text": self._text}, self._whole.bundles()):
+            self._columns = ("bundle", *result["columns"])
+            with Path(result["lines"]).open(encoding="utf-8") as lines:
+                for line in lines:
+                    yield result["bundle"], *json.loads(line)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns; a bundle is asked for them."""
+        if not self._columns:
+            next(iter(self), None)
+        return self._columns
+
+    def _described(self) -> tuple[tuple[str, ...], None]:
+        return self.columns, None

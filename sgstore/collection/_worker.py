@@ -1,0 +1,307 @@
+"""A part of a question: one bundle is asked, and its answer waits in files.
+
+A task and its result are plain values, so that any engine can carry them. A task depends on nothing but what
+it says and the bundle, so it can be done again, here or elsewhere, and gives the same.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import secrets
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from sgstore.collection._cache import bundle_path
+from sgstore.collection._place import place_at
+from sgstore.errors import StoreError
+from sgstore.files import working_folder
+from sgstore.lang import Compiled, Type, parted
+from sgstore.store import PartFile, StoreFile, UserTables, write_classes, write_part
+from sgstore.temporal import CheckRun, TemporalMatches, Verdict
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from sgstore.lang import Catalog
+    from sgstore.matches import Interval
+
+EMPTY: Final = ""
+"""The name of the bundle that has nothing: it is asked where no other one is, to know the columns."""
+
+
+@dataclass(frozen=True, slots=True)
+class Whole:
+    """What a part must know of the whole, beside what it holds.
+
+    Attributes
+    ----------
+    words : dict
+        Enumeration → values in it beside those of every store.
+    own, own_edges : dict
+        Attributes of a client's own → their types.
+    classed : list of str
+        Abstractions in which the classes of frames are known.
+    sets : dict
+        Derived set → the relations that it has; ``None``: that is not known.
+    """
+
+    words: dict[str, list[str]]
+    own: dict[str, str]
+    own_edges: dict[str, str]
+    classed: list[str]
+    sets: dict[str, list[str] | None]
+
+    def catalog(self, local: Catalog) -> Catalog:
+        """The catalog of a part: its contents, and the names of the whole."""
+        sets = dict(local.sets)
+        for name, relations in self.sets.items():
+            if name in sets:
+                sets[name] = _with_relations(sets[name], relations)
+        return replace(
+            local,
+            part=True,
+            names=self.words,
+            own={name: Type(kind) for name, kind in self.own.items()},
+            own_edges={name: Type(kind) for name, kind in self.own_edges.items()},
+            classed=tuple(self.classed),
+            sets=sets,
+            lacks={},
+        )
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """What plain values describe."""
+        return cls(**values)
+
+
+def _with_relations(
+    make: Callable[[Catalog], Catalog], relations: list[str] | None
+) -> Callable[[Catalog], Catalog]:
+    known = None if relations is None else frozenset(relations)
+    return lambda catalog: replace(make(catalog), relations=known)
+
+
+class PartMatches(TemporalMatches):
+    """Matches of a query in one bundle, as the merging of all asks for them."""
+
+    def written(self, form: str, offsets: tuple[int, int], folder: Path) -> list[PartFile]:
+        """Write the rows of each question that a part is asked."""
+        with self._compiled() as compiled:
+            if form == "count":
+                return [self._written(compiled, Compiled.count(compiled), folder)]
+            asked = parted(compiled, form, *offsets).compiled(compiled)
+            return [self._written(one, one.rows(), folder) for one in asked]
+
+    def _written(self, _compiled: Compiled, statement: Any, folder: Path) -> PartFile:
+        to = folder / f"{secrets.token_hex(8)}.parquet"
+        asked = self._asked(statement)
+        found = write_part(self._file, asked["sql"], asked["parameters"], asked["given"], to)
+        return replace(found, columns=tuple(statement.columns))
+
+
+def answer(task: dict[str, Any]) -> dict[str, Any]:
+    """The answer of one bundle.
+
+    Parameters
+    ----------
+    task : dict
+        ``kind``: ``find``, ``check``, ``classes`` or ``sql``; ``url`` and ``bundle``; ``whole``: see
+        :class:`Whole`;
+        ``text``, ``parameters``, ``limit``; ``tables``: name → Parquet file, or its bytes as base64; ``to``:
+        the folder for parts, which the caller reads, empty: rows come with the result; and what the kind
+        needs.
+
+    Returns
+    -------
+    dict
+        ``parts``: rows in Parquet files; ``lines``: a file of JSON lines; ``reasons``: traces that cannot
+        answer, and why.
+
+    Raises
+    ------
+    SgstoreError
+        The bundle cannot be read, or the question not be answered by it.
+    """
+    with working_folder("part") as held:
+        to = Path(task["to"]) if task["to"] else held
+        with _opened(task, held) as file:
+            whole = Whole.from_dict(task["whole"])
+            known = whole.catalog(file.catalog())  # a bundle never changes
+            found = _KINDS[task["kind"]](task, file, lambda: known, to)
+        if not task["to"]:
+            _carry(found)
+        return {"bundle": task["bundle"], **found}
+
+
+def _opened(task: dict[str, Any], held: Path) -> Any:
+    """The bundle, open, with the tables beside it."""
+    if task["bundle"] == EMPTY:
+        path = held / "empty.sgstore"
+        StoreFile.create(path).close()
+    else:
+        path = bundle_path(place_at(task["url"]), task["bundle"])
+    given: dict[str, Path] = {}
+    for name, table in task.get("tables", {}).items():
+        if table.startswith("base64:"):
+            given[name] = held / f"{name}.parquet"
+            given[name].write_bytes(base64.b64decode(table.removeprefix("base64:")))
+        else:
+            given[name] = Path(table)
+    return _Open(StoreFile(path, tables=UserTables(given) if given else None))
+
+
+class _Open:
+    """A store that is open for as long as a part is asked of it."""
+
+    def __init__(self, file: StoreFile) -> None:
+        self._file = file
+        self._snapshot = file.snapshot()
+
+    def __enter__(self) -> StoreFile:
+        self._snapshot.__enter__()
+        return self._file
+
+    def __exit__(self, *exception: Any) -> None:
+        self._snapshot.__exit__(*exception)
+        self._file.close()
+
+
+def _find(
+    task: dict[str, Any], file: StoreFile, catalog: Callable[[], Catalog], to: Path
+) -> dict[str, Any]:
+    matches = PartMatches(file, catalog, task["text"], task["parameters"])
+    if task["limit"] is not None:
+        matches = matches.limit(task["limit"])
+    offsets = task["before"], task["after"]
+    parts = matches.written(task["form"], offsets, to)
+    return {"parts": [part.as_dict() for part in parts], "reasons": matches.reasons}
+
+
+def _check(
+    task: dict[str, Any], file: StoreFile, catalog: Callable[[], Catalog], to: Path
+) -> dict[str, Any]:
+    run = CheckRun(
+        file,
+        catalog,
+        task["text"],
+        task["parameters"],
+        sgsm_compat=task["sgsm_compat"],
+        status=task["status"],
+    )
+    path = to / f"{secrets.token_hex(8)}.ndjson"
+    with path.open("w", encoding="utf-8") as lines:
+        for verdict in run:
+            lines.write(json.dumps(as_plain(verdict)))
+            lines.write("\n")
+    return {"lines": str(path)}
+
+
+def as_plain(verdict: Verdict) -> dict[str, Any]:
+    """A verdict as plain values."""
+    status = None if verdict.status is None else verdict.status.tolist()
+    return asdict(replace(verdict, status=None)) | {"status": status}
+
+
+def as_verdict(values: dict[str, Any]) -> Verdict:
+    """The verdict that plain values describe."""
+    from sgstore.arrays import np
+    from sgstore.temporal import Witness
+
+    def intervals(told: list[dict[str, Any]]) -> tuple[Interval, ...]:
+        from sgstore.matches import Interval
+
+        return tuple(Interval(**one) for one in told)
+
+    witnesses = tuple(
+        Witness(**(one | {"violations": intervals(one["violations"])}))
+        for one in values["witnesses"]
+    )
+    status = values["status"]
+    made: dict[str, Any] = {
+        "violations": intervals(values["violations"]),
+        "witnesses": witnesses,
+        "status": None if status is None else np.array(status, np.int8),
+    }
+    return Verdict(**(values | made))
+
+
+def _classes(
+    task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
+) -> dict[str, Any]:
+    """The classes of the frames of some traces, or of a table of single frames."""
+    path = to / f"{secrets.token_hex(8)}.parquet"
+    part = write_classes(file, task["abstraction"], task["traces"], task["table"], path)
+    return {"parts": [part.as_dict()], "reasons": {}}
+
+
+def _sql(
+    task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
+) -> dict[str, Any]:
+    """The rows of a user's statement on one bundle, as lines."""
+    path = to / f"{secrets.token_hex(8)}.ndjson"
+    with path.open("w", encoding="utf-8") as lines, file.user_batches(task["text"]) as batches:
+        columns, types = batches.columns, batches.types
+        for batch in batches:
+            for row in batch.values:
+                lines.write(json.dumps(row, default=str))
+                lines.write("\n")
+    return {"lines": str(path), "columns": list(columns), "types": list(types)}
+
+
+def _tables(
+    _task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], _to: Path
+) -> dict[str, Any]:
+    """How the rows of tables of users' own fit the frames of one bundle."""
+    joined, told = file.joined(), dict[str, Any]()
+    for name, facts in file.catalog().tables.items():
+        rows = joined.get(name)
+        told[name] = {
+            "columns": {column: kind.value for column, kind in facts.columns.items()},
+            "joins": facts.joins,
+            "matched": rows.matched if rows else 0,
+            "frames": rows.frames if rows else 0,
+            "traces": None if facts.traces is None else sorted(facts.traces),
+        }
+    return {"tables": told}
+
+
+_KINDS: Final[dict[str, Any]] = {
+    "find": _find,
+    "check": _check,
+    "classes": _classes,
+    "sql": _sql,
+    "tables": _tables,
+}
+
+
+def _carry(found: dict[str, Any]) -> None:
+    """Put the content of files into a result that is read on another machine."""
+    for part in found.get("parts", ()):
+        part["data"] = base64.b64encode(Path(part["path"]).read_bytes()).decode()
+    if "lines" in found:
+        found["data"] = Path(found["lines"]).read_text(encoding="utf-8")
+
+
+def brought(result: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """A result with its files in a folder here, if they came with it.
+
+    Raises
+    ------
+    StoreError
+        A file cannot be written.
+    """
+    try:
+        for part in result.get("parts", ()):
+            if "data" in part:
+                to = folder / f"{secrets.token_hex(8)}.parquet"
+                to.write_bytes(base64.b64decode(part.pop("data")))
+                part["path"] = str(to)
+        if "data" in result:
+            to = folder / f"{secrets.token_hex(8)}.ndjson"
+            to.write_text(result.pop("data"), encoding="utf-8")
+            result["lines"] = str(to)
+    except OSError as error:
+        raise StoreError(f"{folder}: cannot be written: {error.strerror}") from error
+    return result

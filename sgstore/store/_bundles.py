@@ -1,0 +1,415 @@
+"""Bundles: traces of one store or of several as a store of their own, sorted, under given names.
+
+Numbers of traces, maps, recordings and settings come from digests, so they are the same in every store: rows
+are copied as they are. What is said of a bundle in the catalogue of a collection is read here, too, and the
+tables of that catalogue are read and written as Parquet.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any, Final
+
+import duckdb
+
+import sgstore.store._schema as shape
+from sgstore.errors import StoreError
+from sgstore.quoting import literal, quoted
+from sgstore.store._columns import MASKS, ORDERS, REPEATED, types_of
+from sgstore.store._locking import Access, default_memory, spill_folder, translated
+from sgstore.store._packing import BUCKET_BITS, SEQ_BITS
+from sgstore.store._publish import SHARED
+from sgstore.store._rebuild import attach_empty
+from sgstore.store._rows import Rows, run
+from sgstore.store._staging import scratch
+from sgstore.store._traces import stored_traces
+from sgstore.vocabulary import NAMES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from duckdb import DuckDBPyConnection
+
+    from sgstore.store._file import StoreFile
+
+
+TOGETHER: Final = 64
+"""Stores that are open at a time while they are joined: of more, some are joined first."""
+
+_TRACE_OF: Final = {
+    "trace_id": "trace_id",
+    "bucket": f"bucket >> {BUCKET_BITS}",
+    "frame_id": f"frame_id >> {SEQ_BITS}",
+}
+"""Column → the trace that a row belongs to; of a table that has several, the first counts."""
+
+_AS_MADE: Final = frozenset({"store_info", "bits"})
+"""Tables that every new store has filled."""
+
+_SORTED: Final = frozenset({"state", *REPEATED, *REPEATED.values(), "frame", *MASKS, "derived_gap"})
+"""The large tables."""
+
+
+# Traces of stores → a store of their own ------------------------------------------------------
+
+
+def write_bundle(
+    source: Path, to: Path, traces: Mapping[int, str], maps: Mapping[str, str] | None = None
+) -> None:
+    """Copy traces of a store into a new one, sorted over all of them.
+
+    Parameters
+    ----------
+    source : Path
+        The store; it stays as it is.
+    to : Path
+        Where the new one is made, in a folder that nobody else uses; nothing is there yet.
+    traces : mapping of int to str
+        Ids of the traces, and the name of each in the new store.
+    maps : mapping of str to str, optional
+        Digests of road maps, and the name of each in the new store.
+
+    Raises
+    ------
+    StoreError
+        The store lacks one of the traces, or a file cannot be read or written.
+    """
+    access = Access(source)
+    threads = os.cpu_count() or 1
+    with (
+        scratch(spill_folder(), memory=default_memory(), threads=threads) as connection,
+        access.attached(connection, to.parent),
+    ):
+        _copied(connection, ["store"], to, traces, maps or {})
+
+
+def join_bundles(
+    sources: Sequence[Path], to: Path, traces: Mapping[int, str], maps: Mapping[str, str]
+) -> None:
+    """Copy traces of several stores, which nobody writes to, into a new one.
+
+    Parameters
+    ----------
+    sources : sequence of Path
+        Each is a store of this version; a trace is in one of them.
+    to, traces, maps
+        As :func:`write_bundle` takes them.
+
+    Raises
+    ------
+    StoreError
+        One of the traces is in none of the stores, or a file cannot be read or written.
+    """
+    sources = list(sources)
+    with ExitStack() as made:
+        while len(sources) > TOGETHER:
+            parts: list[Path] = []
+            for first in range(0, len(sources), TOGETHER):
+                some = sources[first : first + TOGETHER]
+                part = to.with_name(f"{to.name}.part-{len(sources)}-{first}")
+                made.callback(part.unlink, missing_ok=True)
+                _join(some, part, traces, maps, whole=False)
+                parts.append(part)
+            sources = parts
+        _join(sources, to, traces, maps, whole=True)
+
+
+def _join(
+    sources: Sequence[Path],
+    to: Path,
+    traces: Mapping[int, str],
+    maps: Mapping[str, str],
+    *,
+    whole: bool,
+) -> None:
+    threads = os.cpu_count() or 1
+    with (
+        scratch(spill_folder(), memory=default_memory(), threads=threads) as connection,
+        translated(to),
+    ):
+        names = [f"store {number}" for number in range(len(sources))]
+        for name, source in zip(names, sources, strict=True):
+            with Access(source).reading():  # what is no store as ours are is refused
+                pass
+            Access(source).close()
+            place = literal(str(source.absolute()))
+            connection.execute(f"ATTACH {place} AS {quoted(name)} (READ_ONLY)")
+        _copied(connection, names, to, traces, maps, whole=whole)
+
+
+def _copied(
+    connection: DuckDBPyConnection,
+    sources: Sequence[str],
+    to: Path,
+    traces: Mapping[int, str],
+    maps: Mapping[str, str],
+    *,
+    whole: bool = True,
+) -> None:
+    """Fill a new store with traces of those that are attached under some names."""
+    attach_empty(connection, to)
+    for database in sources:
+        words = {enum: shape.labels_of(connection, database, enum) for enum in NAMES}
+        shape.widen(connection, "fresh", words)
+    _choose(connection, traces, maps)
+    for table in shape.expected().tables:
+        if table not in _AS_MADE:
+            rows = " UNION ALL BY NAME ".join(_chosen(table, name) for name in sources)
+            if table in _ONCE or table == "manifest":
+                rows = f"SELECT DISTINCT * FROM ({rows})"
+            order = f" ORDER BY {ORDERS.get(table, 'ALL')}" if table in _SORTED else " ORDER BY ALL"
+            if table in {"map", "map_node"}:  # texts of maps are long, and rows of one map few
+                order = f" ORDER BY map_id{', node_id DESC' * (table == 'map_node')}"
+            connection.execute(f"INSERT INTO fresh.inside.{table} BY NAME {rows}{order}")
+    ((found,),) = connection.execute("SELECT count(*) FROM fresh.inside.trace").fetchall()
+    if whole and found != len(traces):
+        raise StoreError(f"{to}: {len(traces) - found} of {len(traces)} traces are not there")
+    connection.execute("DETACH fresh")
+
+
+def _choose(
+    connection: DuckDBPyConnection, traces: Mapping[int, str], maps: Mapping[str, str]
+) -> None:
+    """Make the tables of the traces that are taken, and of new names of maps."""
+    for table, kind, values in (("chosen", "BIGINT", traces), ("named", "VARCHAR", maps)):
+        connection.execute(
+            f"CREATE OR REPLACE TEMP TABLE {table} AS SELECT unnest(CAST($1 AS {kind}[])) AS key,"
+            " unnest(CAST($2 AS VARCHAR[])) AS name",
+            [[*values], [*values.values()]],
+        )
+
+
+_ONCE: Final = {table: owner for owner, tables in SHARED.items() for table in tables}
+"""Tables of what many traces may have → the table that says who has it."""
+
+
+def _chosen(table: str, database: str) -> str:
+    """The rows of a table of an attached store that belong to the traces that are taken."""
+    inside = f"{quoted(database)}.inside"
+    traces = f"(SELECT t.* FROM {inside}.trace t WHERE t.trace_id IN (SELECT key FROM chosen))"
+    if table == "trace":
+        return (
+            f"SELECT t.* REPLACE (c.name AS name) FROM {inside}.trace t"
+            " JOIN chosen c ON c.key = t.trace_id"
+        )
+    if table == "manifest":
+        owners = " OR ".join(
+            f"(owner = '{owner}' AND id IN (SELECT {owner}_id FROM {traces}"
+            f" WHERE {owner}_id IS NOT NULL))"
+            for owner in ("trace", *SHARED)
+        )
+        return f"SELECT * FROM {inside}.manifest WHERE {owners}"
+    if table in _ONCE:
+        key = f"{_ONCE[table]}_id"
+        chosen = f"{key} IN (SELECT {key} FROM {traces} WHERE {key} IS NOT NULL)"
+        if table == "map":
+            return (
+                f"SELECT m.* REPLACE (coalesce(n.name, m.name) AS name) FROM {inside}.map m"
+                f" LEFT JOIN named n ON n.key = m.digest WHERE m.{chosen}"
+            )
+        place = " REPLACE (NULL AS place)" if table == "recording" else ""
+        return f"SELECT *{place} FROM {inside}.{table} WHERE {chosen}"
+    column = next(name for name in _TRACE_OF if name in types_of(table))
+    return f"SELECT * FROM {inside}.{table} WHERE {_TRACE_OF[column]} IN (SELECT key FROM chosen)"
+
+
+# What the catalogue of a collection says of a bundle ---------------------------------------------
+
+CATALOGUE: Final[dict[str, dict[str, str]]] = {
+    "bundle": {
+        "bundle": "VARCHAR",
+        "bytes": "BIGINT",
+        "frames": "BIGINT",
+        "traces": "BIGINT",
+        "schema_version": "VARCHAR",
+        "schema_digest": "VARCHAR",
+        "created_by": "VARCHAR",
+        "start_ns": "BIGINT",
+        "end_ns": "BIGINT",
+    },
+    "trace": {
+        "bundle": "VARCHAR",
+        "trace_id": "BIGINT",
+        "name": "VARCHAR",
+        "digest": "VARCHAR",
+        "ego": "VARCHAR",
+        "map": "VARCHAR",
+        "map_digest": "VARCHAR",
+        "config": "VARCHAR",
+        "answers": "VARCHAR",
+        "frames": "BIGINT",
+        "start_ns": "BIGINT",
+        "end_ns": "BIGINT",
+        "period_ns": "BIGINT",
+        "uri": "VARCHAR",
+        "first_bucket": "BIGINT",
+        "buckets": "BIGINT",
+        "segment": "VARCHAR",
+    },
+    "config": {"config": "VARCHAR", "settings": "VARCHAR"},
+    "triple": {
+        "bundle": "VARCHAR",
+        "set": "VARCHAR",
+        "moving": "BOOLEAN",
+        "relation": "VARCHAR",
+        "src_kind": "VARCHAR",
+        "dst_kind": "VARCHAR",
+        "rows": "BIGINT",
+    },
+    "kind": {"bundle": "VARCHAR", "home": "VARCHAR", "kind": "VARCHAR"},
+    "word": {
+        "bundle": "VARCHAR",
+        "what": "VARCHAR",
+        "word": "VARCHAR",
+        "type": "VARCHAR",
+        "place": "BIGINT",
+    },
+    "class_count": {
+        "bundle": "VARCHAR",
+        "abstraction": "VARCHAR",
+        "class": "VARCHAR",
+        "frames": "BIGINT",
+        "traces": "BIGINT",
+    },
+    "set": {
+        "bundle": "VARCHAR",
+        "name": "VARCHAR",
+        "trace_id": "BIGINT",
+        "digest": "VARCHAR",
+        "settings": "VARCHAR",
+        "answers": "VARCHAR",
+    },
+}
+"""Tables of a catalogue, with their columns and the types of these in the database.
+
+``word``: the names that the compiler must know beside its own: of an enumeration (``kind``, ``relation``,
+``light_state``), of attributes of a client's own (``own``, ``own_edges``, with their types), and of
+abstractions in which the classes of frames are known (``classed``).
+"""
+
+Facts = dict[str, list[tuple[Any, ...]]]
+"""Rows of a catalogue by table."""
+
+_TRACES: Final = """
+SELECT t.trace_id, t.name, r.digest, coalesce(t.ego, ''), coalesce(m.name, ''), coalesce(m.digest, ''),
+c.digest,
+       to_json(t.answers)::VARCHAR, t.frames, t.start_ns, t.end_ns, t.period_ns, r.uri, b.first, b.buckets
+FROM trace t JOIN recording r ON r.recording_id = t.recording_id JOIN config c ON c.config_id = t.config_id
+     LEFT JOIN map m ON m.map_id = t.map_id
+     JOIN (SELECT trace_id, min(bucket) AS first, max(bucket) - min(bucket) + 1 AS buckets FROM bucket GROUP BY
+     trace_id) b
+       ON b.trace_id = t.trace_id
+ORDER BY t.trace_id
+"""
+_CLASSES: Final = """
+SELECT abstraction, replace(class::VARCHAR, '-', ''), CAST(sum(bit_count(mask)) AS BIGINT),
+       count(DISTINCT bucket >> 18)
+FROM (SELECT * FROM frame_class UNION ALL SELECT * FROM later_class)
+WHERE class IS NOT NULL GROUP BY ALL ORDER BY ALL
+"""
+_SETS: Final = """
+SELECT name, trace_id, digest, settings::VARCHAR, to_json(answers)::VARCHAR FROM derived ORDER BY name, trace_id
+"""
+_INFO: Final = "SELECT key, value FROM store_info"
+
+
+def facts_of(file: StoreFile, bundle: str, size: int) -> Facts:
+    """Rows of a catalogue that say what is in a store.
+
+    Parameters
+    ----------
+    file : StoreFile
+    bundle : str
+        What it is called in the catalogue.
+    size : int
+        Bytes of its file.
+    """
+    with file.access.reading() as connection:
+        catalog = file.catalog()
+        info = dict(run(connection, _INFO).values)
+        traces = run(connection, _TRACES).values
+        sets = run(connection, _SETS).values
+        classes = run(connection, _CLASSES).values
+        settings = run(connection, "SELECT digest, settings FROM config ORDER BY digest").values
+    found: Facts = {
+        "bundle": [
+            (
+                *(bundle, size, sum(row[8] for row in traces), len(traces)),
+                *(info[name] for name in ("schema_version", "schema_digest", "created_by")),
+                min((row[9] for row in traces), default=0),
+                max((row[10] for row in traces), default=0),
+            )
+        ],
+        "trace": [(bundle, *row, "") for row in traces],
+        "config": settings,
+        "triple": [],
+        "kind": [
+            (bundle, home, kind)
+            for home in ("moving", "fixed", "mapped")
+            for kind in sorted(getattr(catalog, home))
+        ],
+        "word": [*_words(bundle, catalog)],
+        "class_count": [(bundle, *row) for row in classes],
+        "set": [(bundle, *row) for row in sets],
+    }
+    for name in ["", *sorted({row[0] for row in sets})]:
+        seen = catalog.under(name) if name else catalog
+        for moving, table in ((True, seen.edges), (False, seen.map_edges)) if seen else ():
+            found["triple"] += [
+                (bundle, name, moving, *triple, n) for triple, n in sorted(table.items())
+            ]
+    return found
+
+
+def _words(bundle: str, catalog: Any) -> Iterator[tuple[Any, ...]]:
+    for enum, names in (catalog.names or {}).items():
+        for place, name in enumerate(names):
+            yield bundle, enum, name, "", place
+    for what in ("own", "own_edges"):
+        for name, kind in sorted(getattr(catalog, what).items()):
+            yield bundle, what, name, kind.value, 0
+    for name in catalog.classed:
+        yield bundle, "classed", name, "", 0
+
+
+def answers_of(text: str) -> tuple[str, ...]:
+    """The relations that a trace of a catalogue can answer."""
+    return tuple(map(str, json.loads(text)))
+
+
+def names_of_traces(path: Path) -> dict[int, tuple[str, str, str]]:
+    """Id → name, digest of the recording, and ego of each trace of a store, by name in natural order."""
+    with Access(path).reading() as connection:
+        found = stored_traces(connection)
+    return {one.trace_id: (one.name, one.digest, one.ego) for one in found}
+
+
+def maps_of_traces(path: Path, traces: Iterable[int]) -> dict[str, str]:
+    """Digest → name of the road maps of some traces of a store."""
+    sql = (
+        "SELECT DISTINCT m.digest, m.name FROM trace t JOIN map m ON m.map_id = t.map_id"
+        " WHERE t.trace_id IN (SELECT unnest(CAST($1 AS BIGINT[])))"
+    )
+    with Access(path).reading() as connection:
+        return dict(run(connection, sql, [[*traces]]).values)
+
+
+def parquet_rows(path: Path, columns: Iterable[str]) -> list[tuple[Any, ...]]:
+    """Rows of a Parquet file of ours, columns of some names.
+
+    Raises
+    ------
+    StoreError
+        It cannot be read, or has no such columns.
+    """
+    listed = ", ".join(map(quoted, columns))
+    try:
+        with duckdb.connect(":memory:") as connection:
+            sql = f"SELECT {listed} FROM read_parquet(?)"
+            found: Rows = run(connection, sql, [str(path)])
+            return found.values
+    except duckdb.Error as error:
+        raise StoreError(f"{path}: cannot be read: {str(error).strip()}") from error

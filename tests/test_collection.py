@@ -1,0 +1,306 @@
+"""A collection of stores: what goes in comes out, and questions have the answers of one store."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from oracle_worlds import random_world
+
+from sgstore.cli import run as run_verb
+from sgstore.collection import Collection, PartialAnswerError, gc, pack, unpack, verify
+from sgstore.errors import QueryError, SqlError, StoreError
+from sgstore.query import Store
+from sgstore.store import StoreFile
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+TRACES = 5
+
+QUESTIONS = [
+    "MATCH (a:Car)-[:near]->(b)",
+    "MATCH (a:Car)-[e:near|visible]->(b) RETURN a.x, b.name, type(e), frame.seq",
+    "MATCH (a:Car)-[e:near|visible]->(b) RETURN type(e), b ORDER BY a.speed DESC, b.kind LIMIT 9",
+    "MATCH (a:Car)-[:near]->(b) RETURN *, a.speed ORDER BY a.speed DESC LIMIT 9",
+    "MATCH (a:Car)-[:near]->(b) LIMIT 3",
+    "MATCH (a:Car)-[:near]->(b) RETURN COUNT(*) AS n",
+    "MATCH (a:Car)-[:near]->(b) WHERE a.x > 1e9 RETURN COUNT(*) AS n, AVG(a.x), COUNT(DISTINCT b)",
+    "MATCH (a:Car)-[:near]->(b) RETURN b.kind AS k, COUNT(*) AS n, COUNT(DISTINCT b) AS d,"
+    " COUNT(DISTINCT b.kind), AVG(a.speed) AS v, MAX(a.x) - MIN(a.x) AS w ORDER BY n DESC, k LIMIT 4",
+    "MATCH (a:Car) RETURN trace.name, SUM(frame.seq), MIN(a.name)",
+    "MATCH (a:Car)-[:near]->(b) RETURN b, COUNT(*) ORDER BY AVG(a.speed)",
+    "MATCH (a:Car)-[:near]->(b) RETURN DISTINCT a, b.kind",
+    "MATCH (a:Car)-[:near]->(b) RETURN DISTINCT trace.name, b.kind LIMIT 6",
+    "MATCH (a:Car)-[:near]->(b) RETURN FRAMES",
+    "MATCH (a:Car)-[:near]->(b) RETURN FRAMES, b.kind ORDER BY seq DESC LIMIT 7",
+    "MATCH (a:Car)-[:near]->(b) RETURN INTERVALS, b",
+    "MATCH (a:Car)-[:near]->(b) RETURN INTERVALS, b, b.kind SAMPLE 2 PER b",
+    "USING EGO 'hero1' MATCH (a:Car)-[:near]->(b) RETURN INTERVALS SAMPLE 4 PER trace",
+    "MATCH (a:Car)-[:near]->(b) RETURN CLIPS(-1s, +1s)",
+    "MATCH (a:Car)-[:near]->(b) RETURN CLIPS(-1s, +1s) ORDER BY start_ns DESC LIMIT 3",
+    "MATCH (a:Car)-[:near]->(b) RETURN SUBGRAPHS LIMIT 5",
+    "MATCH (a:Car)-[:near]->(b) RETURN a.x SAMPLE 3 PER b.kind",
+    "MATCH (a:Car)-[:near]->(b) RETURN a SAMPLE 2 PER a LIMIT 5",
+    "MATCH (a:Car)-[:near]->(b) THEN MATCH (a)-[:visible]->(b) RETURN a, b",
+    "MATCH (a:Car)-[:near]->(b) FOR >= 0.2s RETURN INTERVALS, a",
+    "MATCH (e:Ego) RETURN frame.class, class_count() ORDER BY class_count() DESC LIMIT 5",
+    "MATCH (e:Ego) WHERE frame.class IN dataset_classes('trace3') RETURN FRAMES",
+    "USING DATASET 'trace[45]' MATCH (a:Car) RETURN COUNT(*)",
+    "USING UNKNOWN false MATCH (a:Car)-[:near]->(b) RETURN trace.name, COUNT(*) AS n",
+    "MATCH (a:Car) WHERE NOT EXISTS {(a)-[:near]->(b)} RETURN trace.map, COUNT(*)",
+]
+CHECKS = [
+    "CHECK calm: FORALL (a:Car) ALWAYS a.speed < 8",
+    "CHECK seen: FORSOME (a:Car) EVENTUALLY EXISTS {(a)-[:near]->(b)}; CHECK still: ALWAYS ego.speed < 3",
+]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What is remembered of bundles is remembered in a folder of these tests."""
+    before = os.environ.get("SGSTORE_CACHE")
+    os.environ["SGSTORE_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+    yield
+    os.environ.pop("SGSTORE_CACHE")
+    if before is not None:
+        os.environ["SGSTORE_CACHE"] = before
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store of several traces on two maps."""
+    path = tmp_path_factory.mktemp("one") / "one.sgstore"
+    StoreFile.create(path)
+    world = random_world(5, traces=TRACES, frames=70, maps=2, path=path)
+    world.connection.close()
+    return path
+
+
+@pytest.fixture(scope="module")
+def store(path: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
+    """A copy of it that stays open; the other one is packed."""
+    opened = Store(shutil.copy(path, tmp_path_factory.mktemp("open") / "one.sgstore"))
+    with opened.file.snapshot():
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def place(path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same as a collection of three bundles."""
+    place = tmp_path_factory.mktemp("many") / "fleet"
+    done = pack(path, place, bundle_traces=2)
+    assert len(done.bundles) == 3
+    return place
+
+
+@pytest.fixture(scope="module")
+def whole(place: Path) -> Collection:
+    return Collection(place)
+
+
+def close(one: Any, other: Any) -> bool:
+    """Whether two values are equal, numbers but for what the order of a sum makes of them."""
+    if isinstance(one, float) and isinstance(other, float):
+        return one == pytest.approx(other, rel=1e-9, abs=1e-12)
+    return type(one) is type(other) and one == other
+
+
+@pytest.mark.parametrize("text", QUESTIONS)
+def test_rows_and_their_order_are_those_of_one_store(
+    store: Store, whole: Collection, text: str
+) -> None:
+    expected = store.find(text)
+    found = whole.find(text)
+
+    assert found.columns == expected.columns
+    rows, wanted = found.rows(), expected.rows()
+    assert len(rows) == len(wanted)
+    for row, other in zip(rows, wanted, strict=True):
+        assert all(map(close, row, other)), (row, other)
+
+
+@pytest.mark.parametrize(
+    "text", [QUESTIONS[0], QUESTIONS[2], QUESTIONS[14], QUESTIONS[19], QUESTIONS[22]]
+)
+def test_other_forms_are_those_of_one_store(store: Store, whole: Collection, text: str) -> None:
+    expected, found = store.find(text), whole.find(text)
+
+    assert found.count() == expected.count()
+    assert list(found.frames()) == list(expected.frames())
+    assert list(found.intervals()) == list(expected.intervals())
+    assert list(found.clips(0.5, 1)) == list(expected.clips(0.5, 1))
+    assert list(found.limit(2)) == list(expected.limit(2))
+    graphs = [(g.graph, sorted(g.nodes), sorted(g.edges)) for g in found.limit(3).subgraphs()]
+    wanted = [(g.graph, sorted(g.nodes), sorted(g.edges)) for g in expected.limit(3).subgraphs()]
+    assert graphs == wanted
+
+
+@pytest.mark.parametrize("text", CHECKS)
+def test_verdicts_are_those_of_one_store(store: Store, whole: Collection, text: str) -> None:
+    expected = list(store.check(text, status=True))
+    found = list(whole.check(text, status=True))
+
+    assert [str(one) for one in found] == [str(one) for one in expected]
+    assert [one.violations for one in found] == [one.violations for one in expected]
+    assert [one.witnesses for one in found] == [one.witnesses for one in expected]
+    assert [one.statuses for one in found] == [one.statuses for one in expected]
+
+
+def test_processes_answer_as_this_one_does(whole: Collection, place: Path) -> None:
+    several = Collection(place, engine="local:2")
+
+    assert several.find(QUESTIONS[7]).rows() == whole.find(QUESTIONS[7]).rows()
+    assert list(several.check(CHECKS[0])) == list(whole.check(CHECKS[0]))
+
+
+def test_tables_of_ones_own_are_joined(path: Path, place: Path, tmp_path: Path) -> None:
+    table = tmp_path / "labels.csv"
+    table.write_text("trace,seq,label\ntrace1,3,good\ntrace4,5,bad\ntrace5,60,good\n")
+    text = "MATCH (a:Car) WHERE labels.label = 'good' RETURN trace.name, frame.seq, a, labels.label"
+
+    with Store(path, tables={"labels": table}) as one:
+        expected = one.find(text).rows()
+    found = Collection(place, tables={"labels": table}).find(text).rows()
+
+    assert expected
+    assert [tuple(row) for row in found] == [tuple(row) for row in expected]
+
+
+def test_only_bundles_that_may_answer_are_opened(whole: Collection, place: Path) -> None:
+    def may_answer(bundle: str, relation: str) -> bool:
+        facts = whole.snapshot.of("triple", bundle)
+        return any(row[3] == relation and not row[1] for row in facts)
+
+    for relation in ("near", "opposes", "leads", "sees"):
+        matches = whole.find(f"USING UNKNOWN false MATCH (a)-[:{relation}]->(b)")
+        matches.rows()
+        wanted = {b for b in whole.bundles() if may_answer(b, relation)}
+        assert set(whole.opened) - {""} == wanted
+    whole.find("USING DATASET trace1 MATCH (a)-[:near]->(b)").rows()
+    assert len(whole.opened) == 1
+
+
+def test_sql_is_asked_of_each_bundle_or_refused(whole: Collection, path: Path) -> None:
+    text = "SELECT trace, count(*) AS n FROM frames GROUP BY trace ORDER BY trace"
+
+    with pytest.raises(SqlError, match="--each"):
+        whole.sql(text)
+    rows = list(whole.sql(text, each=True))
+
+    assert sorted(row[1:] for row in rows) == sorted(map(tuple, Store(path).sql(text)))
+    assert {row[0] for row in rows} == set(whole.bundles())
+
+
+def test_mistakes_are_told_before_a_bundle_is_opened(whole: Collection) -> None:
+    whole.opened = []
+    with pytest.raises(QueryError, match="neer"):
+        whole.find("MATCH (a)-[:neer]->(b)")
+    with pytest.raises(QueryError, match="unknown dataset"):
+        whole.find("USING DATASET nothing MATCH (a)")
+    with pytest.raises(QueryError, match="unknown ego"):
+        whole.find("USING EGO nobody MATCH (a)")
+    assert whole.opened == []
+
+
+def tables_of(path: Path) -> dict[str, list[tuple[Any, ...]]]:
+    file = StoreFile(path)
+    listed = "SELECT table_name FROM duckdb_tables() WHERE schema_name = 'inside' ORDER BY ALL"
+    names = [row[0] for row in file.rows(listed).values]
+    return {
+        name: file.rows(f"FROM {name} ORDER BY ALL").values
+        for name in names
+        if name != "store_info"
+    }
+
+
+def test_a_store_that_is_packed_and_unpacked_is_the_same(
+    path: Path, place: Path, tmp_path: Path
+) -> None:
+    names = unpack(place, tmp_path / "again.sgstore")
+
+    assert names == [f"trace{number}" for number in range(1, TRACES + 1)]
+    assert tables_of(tmp_path / "again.sgstore") == tables_of(path)
+
+
+def test_what_is_there_is_left_as_it_is(path: Path, tmp_path: Path) -> None:
+    pack(path, tmp_path / "c", bundle_traces=3)
+    before = sorted((tmp_path / "c").rglob("*"))
+    done = pack(path, tmp_path / "c")
+
+    assert (done.added, done.bundles, done.number) == ([], [], 1)
+    assert len(done.present) == TRACES
+    assert sorted((tmp_path / "c").rglob("*")) == before
+
+
+def test_a_changed_byte_is_found_and_the_bundle_named(place: Path, tmp_path: Path) -> None:
+    shutil.copytree(place, tmp_path / "c")
+    bundle = min((tmp_path / "c" / "bundles").iterdir())
+    data = bytearray(bundle.read_bytes())
+    data[len(data) // 2] ^= 1
+    bundle.write_bytes(data)
+
+    with pytest.raises(PartialAnswerError, match="not as it was committed") as refused:
+        Collection(tmp_path / "c").find("MATCH (a:Car)").rows()
+    assert [*refused.value.bundles] == [bundle.stem]
+    partial = Collection(tmp_path / "c", partial=True)
+    assert partial.find("MATCH (a:Car)").rows()
+    assert [*partial.missing] == [bundle.stem]
+    assert [one[0] for one in verify(tmp_path / "c").faults] == [bundle.stem]
+
+
+def test_two_traces_with_one_id_are_refused_by_name(path: Path, tmp_path: Path) -> None:
+    import duckdb
+
+    other = tmp_path / "other.sgstore"
+    shutil.copy(path, other)
+    with duckdb.connect(str(other)) as connection:
+        connection.execute("UPDATE inside.recording SET digest = 'another' WHERE digest = 't2'")
+        connection.execute("UPDATE inside.trace SET name = 'stranger' WHERE name = 'trace2'")
+    pack(path, tmp_path / "c")
+
+    with pytest.raises(StoreError, match=r"'trace2'.*'stranger'"):
+        pack(other, tmp_path / "c")
+    assert len(Collection(tmp_path / "c").traces()) == TRACES
+
+
+def test_garbage_goes_and_what_is_spoken_of_stays(path: Path, tmp_path: Path) -> None:
+    place = tmp_path / "c"
+    pack(path, place, bundle_traces=3)
+    stray = place / "bundles" / f"{'0' * 64}.sgstore"
+    stray.write_bytes(b"left behind")
+
+    assert gc(place).young == 1
+    assert gc(place, older_s=0, dry_run=True).names == [f"bundles/{stray.name}"]
+    assert stray.exists()
+    assert gc(place, older_s=0).size == len(b"left behind")
+    assert not stray.exists()
+    assert Collection(place).find("MATCH (a:Car)").count()
+
+
+def test_a_folder_that_is_no_collection_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="not a collection"):
+        Collection(tmp_path)
+
+
+def test_verbs_ask_collections_as_they_ask_stores(
+    path: Path, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def said(*arguments: str) -> Any:
+        assert run_verb([*arguments]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    for verb in (["find", QUESTIONS[7]], ["check", "-e", CHECKS[0]]):
+        one, *rest = verb
+        answers = [said(one, str(of), *rest, "--json") for of in (path, place)]
+        assert answers[0] == answers[1]
+    assert run_verb(["sql", str(place), "SELECT 1"]) == 2
+    assert "--each" in capsys.readouterr().err
+    assert said("sql", str(place), "SELECT count(*) AS n FROM frames", "--each", "--json")
+    assert run_verb(["find", str(place), "MATCH (a:Car)", "--count"]) == 0
+    assert int(capsys.readouterr().out) == Store(path).find("MATCH (a:Car)").count()
+    assert run_verb(["collection", "gc", str(place), "--dry-run", "--json"]) == 0
