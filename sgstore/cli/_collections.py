@@ -1,4 +1,4 @@
-"""The verbs of collections: collection pack, unpack, verify, gc."""
+"""The verbs of collections: collection commit, pack, unpack, verify, gc."""
 
 from __future__ import annotations
 
@@ -57,6 +57,19 @@ def pack(
         say(f"{old}: the collection has another trace of this name, so it is {new!r} there")
     say(f"{url}: {len(done.added)} traces in {len(done.bundles)} bundles, snapshot {done.number}")
     return 0
+
+
+@collection.command()
+def commit(url: Place, *, out: PrintedRows) -> int:
+    """Make bundles of all that 'ingest URL … --shard' has landed, and a snapshot that has them."""
+    from sgstore.collection import commit as commit_landed
+
+    done = commit_landed(url_of(url) or url)
+    out.write(("trace", "status"), [(name, "added") for name in done.added])
+    for reason in done.refused:
+        say(f"not committed: {reason}")
+    say(f"{url}: {len(done.added)} traces in {len(done.bundles)} bundles, snapshot {done.number}")
+    return ERROR if done.refused else 0
 
 
 @collection.command()

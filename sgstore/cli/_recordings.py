@@ -26,6 +26,7 @@ from sgstore.cli._options import (
     seconds_of,
 )
 from sgstore.cli._output import Format, say, write_document, write_report
+from sgstore.cli._places import url_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator
@@ -72,6 +73,14 @@ def ingest(
     dry_run: Annotated[
         bool, Option("--dry-run", help="Report what would be done, and do nothing.")
     ] = False,
+    shard: Annotated[
+        str | None,
+        Option(
+            "--shard",
+            metavar="I/N",
+            help="Into a collection: land share I of N of the recordings; then 'collection commit'.",
+        ),
+    ] = None,
     *,
     out: PrintedRows,
 ) -> int:
@@ -80,21 +89,29 @@ def ingest(
     from sgstore.ingest import ingest as ingest_traces
     from sgstore.ingest import recordings
 
-    with ingest_bar() as on_progress:
-        outcomes = ingest_traces(
-            store,
-            recordings(_names(traces)),
-            road_map=reading.road_map,
-            config=reading.settings(),
-            egos=ego or (),
-            jobs=jobs_of(jobs),
-            since=None if since is None else seconds_of(since, "--since"),
-            until=None if until is None else seconds_of(until, "--until"),
-            rate=rate,
-            force=force,
-            dry_run=dry_run,
-            on_progress=on_progress,
-        )
+    how: dict[str, Any] = {
+        "road_map": reading.road_map,
+        "config": reading.settings(),
+        "egos": ego or (),
+        "jobs": jobs_of(jobs),
+        "since": None if since is None else seconds_of(since, "--since"),
+        "until": None if until is None else seconds_of(until, "--until"),
+        "rate": rate,
+    }
+    if shard is not None or url_of(store) is not None:
+        if force or dry_run:
+            raise typer.BadParameter("--force and --dry-run are for a store, not for a collection")
+        outcomes = _landed(store, recordings(_names(traces)), shard, how)
+    else:
+        with ingest_bar() as on_progress:
+            outcomes = ingest_traces(
+                store,
+                recordings(_names(traces)),
+                force=force,
+                dry_run=dry_run,
+                on_progress=on_progress,
+                **how,
+            )
     for outcome in outcomes:
         _say_what_was_odd(outcome)
     columns = ("trace", "status", "ego", "frames", "entities", "seconds", "losses", "file")
@@ -102,6 +119,18 @@ def ingest(
     if any(outcome.error for outcome in outcomes):
         return ERROR
     return LOSS if any(outcome.losses for outcome in outcomes) else 0
+
+
+def _landed(
+    store: Path, paths: list[Path], shard: str | None, how: dict[str, Any]
+) -> list[TraceOutcome]:
+    """Land a share of recordings in a collection."""
+    from sgstore.collection import land
+
+    number, stroke, of = (shard or "1/1").partition("/")
+    if not (stroke and number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of)):
+        raise typer.BadParameter(f"--shard {shard}: expected I/N, such as 3/16")
+    return land(url_of(store) or store, paths, shard=(int(number), int(of)), **how)
 
 
 def _names(traces: list[str]) -> list[str]:

@@ -1,5 +1,7 @@
 # The face of this package: what others may import from it.
 
+from ._landing import commit as commit
+from ._landing import land as land
 from ._open import open as open
 from ._pack import CollectionFaults as CollectionFaults
 from ._pack import Commit as Commit
@@ -21,7 +23,9 @@ __all__ = [
     "PartedChecks",
     "PartedMatches",
     "PartialAnswerError",
+    "commit",
     "gc",
+    "land",
     "open",
     "pack",
     "unpack",

@@ -13,8 +13,8 @@ messages to its frames, and ``_publish`` brings it into the store. ``_classes`` 
 ``_derive`` other sets of relations; ``_similarity`` compares frames. ``_verify`` looks whether all is as it
 was published, ``_rebuild`` makes stores, and makes them anew.
 
-Collections: ``_bundles`` copies traces into stores of their own and says what is in them, and ``_merge``
-makes one answer of those of several bundles.
+Collections: ``_bundles`` copies traces into stores of their own and says what is in them, ``_landed`` keeps
+segments that wait for that, and ``_merge`` makes one answer of those of several bundles.
 """
 
 import lazy_loader

@@ -11,6 +11,8 @@ from ._bundles import parquet_rows as parquet_rows
 from ._bundles import write_bundle as write_bundle
 from ._catalog import relations_of_set as relations_of_set
 from ._catalog import subset_catalogs as subset_catalogs
+from ._landed import split_segment as split_segment
+from ._landed import whole_segment as whole_segment
 from ._merge import PartFile as PartFile
 from ._merge import merged_parts as merged_parts
 from ._merge import write_classes as write_classes
@@ -117,11 +119,13 @@ __all__ = [
     "relations_of_set",
     "remains_of",
     "seq_of",
+    "split_segment",
     "subset_catalogs",
     "take_place",
     "trace_id_of",
     "trace_of",
     "verify_file",
+    "whole_segment",
     "write_bundle",
     "write_classes",
     "write_csv",

@@ -161,6 +161,10 @@ class TableFile:
         """The pieces of a table, in the order in which they were written."""
         return [piece for piece in self._pieces if piece.table == table]
 
+    def all(self) -> list[Piece]:
+        """All pieces, in the order in which they were written."""
+        return list(self._pieces)
+
     def read(self, piece: Piece, first: int = 0, end: int | None = None) -> Columns:
         """Columns of some rows of a piece.
 
@@ -223,6 +227,11 @@ class TableFile:
             at += said["bytes"]
         if at != self._size:
             raise self._wrong("ends before its rows do")
+
+
+def texts_in(piece: Piece) -> dict[str, list[str]]:
+    """The texts that indices of a piece stand for, by column."""
+    return {name: about["texts"] for name, about in piece.columns.items() if "texts" in about}
 
 
 def _narrowed(values: NDArray[Any]) -> tuple[dict[str, Any], NDArray[Any] | None]:

@@ -1,0 +1,386 @@
+"""Recordings into a collection: each lands as sealed segments, and a commit makes bundles of what has landed.
+
+To land needs no lock and no order: a segment is called by what is in it, so that whoever lands it again writes
+the same. Which recordings are read by whom is told by their digests: of N shards each takes its share, on any
+machine, in any order, and one that was stopped is begun again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.collection import _catalogue as catalogue
+from sgstore.collection._pack import ATTEMPTS, Commit, groups, map_names, put_bundle
+from sgstore.collection._place import digest_of_file, place_at
+from sgstore.config import Config
+from sgstore.errors import SgstoreError, StoreError
+from sgstore.files import working_folder
+from sgstore.ingest import BLOCK_FRAMES, Workers
+from sgstore.map_files import Maps
+from sgstore.mcap import digest_of
+from sgstore.segments import Job, SegmentReader, TraceOutcome
+from sgstore.store import (
+    Sealed,
+    StoreFile,
+    free_name,
+    maps_of_traces,
+    split_segment,
+    whole_segment,
+)
+from sgstore.trace_parts import TracePart
+from sgstore.vocabulary import natural
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+    from sgstore.collection._catalogue import Snapshot
+    from sgstore.collection._place import Place
+    from sgstore.store import Facts
+
+FILES: Final = ("sealed.json", "tables")
+"""Files of a segment that has landed."""
+
+
+def land(  # noqa: PLR0913  as many options as there are ways to read
+    url: str | Path,
+    traces: Sequence[str | Path],
+    *,
+    shard: tuple[int, int] = (1, 1),
+    road_map: str | Path | None = None,
+    config: Config | None = None,
+    egos: Sequence[str] = (),
+    jobs: int = 1,
+    since: float | None = None,
+    until: float | None = None,
+    rate: float | None = None,
+) -> list[TraceOutcome]:
+    """Read recordings, and land their segments in a collection, which is made if there is none.
+
+    What has landed already, read in the same way, is not read again.
+
+    Parameters
+    ----------
+    url : str or Path
+        Of the collection.
+    traces : sequence of str or Path
+        Files; :func:`sgstore.ingest.recordings` finds them in folders and by patterns.
+    shard : (int, int)
+        Which share of the recordings is read here, of how many: 1 … N, N.
+    road_map, config, egos, jobs, since, until, rate
+        As :func:`sgstore.ingest.ingest` takes them.
+
+    Returns
+    -------
+    list of TraceOutcome
+        For each recording of the share, in the order given, one for each ego: ``landed``, ``present`` or
+        ``failed``.
+
+    Raises
+    ------
+    StoreError
+        The collection cannot be written, or there is no such share.
+    MapError
+        The file given for the road map cannot be read.
+    """
+    number, of = shard
+    if not 1 <= number <= of:
+        raise StoreError(f"shard {number}/{of}: expected I/N with 1 ≤ I ≤ N")
+    settings = config or Config()
+    if egos:
+        settings = replace(settings, ego="", egos=tuple(egos))
+    if rate is not None:
+        settings = replace(settings, rate=float(rate))
+    place = place_at(url)
+    catalogue.create(place, catalogue.About())
+    with working_folder("landing") as folder:
+        job = Job(
+            store=folder / "none.sgstore",  # nothing is there: whatever is asked for is read
+            road_map=None if road_map is None else Path(road_map),
+            config=settings,
+            part=TracePart(since, until, settings.rate),
+            block_frames=BLOCK_FRAMES,
+        )
+        landing = _Landing(place, job, folder)
+        return landing.landed([Path(path) for path in traces], number - 1, of, jobs)
+
+
+@dataclass(slots=True)
+class _Landing:
+    place: Place
+    job: Job
+    folder: Path
+    maps: set[str] = field(default_factory=set[str])
+
+    def landed(self, paths: list[Path], share: int, of: int, jobs: int) -> list[TraceOutcome]:
+        """Read a share of some recordings, and land their segments."""
+        Maps(self.job.road_map, self.job.config.signs)  # one that cannot be read stops all at once
+        found: dict[int, list[TraceOutcome]] = {}
+        wanted: dict[int, tuple[Path, str]] = {}
+        for place, path in enumerate(paths):
+            try:
+                digest = digest_of(path)
+            except SgstoreError as error:  # then one share says so, always the same
+                if _share(hashlib.sha256(path.name.encode()).hexdigest(), of) == share:
+                    found[place] = [TraceOutcome(path, error=error)]
+                continue
+            if _share(digest, of) != share:
+                continue
+            key = self._key(digest)
+            told = self._told(key, path)
+            if told is None:
+                wanted[place] = path, key
+            else:
+                found[place] = told
+        with ExitStack() as stack:
+            read = self._read([path for path, _ in wanted.values()], jobs, stack)
+            for number, (place, (_, key)) in enumerate(wanted.items()):
+                found[place] = self._land(key, next(read))
+                shutil.rmtree(self.folder / str(number), ignore_errors=True)
+        return [outcome for place in sorted(found) for outcome in found[place]]
+
+    def _read(
+        self, paths: list[Path], jobs: int, stack: ExitStack
+    ) -> Iterator[list[tuple[TraceOutcome, Path | None]]]:
+        def see(*_told: int) -> None:
+            """Take no note of how far it is."""
+
+        if min(jobs, len(paths)) > 1:
+            yield from stack.enter_context(Workers(self.job, jobs, see)).read(paths, self.folder)
+            return
+        reader = SegmentReader(self.job, see)
+        for number, path in enumerate(paths):
+            yield reader.read(path, self.folder / str(number))
+
+    def _key(self, digest: str) -> str:
+        """What a recording that is read in this way is called among those that have landed."""
+        job = self.job
+        road_map = ""
+        if job.road_map is not None and job.road_map.is_file():
+            road_map = digest_of_file(job.road_map)
+        elif job.road_map is not None:
+            road_map = str(job.road_map.resolve())
+        about = [digest, job.config.as_dict(), asdict(job.part), road_map]
+        return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
+
+    def _told(self, key: str, path: Path) -> list[TraceOutcome] | None:
+        """Outcomes of a recording that has landed before; ``None`` if it has not."""
+        name = f"landed/{key[:2]}/{key}.json"
+        if not any(one == name for one, _, _ in self.place.names(f"landed/{key[:2]}")):
+            return None
+        told = json.loads(self.place.read(name))
+        return [
+            TraceOutcome(path, "present", "", one["ego"], one["frames"]) for one in told["traces"]
+        ]
+
+    def _land(self, key: str, views: list[tuple[TraceOutcome, Path | None]]) -> list[TraceOutcome]:
+        told: list[dict[str, Any]] = []
+        for outcome, sealed in views:
+            if sealed is None or outcome.status != "sealed":
+                continue
+            outcome.status = "failed"
+            try:
+                segment = self._put(sealed)
+            except SgstoreError as error:
+                outcome.error = error
+                continue
+            outcome.status = "landed"
+            told.append({"segment": segment, "ego": outcome.ego, "frames": outcome.frames})
+        if told and len(told) == len(views):
+            data = json.dumps({"traces": told}, indent=2).encode()
+            self.place.write_new(f"landed/{key[:2]}/{key}.json", data)
+        return [outcome for outcome, _ in views]
+
+    def _put(self, sealed: Path) -> str:
+        """Put a segment into the collection, and its map if that is not there; what the segment is called."""
+        with working_folder("segment") as folder:
+            parts = [folder / name for name in ("segment", "map")]
+            for part in parts:
+                part.mkdir()
+            of_map = split_segment(sealed, *parts)
+            if of_map and of_map not in self.maps:
+                name = f"maps/{of_map}/tables"
+                if not any(one == name for one, _, _ in self.place.names(f"maps/{of_map}")):
+                    self.place.upload(parts[1] / "tables", name)
+                self.maps.add(of_map)
+            digests = [digest_of_file(parts[0] / name) for name in FILES]
+            segment = hashlib.sha256(" ".join(digests).encode()).hexdigest()
+            for name in reversed(FILES):  # what says that it is complete comes last
+                self.place.upload(parts[0] / name, f"segments/{segment[:2]}/{segment}/{name}")
+            return segment
+
+
+def _share(digest: str, of: int) -> int:
+    return int(digest[:15], 16) % of
+
+
+# What has landed → bundles ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Landed:
+    """A segment that waits to be committed."""
+
+    segment: str
+    trace_id: int
+    digest: str
+    ego: str
+    stem: str
+    uri: str
+    of_map: str
+    map_name: str
+    size: int
+
+    @property
+    def whose(self) -> str:
+        return f"{self.uri} (SHA-256 {self.digest[:12]}…, ego {self.ego!r})"
+
+
+def commit(url: str | Path) -> Commit:
+    """Make bundles of all segments that have landed and are not committed, and a snapshot that has them.
+
+    Raises
+    ------
+    StoreError
+        There is no collection, or it cannot be read or written.
+    """
+    place = place_at(url)
+    about = catalogue.about(place)
+    for _ in range(ATTEMPTS):
+        before = catalogue.latest(place)
+        done = Commit(before.number)
+        with working_folder("commit") as folder:
+            waiting = _accepted(_waiting(place, before, folder), before, done)
+            names = _names(waiting, before, done)
+            if not names:
+                return done
+            each = max(sum(one.size for one in waiting) // len(waiting), 1)
+            most = max(min(about.bundle_traces, about.bundle_bytes // each), 1)
+            by_trace = {one.trace_id: one for one in waiting}
+            maps = map_names(before, {one.of_map: one.map_name for one in waiting if one.of_map})
+            facts = [
+                _bundled(place, folder, [by_trace[one] for one in group], group, maps)
+                for group in groups(names, most)
+            ]
+        done.bundles = [one["bundle"][0][0] for one in facts]
+        done.number = before.number + 1
+        if catalogue.write(place, done.number, catalogue.joined([before.facts, *facts])):
+            return done
+    raise StoreError(f"{place.url}: others commit without a pause; try again later")
+
+
+def _waiting(place: Place, before: Snapshot, folder: Path) -> list[_Landed]:
+    """The segments that have landed and are in no bundle, in the order of their recordings' digests."""
+    known = {row["segment"] for row in before.traces}
+    sizes: dict[str, int] = {}
+    complete: set[str] = set()
+    for name, size, _ in place.names("segments"):
+        segment = name.split("/")[2]
+        sizes[segment] = sizes.get(segment, 0) + size
+        if name.endswith(f"/{FILES[0]}"):
+            complete.add(segment)
+    found: list[_Landed] = []
+    for segment in sorted(complete - known):
+        told = Sealed.read(_fetched(place, segment, folder, FILES[:1]))
+        identity = told.identity
+        found.append(
+            _Landed(
+                segment,
+                identity.trace_id,
+                identity.digest,
+                identity.ego,
+                told.path.stem,
+                str(told.path),
+                identity.map_digest,
+                identity.map_name or "map",
+                sizes[segment],
+            )
+        )
+    return sorted(found, key=lambda one: (one.digest, one.ego, one.segment))
+
+
+def _fetched(place: Place, segment: str, folder: Path, files: Iterable[str] = FILES) -> Path:
+    to = folder / segment
+    to.mkdir(exist_ok=True)
+    for name in files:
+        if not (to / name).exists():
+            place.fetch(f"segments/{segment[:2]}/{segment}/{name}", to / name)
+    return to
+
+
+def _accepted(waiting: list[_Landed], before: Snapshot, done: Commit) -> list[_Landed]:
+    """The segments that can come in; the others are told with the reason."""
+    there = {row["trace_id"]: row for row in before.traces}
+    by_id: dict[int, list[_Landed]] = {}
+    for one in waiting:
+        by_id.setdefault(one.trace_id, []).append(one)
+    found: list[_Landed] = []
+    for trace_id, same in by_id.items():
+        row = there.get(trace_id)
+        whose = [one.whose for one in same]
+        if row is not None:
+            held = f"{row['uri']} (SHA-256 {row['digest'][:12]}…, ego {row['ego']!r})"
+            whose.insert(0, f"{held}, which is {row['name']!r}")
+        of = {(one.digest, one.ego) for one in same}
+        of |= set() if row is None else {(row["digest"], row["ego"])}
+        if len(of) > 1:
+            done.refused.append(
+                f"the id {trace_id} is that of several traces by chance: {' and '.join(whose)};"
+                " put one of them into a collection of its own"
+            )
+        elif len(whose) > 1:
+            done.refused.append(
+                f"one trace was read in several ways (settings, map, part or place): {' and '.join(whose)};"
+                " a collection has it once"
+            )
+        else:
+            found.append(same[0])
+    return found
+
+
+def _names(waiting: Sequence[_Landed], before: Snapshot, done: Commit) -> dict[int, str]:
+    """What each trace is called: in the order of digests, so it does not matter who landed first."""
+    taken = {row["name"] for row in before.traces}
+    names: dict[int, str] = {}
+    for one in waiting:
+        names[one.trace_id] = free_name(one.stem, taken)
+        taken.add(names[one.trace_id])
+    done.added = sorted(names.values(), key=natural)
+    return names
+
+
+def _bundled(
+    place: Place,
+    folder: Path,
+    waiting: Sequence[_Landed],
+    names: Mapping[int, str],
+    maps: Mapping[str, str],
+) -> Facts:
+    """Make a bundle of segments, by way of a store that they are published to."""
+    path = folder / "published.sgstore"
+    file = StoreFile.create(path)
+    for one in waiting:
+        of_map = None
+        if one.of_map:
+            of_map = folder / f"map-{one.of_map}"
+            of_map.mkdir(exist_ok=True)
+            if not (of_map / "tables").exists():
+                place.fetch(f"maps/{one.of_map}/tables", of_map / "tables")
+        to = folder / f"whole-{one.segment}"
+        to.mkdir()
+        segment = _fetched(place, one.segment, folder)
+        file.publish(whole_segment(segment, of_map, to))
+        shutil.rmtree(to)
+        shutil.rmtree(segment)
+    file.close()
+    known = maps_of_traces(path, names)
+    segments = {one.trace_id: one.segment for one in waiting}
+    chosen = {digest: maps[digest] for digest in known}
+    facts = put_bundle(place, path, folder / "bundle.sgstore", names, chosen, segments)
+    path.unlink()
+    return facts

@@ -1,0 +1,70 @@
+"""Sealed segments that wait in a collection, each without its road map, which waits once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+from sgstore.store._publish import SHARED
+from sgstore.store._staging import FILE, Sealed, TableFile, texts_in
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+MAP_TABLES: Final = frozenset(SHARED["map"])
+"""Tables of a segment that belong to its road map."""
+
+
+def split_segment(sealed: Path, to: Path, of_map: Path) -> str:
+    """Write a sealed segment again, its road map apart; the digest of the map, empty without one.
+
+    Parameters
+    ----------
+    sealed : Path
+        The folder of the segment.
+    to, of_map : Path
+        Folders that are there and empty: for the segment without its map, and for the map.
+
+    Raises
+    ------
+    StoreError
+        The segment cannot be read, or a file not be written.
+    """
+    told = Sealed.read(sealed)
+    tables = TableFile(sealed / FILE, sealed)
+    parts = [TableFile(folder / FILE, folder, new=True) for folder in (to, of_map)]
+    try:
+        for piece in tables.all():
+            part = parts[piece.table in MAP_TABLES]
+            part.append(piece.table, tables.read(piece), texts_in(piece))
+    finally:
+        for one in (tables, *parts):
+            one.close()
+    replace(told, folder=to).write()
+    return told.identity.map_digest
+
+
+def whole_segment(segment: Path, of_map: Path | None, to: Path) -> Sealed:
+    """A sealed segment in a folder of its own, made of one without its map, and of the map.
+
+    Raises
+    ------
+    StoreError
+        A file cannot be read or written, or is none of ours.
+    """
+    told = Sealed.read(segment)
+    fresh = TableFile(to / FILE, to, new=True)
+    try:
+        for folder in (segment, *([] if of_map is None else [of_map])):
+            tables = TableFile(folder / FILE, folder)
+            try:
+                for piece in tables.all():
+                    fresh.append(piece.table, tables.read(piece), texts_in(piece))
+            finally:
+                tables.close()
+    finally:
+        fresh.close()
+    whole = replace(told, folder=to)
+    whole.write()
+    return whole

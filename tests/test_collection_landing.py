@@ -1,0 +1,181 @@
+"""Recordings land in a collection by shares, and a commit makes bundles of them: as if one had read all."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from recordings import Recorder, car
+
+from sgstore.cli import run as run_verb
+from sgstore.collection import Collection, commit, gc, land, verify
+from sgstore.collection import _landing as landing
+from sgstore.errors import StoreError
+from sgstore.ingest import ingest
+from sgstore.query import Store
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+NEAR = "MATCH (a:Car)-[:near]->(b:Car)"
+COUNTED = "MATCH (a:Car)-[:near]->(b:Car) RETURN trace.name, a, COUNT(*) AS n, AVG(b.x)"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    before = os.environ.get("SGSTORE_CACHE")
+    os.environ["SGSTORE_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+    yield
+    os.environ.pop("SGSTORE_CACHE")
+    if before is not None:
+        os.environ["SGSTORE_CACHE"] = before
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Four recordings, two of which have the same name, in two folders."""
+    folder = tmp_path_factory.mktemp("drives")
+    paths = [folder / name for name in ("a.mcap", "b.mcap", "c.mcap", "more/a.mcap")]
+    paths[3].parent.mkdir()
+    for number, path in enumerate(paths):
+        with Recorder(path) as recorder:
+            for i in range(65 + number):
+                moving = [car(7, i, v=(10, 0)), car(8, i + 12 + number / 2, v=(9, 0))]
+                recorder.ground_truth(i * 0.1, moving, host=7)
+    return paths
+
+
+@pytest.fixture(scope="module")
+def unsharded(drives: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("whole") / "c"
+    assert {outcome.status for outcome in land(place, drives)} == {"landed"}
+    assert commit(place).added == ["a", "a~2", "b", "c"]
+    return place
+
+
+def segments_of(place: Path) -> list[str]:
+    return sorted(path.relative_to(place).as_posix() for path in (place / "segments").rglob("*"))
+
+
+def facts_of(place: Path) -> dict[str, list[Any]]:
+    """What the catalogue says, but for what bundles are called and how large they are."""
+    facts = Collection(place).snapshot.facts
+    told = {table: sorted(row[1:] for row in rows) for table, rows in facts.items()}
+    return told | {"bundle": [], "config": facts["config"]}
+
+
+def test_shares_that_were_stopped_and_begun_again_are_the_whole(
+    drives: list[Path], unsharded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place, put = tmp_path / "c", landing._Landing._put
+
+    def stopped(self: Any, sealed: Path) -> str:
+        put(self, sealed)
+        raise KeyboardInterrupt  # it has landed, and nobody has noted it
+
+    for share in (2, 1, 3):
+        with monkeypatch.context() as patched:
+            patched.setattr(landing._Landing, "_put", stopped)
+            with suppress(KeyboardInterrupt):
+                land(place, drives, shard=(share, 3))
+        land(place, drives, shard=(share, 3))
+    done = commit(place)
+
+    assert done.added == ["a", "a~2", "b", "c"]
+    assert segments_of(place) == segments_of(unsharded)
+    assert facts_of(place) == facts_of(unsharded)
+    one, other = Collection(place), Collection(unsharded)
+    assert one.find(COUNTED).rows() == other.find(COUNTED).rows() != []
+
+
+def test_each_recording_is_in_one_share(drives: list[Path], tmp_path: Path) -> None:
+    found = [
+        [outcome.path for outcome in land(tmp_path / "c", drives, shard=(share, 2))]
+        for share in (1, 2)
+    ]
+
+    assert sorted(found[0] + found[1]) == sorted(drives)
+
+
+def test_what_was_landed_is_what_ingest_reads(
+    drives: list[Path], unsharded: Path, tmp_path: Path
+) -> None:
+    ingest(tmp_path / "s.sgstore", drives[:3])
+    with Store(tmp_path / "s.sgstore") as store:
+        wanted = [tuple(row)[2:] for row in store.find(f"USING DATASET b {NEAR}")]
+    found = [tuple(row)[2:] for row in Collection(unsharded).find(f"USING DATASET b {NEAR}")]
+
+    assert found == wanted != []
+    assert verify(unsharded).faults == []
+
+
+def test_what_has_landed_is_not_read_again(drives: list[Path], tmp_path: Path) -> None:
+    place = tmp_path / "c"
+    land(place, drives[:1])
+    commit(place)
+
+    (outcome,) = land(place, drives[:1])
+    assert (outcome.status, outcome.frames) == ("present", 65)
+    assert commit(place).bundles == []
+    land(place, drives[1:2])
+    assert commit(place).added == ["b"]
+    assert [row["name"] for row in Collection(place).traces()] == ["a", "b"]
+    assert gc(place, older_s=0).names
+    assert Collection(place).find(NEAR).count() == 65 + 66
+
+
+def test_two_traces_of_one_id_are_refused_and_nothing_else_is_lost(
+    drives: list[Path], unsharded: Path, tmp_path: Path
+) -> None:
+    place = tmp_path / "c"
+    land(place, drives[:2])
+    told = next((place / "segments").rglob("sealed.json"))
+    copied = place / "segments" / "00" / ("0" * 64)
+    shutil.copytree(told.parent, copied)
+    values = json.loads(told.read_text())
+    values["identity"]["digest"], values["path"] = "f" * 64, "/elsewhere/stranger.mcap"
+    (copied / "sealed.json").write_text(json.dumps(values))
+
+    done = commit(place)
+
+    (reason,) = done.refused
+    assert "stranger.mcap" in reason
+    assert any(path.name in reason for path in drives[:2])
+    assert len(done.added) == 1
+    assert Collection(place).find(NEAR).count() > 0
+    assert run_verb(["collection", "commit", str(place)]) == 1
+
+
+def test_one_trace_read_in_two_ways_is_in_a_collection_once(
+    drives: list[Path], tmp_path: Path
+) -> None:
+    place = tmp_path / "c"
+    land(place, drives[:1])
+    commit(place)
+    land(place, drives[:1], until=2)
+
+    (reason,) = commit(place).refused
+    assert "several ways" in reason
+
+
+def test_a_share_that_is_none_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="shard 3/2"):
+        land(tmp_path / "c", [], shard=(3, 2))
+    assert run_verb(["ingest", str(tmp_path / "c"), "x.mcap", "--shard", "half"]) == 2
+
+
+def test_the_verbs_do_it(
+    drives: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = str(tmp_path / "c")
+    for share in ("1/2", "2/2"):
+        assert run_verb(["ingest", place, *map(str, drives), "--shard", share]) == 0
+    assert run_verb(["collection", "commit", place, "--json"]) == 0
+    capsys.readouterr()
+    assert run_verb(["find", place, NEAR, "--count"]) == 0
+    assert int(capsys.readouterr().out) == sum(65 + number for number in range(4))
