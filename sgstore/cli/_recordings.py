@@ -99,9 +99,7 @@ def ingest(
         "rate": rate,
     }
     if shard is not None or url_of(store) is not None:
-        if force or dry_run:
-            raise typer.BadParameter("--force and --dry-run are for a store, not for a collection")
-        outcomes = _landed(store, recordings(_names(traces)), shard, how)
+        outcomes = _landed(store, recordings(_names(traces)), shard, how, alone=force or dry_run)
     else:
         with ingest_bar() as on_progress:
             outcomes = ingest_traces(
@@ -112,6 +110,11 @@ def ingest(
                 on_progress=on_progress,
                 **how,
             )
+    return _told(outcomes, out)
+
+
+def _told(outcomes: list[TraceOutcome], out: PrintedRows) -> int:
+    """Print what became of recordings; the exit code."""
     for outcome in outcomes:
         _say_what_was_odd(outcome)
     columns = ("trace", "status", "ego", "frames", "entities", "seconds", "losses", "file")
@@ -122,9 +125,11 @@ def ingest(
 
 
 def _landed(
-    store: Path, paths: list[Path], shard: str | None, how: dict[str, Any]
+    store: Path, paths: list[Path], shard: str | None, how: dict[str, Any], *, alone: bool
 ) -> list[TraceOutcome]:
-    """Land a share of recordings in a collection."""
+    """Land a share of recordings in a collection; ``alone``: an option was given that is for a store."""
+    if alone:
+        raise typer.BadParameter("--force and --dry-run are for a store, not for a collection")
     from sgstore.collection import land
 
     number, stroke, of = (shard or "1/1").partition("/")

@@ -72,7 +72,9 @@ def open(  # noqa: PLR0913  those of a store, and those of a collection
         There is no store, or no collection, or it is one of another version.
     """
     if not engine:
-        return Store(path, create=create, memory=memory, tables=tables, max_spill=max_spill, root=root)
+        return Store(
+            path, create=create, memory=memory, tables=tables, max_spill=max_spill, root=root
+        )
     from sgstore.collection._questions import Collection
 
     return Collection(path, engine=engine, tables=tables, partial=partial)
