@@ -71,7 +71,7 @@ test: $(VENV)/.dev
 # programs below. A file that is not listed is of the core.
 EDGES := coverage coverage_docs derive derive_using like locks selection selection_docs selection_overlapping prioritize \
   draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap export_viewers exports exports_docs timeline \
-  assistant notebook carla_live importing junit lang_sgl pytest_plugin record sample \
+  assistant notebook carla_live collection collection_landing importing junit lang_sgl pytest_plugin record sample \
   docs_house docs_queries lang_docs packaging views_page \
   fuzz mutants
 tests-of = $(foreach name,$(1),tests/test_$(name).py)

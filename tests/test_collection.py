@@ -52,6 +52,8 @@ QUESTIONS = [
     "MATCH (e:Ego) WHERE frame.class IN dataset_classes('trace3') RETURN FRAMES",
     "USING DATASET 'trace[45]' MATCH (a:Car) RETURN COUNT(*)",
     "USING UNKNOWN false MATCH (a:Car)-[:near]->(b) RETURN trace.name, COUNT(*) AS n",
+    "USING UNKNOWN false MATCH (a)-[:sees]->(b:Bicycle) RETURN COUNT(*) AS n, MAX(a.x)",
+    "USING UNKNOWN false MATCH (a)-[:sees]->(b:Bicycle) RETURN a, b.name",
     "MATCH (a:Car) WHERE NOT EXISTS {(a)-[:near]->(b)} RETURN trace.map, COUNT(*)",
 ]
 CHECKS = [
@@ -300,6 +302,9 @@ def test_verbs_ask_collections_as_they_ask_stores(
         assert answers[0] == answers[1]
     assert run_verb(["sql", str(place), "SELECT 1"]) == 2
     assert "--each" in capsys.readouterr().err
+    assert [row["trace"] for row in said("info", str(place), "--json")] == [
+        f"trace{number}" for number in range(1, TRACES + 1)
+    ]
     assert said("sql", str(place), "SELECT count(*) AS n FROM frames", "--each", "--json")
     assert run_verb(["find", str(place), "MATCH (a:Car)", "--count"]) == 0
     assert int(capsys.readouterr().out) == Store(path).find("MATCH (a:Car)").count()

@@ -16,6 +16,7 @@ from sgstore.cli._options import (
     ERROR,
     LOSS,
     AsJson,
+    AskedPath,
     Jobs,
     PrintedRows,
     ReadingOptions,
@@ -27,6 +28,7 @@ from sgstore.cli._options import (
 )
 from sgstore.cli._output import Format, say, write_document, write_report
 from sgstore.cli._places import url_of
+from sgstore.errors import StoreError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator
@@ -178,7 +180,7 @@ def _outcome_row(outcome: TraceOutcome) -> tuple[Any, ...]:
 
 @app.command(rich_help_panel=PANEL)
 def info(
-    store: StorePath,
+    store: AskedPath,
     traces: Annotated[
         list[str] | None,
         Option("--trace", help="A trace in full: a name, id, or beginning of one; repeatable."),
@@ -186,7 +188,10 @@ def info(
     *,
     out: PrintedRows,
 ) -> int:
-    """List the traces of a store, or describe one in full."""
+    """List the traces of a store, or describe one in full; of a collection, list them."""
+    if (url := url_of(store)) is not None:
+        _tell_of_collection(url, traces or [], out)
+        return 0
     from sgstore.store import StoreFile
 
     file = StoreFile(store)
@@ -212,6 +217,27 @@ def info(
         ),
     )
     return 0
+
+
+def _tell_of_collection(url: str, names: list[str], out: PrintedRows) -> None:
+    """Print what the catalogue of a collection says of traces; without names of all."""
+    from sgstore.collection import Collection
+
+    found = Collection(url).traces()
+    known = {row["name"] for row in found}
+    for name in names:
+        if name not in known:
+            raise StoreError(f"{url}: no trace {name!r}")
+    columns = ("trace", "frames", "seconds", "ego", "map", "trace_id", "bundle", "file")
+    rows = (
+        (
+            *(row["name"], row["frames"], round((row["end_ns"] - row["start_ns"]) / 1e9, 3)),
+            *(row["ego"], row["map"], row["trace_id"], row["bundle"], row["uri"]),
+        )
+        for row in found
+        if not names or row["name"] in names
+    )
+    out.write(columns, rows)
 
 
 def _tell_all_of(file: StoreFile, names: list[str], out: PrintedRows) -> None:

@@ -185,34 +185,38 @@ class Snapshot:
 
     def catalog_of(self, bundles: Sequence[str]) -> Catalog:
         """What some bundles hold together; names are those of all."""
+        chosen = frozenset(bundles)
+        found = zip(self._homes, self._facts, strict=True)
+        sets = subset_catalogs()
+        sets |= {name: partial(self._derived, name, chosen) for name in self.sets}
+        return replace(
+            self.contents(bundles),
+            traces=tuple(facts for bundle, facts in found if bundle in chosen),
+            classed=self.classed,
+            names=self.words,
+            own=self.own["own"],
+            own_edges=self.own["own_edges"],
+            sets=sets,
+        )
+
+    def contents(self, bundles: Sequence[str], name: str = "") -> Catalog:
+        """The triples and kinds of some bundles, in a derived set or as they were ingested; no traces."""
         edges, map_edges = Counter[Any](), Counter[Any]()
         kinds: dict[str, set[str]] = {home: set() for home in ("moving", "fixed", "mapped")}
         for bundle in bundles:
-            for _, name, moving, relation, src, dst, rows in self.of("triple", bundle):
-                if not name:
+            for _, of, moving, relation, src, dst, rows in self.of("triple", bundle):
+                if of == name:
                     (edges if moving else map_edges)[relation, src, dst] += rows
             for _, home, kind in self.of("kind", bundle):
                 kinds[home].add(kind)
-        chosen = frozenset(bundles)
-        whole = Catalog(
+        return Catalog(
             edges=dict(edges),
             map_edges=dict(map_edges),
             moving=frozenset(kinds["moving"]),
             fixed=frozenset(kinds["fixed"]),
             mapped=frozenset(kinds["mapped"]),
-            traces=tuple(
-                facts
-                for bundle, facts in zip(self._homes, self._facts, strict=True)
-                if bundle in chosen
-            ),
-            classed=self.classed,
-            names=self.words,
-            own=self.own["own"],
-            own_edges=self.own["own_edges"],
+            sets=subset_catalogs(),
         )
-        sets = subset_catalogs()
-        sets |= {name: partial(self._derived, name, chosen) for name in self.sets}
-        return replace(whole, sets=sets)
 
     @cached_property
     def _homes(self) -> tuple[str, ...]:

@@ -270,7 +270,7 @@ class Collection:
         snapshot, tables = self.snapshot, dict[str, str]()
         for table in self._tables.tables if self._tables is not None else ():
             tables[table.name] = self._sent(table.place)
-        for name, path in question.pop("given", {}).items():
+        for name, path in question.get("given", {}).items():
             tables[name] = self._sent(path)
         whole = {
             "words": {enum: [*words] for enum, words in snapshot.words.items()},
@@ -284,7 +284,8 @@ class Collection:
         }
         to = str(folder) if self.engine.shares_files else ""
         about = {"url": self.place.url, "whole": whole, "tables": tables, "to": to}
-        return {"text": "", "parameters": {}, "limit": None} | question | about
+        asked = {name: value for name, value in question.items() if name != "given"}
+        return {"text": "", "parameters": {}, "limit": None} | asked | about
 
     def _sent(self, path: Path) -> str:
         """A table as a task names it: its file, or its bytes where files are not shared."""
@@ -342,8 +343,9 @@ class Collection:
         """The triples of a bundle by relation, and its kinds, under an abstraction."""
         held = self._memo.get((bundle, name))
         if held is None:
-            seen = self.snapshot.catalog_of([bundle])
-            seen = (seen.under(name) if name else seen) or seen
+            derived = name if name in self.snapshot.sets else ""
+            seen = self.snapshot.contents([bundle], derived)
+            seen = (seen.under(name) if name and not derived else seen) or seen
             triples: dict[str, set[Any]] = {}
             for triple in (*seen.edges, *seen.map_edges):
                 triples.setdefault(triple[0], set()).add(triple)
@@ -520,21 +522,27 @@ class PartedMatches(Tabular):
         """The rows of a form in which the matches are asked for."""
         asked = parted(self._ready, form, *offsets)
         with working_folder("parts") as folder:
-            bundles = self._whole.may_answer(self._ready) or [worker.EMPTY]
+            question = self._question(form, folder, offsets)
             tables: dict[str, list[PartFile]] = {}
-            for answer in self._whole.ask(self._question(form, folder, offsets), bundles):
-                self._reasons |= answer["reasons"]
-                for number, told in enumerate(answer["parts"]):
-                    part = PartFile.from_dict(told)
-                    kept = folder / part.path.name
-                    part.path.replace(kept)
-                    name = PARTS if not number else f"{PARTS} {number}"
-                    tables.setdefault(name, []).append(replace(part, path=kept))
+            for bundles in (self._whole.may_answer(self._ready), [worker.EMPTY]):
+                if tables:
+                    break
+                for answer in self._whole.ask(question, bundles):
+                    self._reasons |= answer["reasons"]
+                    for number, told in enumerate(answer["parts"]):
+                        name = PARTS if not number else f"{PARTS} {number}"
+                        part = _moved(PartFile.from_dict(told), folder)
+                        tables.setdefault(name, []).append(part)
             text, values = asked.statement(self._ready.catalog)
             words = self._whole.snapshot.words
             with merged_parts(tables, words, text, values) as batches:
                 for batch in batches:
                     yield from batch.values
+
+
+def _moved(part: PartFile, folder: Path) -> PartFile:
+    """A part whose file is in another folder now, where it stays until all have come."""
+    return replace(part, path=part.path.replace(folder / part.path.name))
 
 
 class PartedChecks:
