@@ -14,7 +14,7 @@ from sgstore.cli import run as run_verb
 from sgstore.collection import Collection, PartialAnswerError, gc, pack, unpack, verify
 from sgstore.errors import QueryError, SqlError, StoreError
 from sgstore.query import Store
-from sgstore.store import StoreFile
+from sgstore.store import StoreFile, _bundles
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -220,9 +220,12 @@ def tables_of(path: Path) -> dict[str, list[tuple[Any, ...]]]:
     }
 
 
+@pytest.mark.parametrize("together", [64, 2], ids=["at once", "some by some"])
 def test_a_store_that_is_packed_and_unpacked_is_the_same(
-    path: Path, place: Path, tmp_path: Path
+    path: Path, place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, together: int
 ) -> None:
+    monkeypatch.setattr(_bundles, "TOGETHER", together)
+
     names = unpack(place, tmp_path / "again.sgstore")
 
     assert names == [f"trace{number}" for number in range(1, TRACES + 1)]

@@ -9,6 +9,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from opendrive_maps import a_map, a_road, lane, line, section
 from recordings import Recorder, car
 
 from sgstore.cli import run as run_verb
@@ -38,12 +39,15 @@ def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Four recordings, two of which have the same name, in two folders."""
+    """Four recordings, two of which have the same name, in two folders; all but the first on one map."""
+    road_map = a_map(a_road("1", line(200.0), sections=section(lane(1), lane(0), lane(-1))))
     folder = tmp_path_factory.mktemp("drives")
     paths = [folder / name for name in ("a.mcap", "b.mcap", "c.mcap", "more/a.mcap")]
     paths[3].parent.mkdir()
     for number, path in enumerate(paths):
         with Recorder(path) as recorder:
+            if number:
+                recorder.map(road_map)
             for i in range(65 + number):
                 moving = [car(7, i, v=(10, 0)), car(8, i + 12 + number / 2, v=(9, 0))]
                 recorder.ground_truth(i * 0.1, moving, host=7)
@@ -54,6 +58,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 def unsharded(drives: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("whole") / "c"
     assert {outcome.status for outcome in land(place, drives)} == {"landed"}
+    assert len(list((place / "maps").rglob("tables"))) == 1
     assert commit(place).added == ["a", "a~2", "b", "c"]
     return place
 
