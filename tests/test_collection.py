@@ -157,7 +157,7 @@ def test_processes_answer_as_this_one_does(whole: Collection, place: Path) -> No
     several = Collection(place, engine="local:2")
 
     assert several.find(QUESTIONS[7]).rows() == whole.find(QUESTIONS[7]).rows()
-    assert list(several.check(CHECKS[0])) == list(whole.check(CHECKS[0]))
+    assert list(map(str, several.check(CHECKS[0]))) == list(map(str, whole.check(CHECKS[0])))
 
 
 def test_tables_of_ones_own_are_joined(path: Path, place: Path, tmp_path: Path) -> None:
@@ -255,7 +255,8 @@ def test_a_changed_byte_is_found_and_the_bundle_named(place: Path, tmp_path: Pat
     partial = Collection(tmp_path / "c", partial=True)
     assert partial.find("MATCH (a:Car)").rows()
     assert [*partial.missing] == [bundle.stem]
-    assert [one[0] for one in verify(tmp_path / "c").faults] == [bundle.stem]
+    faults = verify(tmp_path / "c").faults
+    assert [one[0] for one in faults if one[1] == "file"] == [bundle.stem]
 
 
 def test_two_traces_with_one_id_are_refused_by_name(path: Path, tmp_path: Path) -> None:
