@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from typing import TYPE_CHECKING, Any
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any, get_args
 
 import pytest
 from oracle_worlds import random_world
@@ -13,6 +14,9 @@ from oracle_worlds import random_world
 from sgstore.cli import run as run_verb
 from sgstore.collection import Collection, PartialAnswerError, gc, pack, unpack, verify
 from sgstore.errors import QueryError, SqlError, StoreError
+from sgstore.lang import _catalog, compile_query, ir, syntax
+from sgstore.lang import _parts as parts
+from sgstore.lang._aggregates import AGGREGATES
 from sgstore.query import Store
 from sgstore.store import StoreFile, _bundles
 
@@ -46,6 +50,9 @@ QUESTIONS = [
     "MATCH (a:Car)-[:near]->(b) RETURN SUBGRAPHS LIMIT 5",
     "MATCH (a:Car)-[:near]->(b) RETURN a.x SAMPLE 3 PER b.kind",
     "MATCH (a:Car)-[:near]->(b) RETURN a SAMPLE 2 PER a LIMIT 5",
+    "MATCH (a:Car)-[:near]->(b) RETURN a.x, frame.seq, trace.name SAMPLE 3 PER b.kind LIMIT 2",
+    "MATCH (a:Car)-[:near]->(b) RETURN INTERVALS, b.kind SAMPLE 2 PER b.kind LIMIT 3",
+    "MATCH (a:Car) RETURN a ORDER BY a.speed DESC SAMPLE 2 PER a.kind LIMIT 3",
     "MATCH (a:Car)-[:near]->(b) THEN MATCH (a)-[:visible]->(b) RETURN a, b",
     "MATCH (a:Car)-[:near]->(b) FOR >= 0.2s RETURN INTERVALS, a",
     "MATCH (e:Ego) RETURN frame.class, class_count() ORDER BY class_count() DESC LIMIT 5",
@@ -54,6 +61,27 @@ QUESTIONS = [
     "USING UNKNOWN false MATCH (a:Car)-[:near]->(b) RETURN trace.name, COUNT(*) AS n",
     "USING UNKNOWN false MATCH (a)-[:sees]->(b:Bicycle) RETURN COUNT(*) AS n, MAX(a.x)",
     "USING UNKNOWN false MATCH (a)-[:sees]->(b:Bicycle) RETURN a, b.name",
+    "MATCH (a:Car)-[:near]->(b) RETURN b.kind AS k, COUNT(*) AS n HAVING n > 9 ORDER BY n DESC",
+    "MATCH (a:Car)-[:near]->(b) RETURN b.kind HAVING COUNT(*) > 9 AND MAX(a.x) > 101 SKIP 1 LIMIT 2",
+    "MATCH (a:Car)-[:near]->(b) RETURN COUNT(*) AS n, collect(b) HAVING n > 100000",
+    "MATCH (a:Car)-[:near]->(b) WHERE a.x > 1e9 RETURN COUNT(*), collect(b.name), median(a.x)",
+    "MATCH (a:Car)-[:near]->(b) RETURN INTERVALS, b HAVING frames > 1 ORDER BY frames DESC SKIP 2",
+    "MATCH (a:Car)-[:near]->(b) RETURN trace.name, b.kind, COUNT(*) AS n ORDER BY n LIMIT 1 PER trace.name",
+    "MATCH (a:Car)-[:near]->(b) RETURN b, b.kind, COUNT(*) AS n LIMIT 1 PER b",
+    "MATCH (a:Car)-[:near]->(b) RETURN DISTINCT b, b.kind LIMIT 1 PER b SKIP 1",
+    "MATCH (a:Car)-[:near]->(b) RETURN a.x, frame.seq ORDER BY a.x DESC LIMIT 2 PER b.kind SKIP 1 LIMIT 5",
+    "MATCH (a:Car)-[:near]->(b) RETURN a.x, b SAMPLE 4 PER b LIMIT 2 PER b.kind",
+    "MATCH (a:Car)-[:near]->(b) RETURN INTERVALS, b, b.kind ORDER BY frames DESC LIMIT 2 PER b LIMIT 9",
+    "MATCH (a:Car)-[:near]->(b) RETURN FRAMES, b.kind LIMIT 2 PER trace SKIP 1",
+    "MATCH (a:Car)-[:near]->(b) RETURN SUBGRAPHS, b.kind ORDER BY a.x LIMIT 1 PER b.kind",
+    "MATCH (a:Car) RETURN a.x AS x ORDER BY x SKIP 5 LIMIT 4",
+    "MATCH (a:Car)-[:near]->(b) RETURN median(a.x), percentile(a.x, 90), stddev(a.speed), AVG(DISTINCT"
+    " a.width), SUM(DISTINCT frame.seq), MAX(DISTINCT a.x)",
+    "MATCH (a:Car)-[:near]->(b) RETURN b.kind, collect(b), collect(DISTINCT b), collect(a.x), collect(b.name)",
+    "MATCH (a:Car)-[:near]->(b) RETURN b.width AS w, SUM(a.x) * b.width, b.width / COUNT(*)",
+    "MATCH (a:Car)-[:near]->(b) RETURN CASE b.kind WHEN 'car' THEN 'four' ELSE 'other' END AS w, COUNT(*) AS n"
+    " ORDER BY CASE WHEN n > 9 THEN 1 ELSE 2 END, w",
+    "MATCH (a:Car) WHERE a.x > 100 MATCH (a)-[:near]->(b) RETURN a, b.name LIMIT 7",
     "MATCH (a:Car) WHERE NOT EXISTS {(a)-[:near]->(b)} RETURN trace.map, COUNT(*)",
 ]
 CHECKS = [
@@ -196,6 +224,69 @@ def test_sql_is_asked_of_each_bundle_or_refused(whole: Collection, path: Path) -
 
     assert sorted(row[1:] for row in rows) == sorted(map(tuple, Store(path).sql(text)))
     assert {row[0] for row in rows} == set(whole.bundles())
+
+
+RULES = {
+    "Result": parts.MERGED,
+    "Query": {
+        *("scope", "result", "relations", "injective", "ego", "unknown_is_false"),
+        *("steps", "links", "policy", "gaps"),
+    },
+    "BoundCheck": {
+        *("name", "scope", "quantifiers", "formula", "reset", "relations", "injective", "ego"),
+        *("unknown_is_false", "end", "gaps"),
+    },
+    "Scope": {"nodes", "outer", "edges", "where", "distinct"},
+    "Aggregate": {"word", "operand", "distinct", "type", "share"},
+}
+"""What a query may say. Of what is in ``Result`` and ``Aggregate`` the merging makes one answer; all else is
+about one trace."""
+VALUES = {
+    *(
+        "Value",
+        "Choices",
+        "NodeValue",
+        "NodeAttribute",
+        "LabelTest",
+        "EdgeRelation",
+        "EdgeAttribute",
+    ),
+    *("FrameAttribute", "TraceAttribute", "PairNumber", "Operation", "BlockValue", "Aggregate"),
+    *("Tense", "SignalCall", "StepTime", "GroupKey"),
+}
+"""Values: but for ``Aggregate`` and two units of ``FrameAttribute`` they speak of one trace."""
+UNITS = {
+    *("plain", "degrees", "east", "north", "up", "light", "derived", "along", "given", "velocity"),
+    *("standing", "binding", "owner", "whole", "label", "seconds", "classed", "weather", "clock"),
+    *("span", "role", "recording", "own", "counted", "seen"),
+}
+"""Units: ``counted`` and ``seen`` speak of all traces, and are given to each bundle (lang/_parts.py)."""
+
+
+def test_merging_knows_all_that_a_query_may_say() -> None:
+    """What fails here is new in the language: say in lang/_parts.py how answers of bundles are merged.
+
+    Then say it here, and ask it in ``QUESTIONS``.
+    """
+    for name, known in RULES.items():
+        assert {one.name for one in fields(getattr(ir, name))} == known, name
+    assert {of.__name__ for of in get_args(ir.Bound)} == VALUES
+    assert {str(unit) for unit in _catalog.DisplayUnit} == UNITS
+    assert {of.__name__ for of in get_args(syntax.Statement)} == {
+        *("MatchClause", "UnionClause", "Define", "CheckClause"),
+    }
+    assert set(AGGREGATES) == parts.SUMMED | parts.LISTED
+
+
+def test_what_merging_does_not_know_is_refused(whole: Collection) -> None:
+    ready = compile_query("MATCH (a:Car) RETURN AVG(a.x)", whole.catalog, {})
+    result = ready.bound.result
+    (column,) = result.columns
+    strange = replace(column, value=replace(column.value, word="mode"))
+    asked = replace(ready, bound=replace(ready.bound, result=replace(result, columns=(strange,))))
+
+    with pytest.raises(QueryError, match="mode"):
+        parts.parted(asked)
 
 
 def test_mistakes_are_told_before_a_bundle_is_opened(whole: Collection) -> None:

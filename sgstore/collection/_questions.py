@@ -179,7 +179,8 @@ class Collection:
         Raises
         ------
         QueryError
-            The text is no query, or names what the collection does not know; it says where.
+            The text is no query, names what the collection does not know, or asks for what cannot be told of
+            all bundles; it says where.
         """
         if not isinstance(query, str):
             from sgstore.lang import Pattern
@@ -387,6 +388,7 @@ class PartedMatches(Tabular):
         self._whole, self._text, self._parameters = whole, text, dict(parameters)
         self._limit: int | None = None
         self._ready: Compiled = compile_query(text, whole.catalog, parameters)
+        parted(self._ready)  # what cannot be merged is refused before a bundle is opened
         self.graphs = self._ready.layout is not None
         self.columns = self._ready.columns
         self._reasons: dict[str, str] = {}

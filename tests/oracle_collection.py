@@ -1,0 +1,217 @@
+"""One store against collections of it: random questions have the same rows in the same order.
+
+``python -m oracle_collection 1000`` (in this folder) asks that many, of collections of 1, 3 and 20 bundles;
+``python -m oracle_collection 1000 ray`` by an engine.
+
+What is right is what one store says: it is held against exhaustive search in :mod:`oracle`, :mod:`oracle_after`
+and :mod:`oracle_over_time`.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from oracle_after import AfterWriter
+from oracle_over_time import random_check, random_sequence
+from oracle_worlds import random_world
+
+from sgstore.collection import Collection, pack
+from sgstore.errors import QueryError
+from sgstore.query import Store
+from sgstore.store import StoreFile
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+TRACES = 20
+BUNDLES = (1, 3, 20)
+QUESTIONS = 50
+"""Questions that are asked of one world."""
+
+
+class CollectionWriter(AfterWriter):
+    """Writes a question of any form."""
+
+    def text(self) -> str:
+        roll = self.rng.random()
+        if roll < 0.12:
+            return self.settings(check=True) + random_check(self.rng)
+        if roll < 0.3:
+            return self.settings() + random_sequence(self.rng) + self.ended()
+        text = self.query()
+        if not text.startswith("USING"):
+            text = self.settings() + text
+        roll = self.rng.random()
+        if roll < 0.4:
+            return text + self.after()
+        return text + (self.values() if roll < 0.75 else self.form())
+
+    def settings(self, *, check: bool = False) -> str:
+        some = ["", "", "", "UNKNOWN false", "EGO 'hero1'", "DATASET 'trace1*'", "DATASET 'trace7'"]
+        some += ["ABSTRACTION EL", "ABSTRACTION ER", "DATASET 'trace?', UNKNOWN false"]
+        chosen = self.rng.choice([one for one in some if not (check and "ABSTR" in one)])
+        return f"USING {chosen} " if chosen else ""
+
+    def values(self) -> str:
+        """Values, counted or listed, in an order of the query, of which some are wanted."""
+        text = self.results()
+        if not text.partition("RETURN")[2].strip():
+            text = " RETURN COUNT(*)"
+        counted = any(f"{word}(" in text for word in ("COUNT", "MAX", "MIN", "AVG", "SUM"))
+        return text + self.wanted(listed=not (counted or "DISTINCT" in text))
+
+    def form(self) -> str:
+        node = next(iter(self.nodes), None)
+        kept = self.rng.choice(["", "", f", {node}", f", {node}.kind", f", {node}.name"])
+        kept = kept if node else ""
+        forms = ["", " RETURN *", f" RETURN FRAMES{kept}", f" RETURN INTERVALS{kept}"]
+        forms += [" RETURN CLIPS(-1s, +0.5s)", " RETURN SUBGRAPHS", " RETURN DISTINCT *"]
+        form = self.rng.choice(forms)
+        if not form:
+            return self.rng.choice(["", " LIMIT 3", " LIMIT 20"])
+        return form + self.wanted(listed=True, keys=())
+
+    def wanted(self, *, listed: bool, keys: Iterable[str] = ("trace.name",)) -> str:
+        node = next(iter(self.nodes), None)
+        some = [*keys, *([f"{node}.x", f"{node}.kind", f"{node}.speed"] if node and listed else [])]
+        text = ""
+        if some and listed and self.rng.random() < 0.4:
+            order = self.rng.sample(some, self.rng.choice((1, min(2, len(some)))))
+            text += " ORDER BY " + ", ".join(k + self.rng.choice(("", " DESC")) for k in order)
+        if listed and self.rng.random() < 0.25:
+            per = self.rng.choice(["", " PER trace", *([f" PER {node}.kind"] if node else [])])
+            text += f" SAMPLE {self.rng.choice('123')}{per}"
+        if listed and node and self.rng.random() < 0.15:
+            text += f" LIMIT {self.rng.choice('12')} PER {node}.kind"
+        if self.rng.random() < 0.1:
+            text += f" SKIP {self.rng.choice('0127')}"
+        if self.rng.random() < 0.35:
+            text += f" LIMIT {self.rng.choice(('1', '2', '5', '9', '40'))}"
+        return text
+
+    def ended(self) -> str:
+        forms = [
+            "",
+            "",
+            " RETURN INTERVALS",
+            " RETURN CLIPS(-1s, +1s)",
+            " RETURN trace.name, COUNT(*)",
+        ]
+        forms += [" RETURN FRAMES LIMIT 5", " RETURN e, t(s0) ORDER BY t(s0) DESC LIMIT 4"]
+        forms += [" RETURN e.kind, MAX(t(s1)), COUNT(DISTINCT e)", " RETURN DISTINCT e", " LIMIT 3"]
+        return self.rng.choice(forms)
+
+
+def close(one: Any, other: Any) -> bool:
+    """Whether two values are equal, numbers but for what the order of a sum makes of them."""
+    if isinstance(one, float) and isinstance(other, float):
+        same = one == other or (math.isnan(one) and math.isnan(other))
+        return same or math.isclose(one, other, rel_tol=1e-9, abs_tol=1e-12)
+    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
+        return len(one) == len(other) and all(map(close, one, other))
+    return type(one) is type(other) and one == other
+
+
+def same(rows: list[Any], others: list[Any]) -> bool:
+    return close(list(map(tuple, rows)), list(map(tuple, others)))
+
+
+def verdicts(asked: Iterable[Any]) -> list[Any]:
+    return [(str(one), one.violations, one.witnesses, one.statuses) for one in asked]
+
+
+def refused(asked: Store | Collection, text: str) -> str:
+    """Why a question is refused; empty if it is not."""
+    try:
+        asked.check(text) if "CHECK" in text else asked.find(text)
+    except QueryError as error:
+        return error.reason
+    return ""
+
+
+def disagreement(store: Store, whole: Collection, text: str) -> tuple[str, int]:
+    """What a store and a collection of it do not agree on; how many rows there are."""
+    if "CHECK" in text:
+        wanted, found = (verdicts(one.check(text, status=True)) for one in (store, whole))
+        equal = wanted == found
+    else:
+        wanted, found = (one.find(text).rows() for one in (store, whole))
+        equal = same(wanted, found)
+    return "" if equal else f"{text}\nwanted\n{wanted}\nfound\n{found}", len(wanted)
+
+
+def other_forms(store: Store, whole: Collection, text: str) -> str:
+    """What they do not agree on when it is asked for otherwise."""
+    one, other = store.find(text), whole.find(text)
+    answers = [
+        [
+            [asked.count()],
+            list(asked.frames()),
+            list(asked.clips(0.5, 1)),
+            *([] if "SUBGRAPHS" in text or "*" in text else [list(asked.intervals())]),
+            list(map(tuple, asked.limit(2))),
+        ]
+        for asked in (one, other)
+    ]
+    wrong = [pair for pair in zip(*answers, strict=True) if not close(*pair)]
+    return f"{text}\nwanted, found\n{wrong}" if wrong else ""
+
+
+def worlds(seed: int, folder: Path, engine: str = "local") -> tuple[Store, list[Collection]]:
+    """A store, and collections of it."""
+    path = folder / f"{seed}.sgstore"
+    StoreFile.create(path)
+    world = random_world(seed, traces=TRACES, frames=6 + seed % 5, maps=1 + seed % 2, path=path)
+    world.connection.close()
+    for bundles in BUNDLES:
+        size = -(-TRACES // bundles)
+        done = pack(path, folder / f"{seed}-{bundles}", bundle_traces=size)
+        assert len(done.bundles) == bundles
+    places = [folder / f"{seed}-{bundles}" for bundles in BUNDLES]
+    return Store(path), [Collection(place, engine=engine) for place in places]
+
+
+def texts(seed: int) -> Iterator[str]:
+    for number in range(QUESTIONS):
+        yield CollectionWriter(seed * QUESTIONS + number).text()
+
+
+def compare(
+    store: Store, wholes: Iterable[Collection], asked: Iterable[str], *, forms_of: int = 4
+) -> Counter[str]:
+    """Ask random questions of a store and of collections; how many of each sort there were."""
+    seen = Counter[str]()
+    for number, text in enumerate(asked):
+        if reason := refused(store, text):
+            seen["refused"] += 1
+            assert {refused(whole, text) for whole in wholes} == {reason}, text
+            continue
+        seen["asked"] += 1
+        for whole in wholes:
+            problem, rows = disagreement(store, whole, text)
+            if not problem and "CHECK" not in text and number % forms_of == 0:
+                problem = other_forms(store, whole, text)
+            assert not problem, f"{whole}: {problem}"
+        seen["with rows"] += rows > 0
+    return seen
+
+
+def run(questions: int, folder: Path, engine: str = "local") -> Counter[str]:
+    """Ask so many questions."""
+    seen = Counter[str]()
+    for seed in range(-(-questions // QUESTIONS)):
+        store, wholes = worlds(seed, folder, engine)
+        with store.file.snapshot():
+            seen += compare(store, wholes, texts(seed))
+    return seen
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as made:
+        told = run(int(sys.argv[1]), Path(made), *sys.argv[2:])
+    sys.stdout.write(f"no difference: {dict(told)}\n")
