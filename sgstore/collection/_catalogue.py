@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.collection._place import digest_of_file
+from sgstore.collection._place import MissingObjectError, digest_of_file
 from sgstore.errors import ExportError, StoreError
 from sgstore.files import working_folder
 from sgstore.lang import Catalog, RelationScope, TraceFacts, Type
@@ -82,10 +82,9 @@ def about(place: Place) -> About:
                 str(told["schema_version"]), int(told["bundle_traces"]), int(told["bundle_bytes"])
             ),
         )
-    except StoreError as error:
+    except MissingObjectError as error:
         raise StoreError(
-            f"{place.url}: not a collection, or it cannot be read ({error});"
-            " 'sgstore collection pack STORE URL' makes one"
+            f"{place.url}: not a collection ({error}); 'sgstore collection pack STORE URL' makes one"
         ) from error
     except (ValueError, KeyError, TypeError) as error:
         raise StoreError(f"{place.url}/{ABOUT}: cannot be read: {error!r}") from error

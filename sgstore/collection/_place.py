@@ -12,6 +12,7 @@ import secrets
 import shutil
 import time
 from contextlib import contextmanager, suppress
+from datetime import timedelta
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -29,6 +30,10 @@ TRIES: Final = 4
 """How often is asked for what an object store did not give whole."""
 
 _SCHEMES: Final = ("s3://", "s3a://", "gs://", "az://", "abfs://", "http://", "https://")
+
+
+class MissingObjectError(StoreError):
+    """There is no file of that name at a place."""
 
 
 class Place(Protocol):
@@ -120,6 +125,8 @@ class _Folder:
     def _told(self, name: str) -> Generator[None]:
         try:
             yield
+        except FileNotFoundError as error:
+            raise MissingObjectError(f"{self.root / name}: there is no such file") from error
         except OSError as error:
             raise StoreError(f"{self.root / name}: {error.strerror or error}") from error
 
@@ -190,13 +197,14 @@ class _Remote:
     @contextmanager
     def _told(self, name: str) -> Generator[None]:
         where = f"{self.url}/{name}".rstrip("/")
+        wrong = self._objects.exceptions
         try:
             yield
-        except FileNotFoundError as error:
-            raise StoreError(f"{where}: no such object, or no such bucket") from error
-        except PermissionError as error:
+        except (FileNotFoundError, wrong.NotFoundError) as error:
+            raise MissingObjectError(f"{where}: no such object, or no such bucket") from error
+        except (PermissionError, wrong.PermissionDeniedError, wrong.UnauthenticatedError) as error:
             raise StoreError(f"{where}: access is refused: look at the credentials") from error
-        except (self._objects.exceptions.BaseError, OSError) as error:
+        except (wrong.BaseError, OSError) as error:
             text = " ".join(str(error).split())
             raise StoreError(f"{where}: {text[:300]}") from error
 
@@ -241,7 +249,7 @@ class _Remote:
                     yield one["path"], one["size"], one["last_modified"].timestamp()
 
     def remove(self, name: str) -> None:
-        with self._told(name), suppress(FileNotFoundError):
+        with suppress(MissingObjectError), self._told(name):
             self._objects.delete(self._store, name)
 
     def local(self, name: str) -> Path | None:
@@ -251,9 +259,14 @@ class _Remote:
 
 def _options(url: str) -> dict[str, Any]:
     """Settings of the client: an S3 of one's own may be reached by plain HTTP (AWS_ENDPOINT_URL)."""
+    retry = {
+        "max_retries": TRIES,
+        "backoff": {"init_backoff": timedelta(seconds=0.1), "max_backoff": timedelta(seconds=5)},
+        "retry_timeout": timedelta(seconds=60),
+    }
     endpoint = os.environ.get("AWS_ENDPOINT_URL", os.environ.get("AWS_ENDPOINT", ""))
-    plain = url.startswith("s3") and endpoint.startswith("http://")
-    return {"client_options": {"allow_http": True}} if plain else {}
+    plain = url.startswith("http:") or (url.startswith("s3") and endpoint.startswith("http://"))
+    return {"retry_config": retry} | ({"client_options": {"allow_http": True}} if plain else {})
 
 
 @cache

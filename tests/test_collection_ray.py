@@ -1,0 +1,154 @@
+"""Ray asks the bundles of a collection: equal answers, also where workers and nodes are lost on the way."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import dying
+import pytest
+from oracle_worlds import random_world
+from thorough import LONG
+
+from sgstore.collection import Collection, PartialAnswerError, pack
+from sgstore.collection import _engines as engines
+from sgstore.collection import _worker as worker
+from sgstore.errors import StoreError
+from sgstore.store import StoreFile
+
+ray = pytest.importorskip("ray", reason="the extra ray is not installed")
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+QUESTIONS = [
+    "MATCH (a:Car)-[e:near|visible]->(b) RETURN type(e), b ORDER BY a.speed DESC, b.kind LIMIT 9",
+    "MATCH (a:Car)-[:near]->(b) RETURN b.kind AS k, COUNT(*) AS n, COUNT(DISTINCT b) ORDER BY n, k",
+    "MATCH (a:Car)-[:near]->(b) RETURN INTERVALS, b",
+]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _ray(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("SGSTORE_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patched.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        yield
+        ray.shutdown()
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("fleet")
+    StoreFile.create(folder / "one.sgstore")
+    random_world(7, traces=6, frames=30, path=folder / "one.sgstore").connection.close()
+    assert len(pack(folder / "one.sgstore", folder / "fleet", bundle_traces=1).bundles) == 6
+    return folder / "fleet"
+
+
+def test_answers_of_ray_are_those_of_this_process(place: Path) -> None:
+    with Collection(place) as here, Collection(place, engine="ray") as there:
+        for text in QUESTIONS:
+            assert there.find(text).rows() == here.find(text).rows() != []
+        check = "CHECK calm: FORALL (a:Car) ALWAYS a.speed < 8"
+        assert list(map(str, there.check(check))) == list(map(str, here.check(check)))
+        rows = [list(one.sql("SELECT count(*) FROM frames", each=True)) for one in (here, there)]
+        assert sorted(rows[0]) == sorted(rows[1])
+
+
+def test_a_bundle_that_is_refused_is_named(place: Path, tmp_path: Path) -> None:
+    import shutil
+
+    shutil.copytree(place, tmp_path / "c")
+    bundle = min((tmp_path / "c" / "bundles").iterdir())
+    bundle.write_bytes(bundle.read_bytes()[:-1] + b"?")
+
+    with pytest.raises(PartialAnswerError, match="not as it was committed") as refused:
+        Collection(tmp_path / "c", engine="ray").find(QUESTIONS[0]).rows()
+    assert [*refused.value.bundles] == [bundle.stem]
+
+
+class Killer(threading.Thread):
+    """Kills whoever has begun the n-th task, some seconds after he did."""
+
+    def __init__(self, folder: Path, number: int, after: float) -> None:
+        super().__init__(daemon=True)
+        self.folder, self.number, self.after = folder, number, after
+        self.killed = 0
+
+    def run(self) -> None:
+        until = time.monotonic() + 60
+        while time.monotonic() < until:
+            marks = sorted(self.folder.iterdir())
+            if len(marks) > self.number:
+                time.sleep(self.after)
+                self.killed = int(marks[self.number].name.partition("-")[2])
+                os.kill(self.killed, signal.SIGKILL)
+                return
+            time.sleep(0.005)
+
+
+@pytest.fixture
+def marks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder where tasks that take a while leave their marks."""
+    ray.shutdown()
+    folder = tmp_path / "marks"
+    folder.mkdir()
+    monkeypatch.setenv(dying.FOLDER, str(folder))
+    monkeypatch.setenv("PYTHONPATH", str(Path(dying.__file__).parent))
+    monkeypatch.setattr(worker, "answer", dying.answer_late)
+    return folder
+
+
+POINTS = [(number, after) for number in (0, 1, 2, 4, 5) for after in (0.0, 0.2)]
+
+
+@pytest.mark.parametrize(("number", "after"), POINTS if LONG else [(1, 0.2)])
+def test_a_worker_that_is_killed_costs_a_repetition(
+    place: Path, marks: Path, number: int, after: float
+) -> None:
+    wanted = Collection(place).find(QUESTIONS[0])
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(worker, "answer", dying.answer)
+        rows = wanted.rows()
+    killer = Killer(marks, number, after)
+    killer.start()
+
+    found = Collection(place, engine="ray").find(QUESTIONS[0]).rows()
+
+    killer.join(1)
+    assert killer.killed
+    assert found == rows
+    assert len(list(marks.iterdir())) > 6  # one was done again
+
+
+@pytest.mark.skipif(not LONG, reason="two nodes take long to start")
+def test_a_node_that_is_lost_costs_a_repetition(place: Path, marks: Path) -> None:
+    from ray.cluster_utils import Cluster
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(worker, "answer", dying.answer)
+        rows = Collection(place).find(QUESTIONS[0]).rows()
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    other = cluster.add_node(num_cpus=1)
+    try:
+        ray.init(address=cluster.address, log_to_driver=False, logging_level="ERROR")
+        timer = threading.Timer(1.0, cluster.remove_node, [other])
+        timer.start()
+        found = Collection(place, engine="ray").find(QUESTIONS[0]).rows()
+        timer.join()
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+
+    assert found == rows
+
+
+def test_an_engine_that_is_none_is_refused() -> None:
+    for name in ("dask", "local:x"):
+        with pytest.raises(StoreError, match="engine"):
+            engines.engine_named(name)
