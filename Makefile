@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: help demo check test tests test-edges test-wheel test-versions lint format bench fuzz kill mutants soak pyg oracle patterns sample clean duckdb-versions fuzz-queries frozen house api
+.PHONY: help demo check test tests test-edges test-wheel test-versions lint format bench fuzz kill mutants soak pyg oracle patterns sample clean duckdb-versions fuzz-queries frozen house api cluster
 
 help:
 	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
@@ -25,6 +25,7 @@ help:
 	@echo "make soak    one writer and eight readers on one store for ten minutes"
 	@echo "make pyg     PyTorch Geometric reads what is exported for it, and a small network learns from it (downloads torch)"
 	@echo "make oracle  100,000 random patterns and formulas against exhaustive search, 12,000 pairs of graphs against networkx (hours)"
+	@echo "make cluster  1,000 random questions of collections; S3 and Ray, and faults of both (an hour; installs ray, obstore, moto)"
 	@echo "make duckdb-versions  every construct of the language under DuckDB 1.5 and 2.0: equal answers (minutes)"
 	@echo "make patterns  draw the examples of the library, and write its page, again"
 	@echo "make api     write docs/api.md and docs/relations.md from the code again"
@@ -71,7 +72,7 @@ test: $(VENV)/.dev
 # programs below. A file that is not listed is of the core.
 EDGES := coverage coverage_docs derive derive_using like locks selection selection_docs selection_overlapping prioritize \
   draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap export_viewers exports exports_docs timeline \
-  assistant notebook carla_live collection collection_landing importing junit lang_sgl pytest_plugin record sample \
+  assistant notebook carla_live collection collection_landing collection_ray collection_remote importing junit lang_sgl pytest_plugin record sample \
   docs_house docs_queries lang_docs packaging views_page \
   fuzz mutants
 tests-of = $(foreach name,$(1),tests/test_$(name).py)
@@ -122,7 +123,7 @@ pyg: $(VENV)/.base
 	build/pyg/bin/python tests/learning.py
 
 # Files of tests that try more where SGSTORE_LONG is set (tests/thorough.py).
-LONG := temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \
+LONG := collection collection_ray temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \
   lang_after lang_attributes lang_counting lang_match lang_oracle lang_subgraphs doors frozen ingest_data ingest_hardship \
   monitor notebook assistant online sgg_traces store_transactions tolerance
 oracle: $(VENV)/.dev
@@ -136,6 +137,14 @@ oracle: $(VENV)/.dev
 	SGSTORE_CLASS_PAIRS=12000 $(BIN)/python -m pytest tests/test_classes.py
 	SGSTORE_HURT_GRAPHS=20000 $(BIN)/python -m pytest tests/test_importing.py
 	SGSTORE_COVERAGE_RATE=2 $(BIN)/python -m pytest tests/test_coverage.py
+
+$(VENV)/.cluster: $(VENV)/.dev
+	@$(BIN)/python -m pip install -q --disable-pip-version-check --group cluster -e '.[cluster,ray]'
+	@touch $@
+
+cluster: $(VENV)/.cluster
+	cd tests && ../$(BIN)/python oracle_collection.py 1000
+	SGSTORE_LONG=1 $(BIN)/python -m pytest $(wildcard tests/test_collection*.py)
 
 duckdb-versions: $(VENV)/.dev
 	$(BIN)/python tests/duckdb_versions.py

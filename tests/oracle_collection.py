@@ -26,7 +26,7 @@ from sgstore.query import Store
 from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
 TRACES = 20
 BUNDLES = (1, 3, 20)
@@ -122,7 +122,9 @@ def same(rows: list[Any], others: list[Any]) -> bool:
 
 
 def verdicts(asked: Iterable[Any]) -> list[Any]:
-    return [(str(one), one.violations, one.witnesses, one.statuses) for one in asked]
+    return [
+        (str(one), one.violations, one.witnesses, one.statuses, one.robustness) for one in asked
+    ]
 
 
 def refused(asked: Store | Collection, text: str) -> str:
@@ -162,17 +164,19 @@ def other_forms(store: Store, whole: Collection, text: str) -> str:
     return f"{text}\nwanted, found\n{wrong}" if wrong else ""
 
 
-def worlds(seed: int, folder: Path, engine: str = "local") -> tuple[Store, list[Collection]]:
-    """A store, and collections of it."""
+def worlds(
+    seed: int, folder: Path, engine: str = "local", bundles: Sequence[int] = BUNDLES
+) -> tuple[Store, list[Collection]]:
+    """A store, and collections of it of so many bundles."""
     path = folder / f"{seed}.sgstore"
     StoreFile.create(path)
     world = random_world(seed, traces=TRACES, frames=6 + seed % 5, maps=1 + seed % 2, path=path)
     world.connection.close()
-    for bundles in BUNDLES:
-        size = -(-TRACES // bundles)
-        done = pack(path, folder / f"{seed}-{bundles}", bundle_traces=size)
-        assert len(done.bundles) == bundles
-    places = [folder / f"{seed}-{bundles}" for bundles in BUNDLES]
+    for number in bundles:
+        size = -(-TRACES // number)
+        done = pack(path, folder / f"{seed}-{number}", bundle_traces=size)
+        assert len(done.bundles) == number
+    places = [folder / f"{seed}-{number}" for number in bundles]
     return Store(path), [Collection(place, engine=engine) for place in places]
 
 

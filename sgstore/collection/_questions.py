@@ -567,6 +567,11 @@ class PartedChecks:
         return tuple(one.check.name for one in self._checks)
 
     @property
+    def quantitative(self) -> bool:
+        """Tell whether it is asked of some check by how much it is met."""
+        return any(one.check.robustness for one in self._checks)
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """Notes on likely mistakes: none are looked for in a collection."""
         return ()

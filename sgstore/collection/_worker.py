@@ -207,7 +207,7 @@ def as_plain(verdict: Verdict) -> dict[str, Any]:
 def as_verdict(values: dict[str, Any]) -> Verdict:
     """The verdict that plain values describe."""
     from sgstore.arrays import np
-    from sgstore.temporal import Witness
+    from sgstore.temporal import Robustness, Witness
 
     def intervals(told: list[dict[str, Any]]) -> tuple[Interval, ...]:
         from sgstore.matches import Interval
@@ -218,11 +218,12 @@ def as_verdict(values: dict[str, Any]) -> Verdict:
         Witness(**(one | {"violations": intervals(one["violations"])}))
         for one in values["witnesses"]
     )
-    status = values["status"]
+    status, margin = values["status"], values["robustness"]
     made: dict[str, Any] = {
         "violations": intervals(values["violations"]),
         "witnesses": witnesses,
         "status": None if status is None else np.array(status, np.int8),
+        "robustness": None if margin is None else Robustness(**margin),
     }
     return Verdict(**(values | made))
 
