@@ -415,6 +415,7 @@ def _parted_intervals(query: Query) -> Parted:
         first = quoted(FIRST)
         keys = [*own, frame_key(select, first, catalog, None, values)]
         keys += [quoted(column.name) for column in result.columns]
+        keys.append(quoted("end_ns"))  # several of a sequence may begin in one frame
         pers = (
             _per_of_intervals(result, result.sample, OWNER_KEY),
             _per_of_intervals(result, result.top, TOP_OWNER),

@@ -557,6 +557,7 @@ class _IntervalStatement:
         writer = self.writer
         order.append(frame_key(select, first, writer.catalog, writer.window, writer.values))
         order += [self._told(column.value) for column in columns]
+        order += ['"max seq"'] if self.span is not None else []  # several may begin in one frame
         names = (*(name for name, _ in own), *(column.name for column in columns), *hidden)
         if self.result.having is not None:
             select.where.append(self._having(self.result.having, told))
