@@ -143,7 +143,6 @@ def check(
     and from when to when.
     """
     from sgstore.lang import joined
-    from sgstore.temporal import verdict_columns, verdict_rows
 
     asked, values = statements.asked(files)
     text = joined([*chain.from_iterable(asked.values())])
@@ -165,6 +164,8 @@ def _reported(
     junit: Path | None,
 ) -> int:
     """Print verdicts, or how the checks are understood; the exit code."""
+    from sgstore.temporal import verdict_columns, verdict_rows
+
     if explain:
         typer.echo(run.explain())
         return 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Final
 
 import typer
@@ -28,7 +28,9 @@ def url_of(store: Path) -> str | None:
     if text.startswith(_REMOTE):  # two strokes have become one on the way
         scheme, _, rest = text.partition(":/")
         return f"{scheme}://{rest.lstrip('/')}"
-    return text if (store / ABOUT).is_file() else None
+    with suppress(OSError, ValueError):  # what cannot be looked at is refused as a store
+        return text if (store / ABOUT).is_file() else None
+    return None
 
 
 @contextmanager

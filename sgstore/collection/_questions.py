@@ -294,7 +294,7 @@ class Collection:
             return str(path)
         return "base64:" + base64.b64encode(path.read_bytes()).decode()
 
-    def classes(self, questions: Iterable[ClassQuestion], folder: Path) -> dict[str, Path]:
+    def classes(self, questions: Iterable[ClassQuestion], folder: str | Path) -> dict[str, Path]:
         """The table of classes that all bundles have, for those that are asked; nothing if none is asked."""
         rows: list[tuple[str, str, str, int]] = []
         asked = False
@@ -315,7 +315,7 @@ class Collection:
             rows += [(one.dataset, one.abstraction, name, 0) for name in sorted(found)]
         if not asked:
             return {}
-        path = folder / "classes.parquet"
+        path = Path(folder) / "classes.parquet"
         types = ("VARCHAR", "VARCHAR", "VARCHAR", "BIGINT")
         write_parquet(("dataset", "abstraction", "class", "frames"), rows, path, types)
         return {CLASSES_GIVEN: path}
