@@ -26,6 +26,7 @@ from sgstore.lang import (
     compile_query,
     extents,
     for_people,
+    has_nodes,
     joined_rows,
     rewritten,
 )
@@ -42,6 +43,7 @@ from sgstore.store import (
     as_told_batches,
     write_batches,
 )
+from sgstore.truth_lanes import truth_lanes
 from sgstore.vocabulary import natural
 from sgstore.world import Clip, tolerance_ns
 
@@ -54,7 +56,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang import Catalog, Compared, Gathered, SqlStatement, UnionParts
+    from sgstore.lang.ir import Query
     from sgstore.store import Given, StoreFile
+    from sgstore.truth_lanes import TruthLanes
 
 SHOWN: Final = 80
 """Characters of a query that the repr of its matches shows."""
@@ -310,6 +314,24 @@ class Matches(Tabular):
         found = [row for row in rows if row[0] == frame.frame_id]
         return [{name: row[i] for i, name in names.items()} for row in found]
 
+    def parts(self, frame: FrameRef, binding: Mapping[str, int] | None = None) -> TruthLanes:
+        """Where each part of the pattern holds for the nodes of a match; see :meth:`sgstore.Store.parts`."""
+        with self._compiled() as compiled:
+            found = self.bindings(frame) if binding is None else [dict(binding)]
+
+            facts = next((t for t in compiled.catalog.traces if t.trace_id == frame.trace_id), None)
+            window = None if facts is None else Window.of([facts.extent])
+
+            def numbers(part: Query) -> NDArray[np.generic]:
+                frames = self._part(compiled, part).frames(window)
+                return self._file.arrays(**self._asked(frames))["seq"]
+
+            return truth_lanes(compiled.bound, frame.trace, facts, next(iter(found), {}), numbers)
+
+    def _part(self, compiled: Compiled, query: Query) -> Compiled:
+        ready = query if query.steps else rewritten(query, compiled.catalog)
+        return replace(compiled, bound=query, query=ready, finder=None)
+
     def subgraphs(self) -> Iterator[nx.MultiDiGraph[int]]:
         """Each match as a graph of the nodes and edges that it binds, whatever ``RETURN`` says.
 
@@ -332,15 +354,21 @@ class Matches(Tabular):
                 about = dict(zip(layout.columns, values, strict=False))
                 yield graph_of_records(nodes, edges, **about)
 
-    def intervals(self) -> Iterator[Interval]:
+    def intervals(self, *, bound: bool = False) -> Iterator[Interval]:
         """Maximal runs of consecutive frames of a trace in which the same binding holds.
 
         With ``RETURN``, in which the same values are returned. A gap longer than 2.5 median periods ends a run.
+
+        Parameters
+        ----------
+        bound : bool
+            Give bindings, whatever ``RETURN`` says: node ids by variable, and their names.
         """
+        ask = Compiled.bound_intervals if bound else Compiled.intervals
         with self._compiled() as compiled:
             width = len(INTERVAL_COLUMNS)
-            names = compiled.intervals().columns[width:]
-            for row in self._stream(Compiled.intervals, "intervals"):
+            names = ask(compiled).columns[width:]
+            for row in self._stream(ask, "intervals"):
                 yield Interval(*row[:width], values=dict(zip(names, row[width:], strict=True)))
 
     def clips(self, before: float = 0.0, after: float = 0.0) -> Iterator[Clip]:
@@ -656,10 +684,17 @@ class UnionMatches(Matches):
             parts = [part.subgraphs() for part in self._parts]
             yield from merge(*parts, key=lambda of: (natural(of.graph["trace"]), of.graph["seq"]))
 
-    def intervals(self) -> Iterator[Interval]:
+    def parts(self, frame: FrameRef, binding: Mapping[str, int] | None = None) -> TruthLanes:
+        """The lanes of truth of the part that has such a match in a frame; of the first where none has."""
+        given = (binding or {}).items()
+        named = [p for p in self._parts if has_nodes(p._ready.bound, binding or {})] or self._parts  # noqa: SLF001
+        matching = (p for p in named if any(given <= b.items() for b in p.bindings(frame)))
+        return next(matching, named[0]).parts(frame, binding)
+
+    def intervals(self, *, bound: bool = False) -> Iterator[Interval]:
         """Intervals of all parts, by trace and start; see :meth:`Matches.intervals`."""
         with self._file.snapshot():
-            parts = [self._in_time(part.intervals(), _begin) for part in self._parts]
+            parts = [self._in_time(part.intervals(bound=bound), _begin) for part in self._parts]
             yield from self._merged(parts, _begin, repr)
 
     def clips(self, before: float = 0.0, after: float = 0.0) -> Iterator[Clip]:

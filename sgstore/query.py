@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from sgstore.segments import TraceOutcome
     from sgstore.store import Rows, SimilarFrames, StoredTrace
     from sgstore.temporal import CheckRun
+    from sgstore.truth_lanes import TruthLanes
     from sgstore.world import Clip
 
 
@@ -759,6 +760,59 @@ class Store:
                 )
             view = self._view(ref, looked_up(compiled.bound))
             return why_not(compiled.bound, view, compiled.text)
+
+    def parts(
+        self,
+        text: str,
+        frame: int | str | FrameRef,
+        binding: Mapping[str, int] | None = None,
+        /,
+        **parameters: object,
+    ) -> TruthLanes:
+        """Where each part of a pattern holds, over the trace of a frame, for the nodes of a match there.
+
+        The frames in which all parts hold are those that match with these nodes; of a sequence, step by step.
+
+        Parameters
+        ----------
+        text : str
+            A pattern, as :meth:`find` takes it.
+        frame : int, str or FrameRef
+            As :meth:`graph` takes it.
+        binding : mapping of str to int, optional
+            Node ids of variables; by default those of the first match in the frame, or, where there is none,
+            those with which it comes nearest.
+        **parameters
+            Values of ``$name``.
+
+        Raises
+        ------
+        QueryError
+            The text is no query, or has no variable of such a name.
+        StoreError
+            There is no such frame.
+        """
+        with self.file.snapshot():
+            matches, ref = self.find(text, **parameters), self.file.frame(_ref(frame))
+            if binding is None and not matches.bindings(ref):
+                binding = self._nearest(ref, text, parameters)
+            return matches.parts(ref, binding)
+
+    def _nearest(
+        self, ref: FrameRef, text: str, parameters: Mapping[str, object]
+    ) -> dict[str, int]:
+        """Nodes of a frame with which a pattern comes nearest to a match there."""
+        why: Any = self.why_not(ref, text, **parameters)
+        ids = {
+            str(about.get("name", node)): node
+            for node, about in self.file.graph(ref.frame_id).nodes.items()
+        }
+        found: dict[str, int] = {}
+        for step in getattr(why, "steps", (why,)):
+            for key, name in step.nearest.items():
+                if name in ids:
+                    found.setdefault(key, ids[name])
+        return found
 
     def _view(self, frame: FrameRef, asked: Sequence[FrameAttribute]) -> FrameView:
         """A frame as patterns in memory see it, with the attributes that only the store knows."""

@@ -17,6 +17,7 @@ from ._catalog import RelationScope as RelationScope
 from ._catalog import TableFacts as TableFacts
 from ._catalog import TraceFacts as TraceFacts
 from ._catalog import Triple as Triple
+from ._catalog import attributes_of as attributes_of
 from ._catalog import Type as Type
 from ._notes import Compared as Compared
 from ._notes import compared_in_check as compared_in_check
@@ -59,6 +60,10 @@ from ._parts import class_questions as class_questions
 from ._parts import parted as parted
 from ._parse import joined as joined
 from ._parse import parse as parse
+from ._truth_parts import DrawnEdge as DrawnEdge
+from ._truth_parts import PatternPart as PatternPart
+from ._truth_parts import has_nodes as has_nodes
+from ._truth_parts import parts_of as parts_of
 from ._patterns import Pattern as Pattern
 from ._patterns import node_of_kind as node_of_kind
 from ._patterns import pattern_of as pattern_of
@@ -91,6 +96,7 @@ __all__ = [
     "Column",
     "Columns",
     "all_known",
+    "attributes_of",
     "column_evaluator",
     "Attribute",
     "Binding",
@@ -103,6 +109,7 @@ __all__ = [
     "ClassQuestion",
     "Compared",
     "Compiled",
+    "DrawnEdge",
     "EDGE_ATTRIBUTES",
     "ENV_ATTRIBUTES",
     "Evaluate",
@@ -121,6 +128,7 @@ __all__ = [
     "PARTS",
     "Parted",
     "Pattern",
+    "PatternPart",
     "PatternTable",
     "Pruning",
     "RelationScope",
@@ -161,6 +169,8 @@ __all__ = [
     "of_query",
     "parse",
     "parted",
+    "parts_of",
+    "has_nodes",
     "pattern_named",
     "pattern_of",
     "pattern_tables",

@@ -726,3 +726,15 @@ class Catalog:
         if not found and self.part:
             return replace(self, name=abstraction, only=frozenset())
         return found[-1](self) if found else None
+
+
+def attributes_of(catalog: Catalog) -> dict[str, list[Attribute]]:
+    """All attributes that a query can ask for, by what has them; a client's own among those of nodes."""
+    own = [Attribute(name, type_, {}, "of your own") for name, type_ in catalog.own.items()]
+    return {
+        "node": [*NODE_ATTRIBUTES.values(), *own],
+        "edge": [*EDGE_ATTRIBUTES.values()],
+        "frame": [*FRAME_ATTRIBUTES.values()],
+        "env": [*ENV_ATTRIBUTES.values()],
+        "trace": [*TRACE_ATTRIBUTES.values()],
+    }

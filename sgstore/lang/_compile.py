@@ -619,6 +619,10 @@ class Compiled:
             query = replace(query, result=result)
         return self.rows(window, query)
 
+    def bound_intervals(self, window: Window | None = None) -> SqlStatement:
+        """Intervals in which the same nodes are bound, whatever ``RETURN`` says."""
+        return self.rows(window, results.with_bindings(self.query))
+
     def clips(self, before_ns: int, after_ns: int, window: Window | None = None) -> SqlStatement:
         """Clips around the frames that match; the offsets of ``RETURN CLIPS`` win over those given.
 

@@ -8,6 +8,7 @@ What has no name in the query gets one where it is spoken of: a lane ``lane``, a
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -262,6 +263,25 @@ def _edges_spoken_of(scope: b.Scope) -> set[str]:
 # The parts of a pattern are taken in reading order: its nodes, each edge as soon as both its ends are there,
 # then the conditions. So the answer names one part, and the parts before it do hold together.
 
+_WRITTEN_NUMBER: Final = re.compile(
+    r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|--[^\n]*|(?<![\w.])(\d+(?:\.\d+)?(?:[eE][-+]?\d+)?)"""
+)
+"""Texts and comments, which are passed over, and numbers."""
+
+
+def _beyond(sign: str, limit: float, value: float) -> float:
+    """A number of few digits with which a comparison of a value is true."""
+    if sign == "=":
+        return value
+    up = sign in {"<", "<="}
+    span = abs(value - limit) or abs(value) or 1.0
+    step = 10.0 ** math.floor(math.log10(span))
+    rounded = (math.ceil(value / step) if up else math.floor(value / step)) * step
+    if rounded == value and sign in {"<", ">"}:
+        rounded += step if up else -step
+    return round(rounded, 12)
+
+
 MOST_LOOKED_AT: Final = 10_000
 """Ways to bind the parts that hold, among which the nearest to a match is looked for."""
 
@@ -284,12 +304,37 @@ class WhyNot:
 
     All of them are text of the language: what ``held`` and ``failed`` say can be asked again, as patterns
     after ``MATCH`` and as conditions after ``WHERE``.
+
+    ``gaps`` says of each comparison with a number in the failed condition that is false, what the value is
+    where it comes nearest: the comparison, the number that it is compared with, and the value.
     """
 
     held: tuple[str, ...]
     failed: str
     nearest: Mapping[str, str]
     found: str
+    gaps: tuple[tuple[str, float, float], ...] = ()
+
+    def relaxed(self, text: str) -> Iterator[tuple[int, int, str]]:
+        """Numbers of a query, by first and last place, and what to write there so that the part may hold.
+
+        A number may stand in several places: whoever takes one asks again whether it was the right one.
+
+        Parameters
+        ----------
+        text : str
+            The query as it was written.
+        """
+        for sign, limit, value in self.gaps:
+            for found in _WRITTEN_NUMBER.finditer(text):
+                if found[1] is not None and float(found[1]) == abs(limit):
+                    new = _beyond(sign, limit, value)
+                    minus = limit < 0 and text[: found.start(1)].rstrip().endswith("-")
+                    if new >= 0 and not minus:
+                        yield found.start(1), found.end(1), f"{new:.12g}"
+                    elif minus:
+                        start = text[: found.start(1)].rstrip().rindex("-")
+                        yield start, found.end(1), f"{new:.12g}"
 
     def as_dict(self) -> dict[str, Any]:
         """The same as plain values."""
@@ -436,6 +481,7 @@ def _failure(
     held: tuple[str, ...],
 ) -> WhyNot:
     best, nearest, found = math.inf, dict[str, str](), ""
+    gaps: tuple[tuple[str, float, float], ...] = ()
     if isinstance(part, b.Node):
         at = _first(scope, query, view)
         nearest = _named(at, scope) if at else {}
@@ -448,7 +494,39 @@ def _failure(
             best, nearest = short, _named(at, scope)
             between = isinstance(part, b.Edge)
             found = _between(part, at, writer) if between else _values(part, at, query, writer)
-    return WhyNot(held, _text(part, scope, writer), nearest, found)
+            gaps = () if between else tuple(_gaps(part, at, query))
+    return WhyNot(held, _text(part, scope, writer), nearest, found, gaps)
+
+
+def _gaps(condition: b.Bound, at: Binding, query: b.Query) -> Iterator[tuple[str, float, float]]:
+    """Comparisons in a condition with a number that are false: sign, number, and value."""
+    for part in b.walk(condition):
+        match part:
+            case b.Operation(word=word, operands=(left, right)) if word in _COMPARED:
+                if isinstance(_constant_of(left), float):
+                    word, left, right = _MIRRORED[word], right, left
+                limit = _constant_of(right)
+                if limit is None or _value(part, at, query) is not False:
+                    continue
+                value = _value(left, at, query)
+                if isinstance(value, int | float) and not isinstance(value, bool):
+                    yield word, limit, float(value)
+            case _:
+                pass
+
+
+def _constant_of(value: b.Bound) -> float | None:
+    """The number that an expression is, if it is one."""
+    match value:
+        case b.Value(value=int() | float() as number) if not isinstance(number, bool):
+            return float(number)
+        case b.Operation(word="negative", operands=(b.Value(value=int() | float() as number),)):
+            return -float(number)
+        case _:
+            return None
+
+
+_MIRRORED: Final = {"<": ">", "<=": ">=", ">": "<", ">=": "<=", "=": "="}
 
 
 def shortfall(condition: b.Bound, at: Binding, query: b.Query) -> float:

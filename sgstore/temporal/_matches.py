@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Generator, Iterable
 
     from sgstore.lang import Attribute, Catalog, Compiled, Need
+    from sgstore.lang.ir import Query
     from sgstore.store import StoreFile
     from sgstore.temporal._sequences import Finder
 
@@ -74,6 +75,10 @@ class TemporalMatches(Matches):
                 yield replace(ready, finder=self._finder(ready))
             else:
                 yield compiled
+
+    def _part(self, compiled: Compiled, query: Query) -> Compiled:
+        ready = super()._part(compiled, query)
+        return replace(ready, finder=self._finder(ready)) if query.steps else ready
 
     @property
     def reasons(self) -> dict[str, str]:

@@ -1,0 +1,263 @@
+"""Parts of a pattern, each a query of its own, for nodes that are given.
+
+Which parts may stand alone follows from logic: "there is an x so that A and B" may be split where only one of
+A and B speaks of x. Nodes that are given are constants, so what speaks of nothing else stands alone; conditions
+and edges that share a node that is not given, or an edge that is bound, stay together, and so do nodes that
+must differ from one another. Then a frame matches exactly if all parts hold in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+from sgstore.errors import QueryNameError
+from sgstore.lang import ir as b
+from sgstore.lang._catalog import NODE_ATTRIBUTES, Type
+from sgstore.lang._compile import value_text
+from sgstore.lang._why_not import Writer, label_written
+from sgstore.records import dataclass
+from sgstore.vocabulary import RELATIONS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnEdge:
+    """An edge of a pattern as it is drawn: ends by key, what is written on it, whether it has a direction."""
+
+    src: str
+    dst: str
+    label: str
+    both: bool
+
+
+@dataclass(frozen=True, slots=True)
+class PatternPart:
+    """A part of a pattern.
+
+    Attributes
+    ----------
+    text : str
+        As it would be written in a query.
+    step : int
+        Number of its step in a sequence, from 1; 0 in a pattern of single frames.
+    query : Query
+        What finds the frames in which it holds for the given nodes; not rewritten.
+    nodes : mapping of str to str
+        Nodes that it speaks of by key, with their labels.
+    edges : tuple of DrawnEdge
+    conditions : tuple of str
+    """
+
+    text: str
+    step: int
+    query: b.Query
+    nodes: Mapping[str, str]
+    edges: tuple[DrawnEdge, ...]
+    conditions: tuple[str, ...]
+
+
+_Atom = b.Edge | b.Node | b.Bound
+
+
+def parts_of(query: b.Query, given: Mapping[str, int]) -> Iterator[PatternPart]:
+    """Parts of a bound query, step by step, for given nodes.
+
+    Parameters
+    ----------
+    query : Query
+        As the binder gave it.
+    given : mapping of str to int
+        Node ids of some of its variables. Of the others it is asked that there be some.
+
+    Raises
+    ------
+    QueryNameError
+        The pattern has no such variable.
+    """
+    keys = _keys_of(query)
+    for name in given:
+        if name.lower() not in keys:
+            known = ", ".join(key for key in keys.values() if not key.startswith("#"))
+            raise QueryNameError(f"the pattern has no node '{name}'", hint=f"it has: {known}")
+    pins = {keys[name.lower()]: number for name, number in given.items()}
+    if not query.steps:
+        yield from _parts(query, query.scope, (), pins, 0, None)
+    for number, step in enumerate(query.steps, start=1):
+        yield from _parts(query, step.scope, step.when, pins, number, step)
+
+
+def has_nodes(query: b.Query, names: Iterable[str]) -> bool:
+    """Tell whether a pattern has nodes of some names."""
+    return {name.lower() for name in names} <= _keys_of(query).keys()
+
+
+def _keys_of(query: b.Query) -> dict[str, str]:
+    scopes = [query.scope, *(step.scope for step in query.steps)]
+    return {key.lower(): key for scope in scopes for key in scope.nodes}
+
+
+def _parts(
+    query: b.Query,
+    scope: b.Scope,
+    when: tuple[b.Bound, ...],
+    pins: Mapping[str, int],
+    number: int,
+    step: b.BoundStep | None,
+) -> Iterator[PatternPart]:
+    writer = Writer(scope)
+    for atoms in _groups(scope, when, pins):
+        keys = _spoken_of(atoms, scope)
+        part = _narrowed(scope, atoms, keys, pins, when)
+        later = tuple(one for one in when if any(atom is one for atom in atoms))
+        relations = query.relations & _relations([*part.edges], [*part.where, *later])
+        asked = replace(
+            query, scope=part, result=b.Result(), relations=relations, steps=(), links=()
+        )
+        if later and step is not None:
+            alone = replace(step, scope=part, when=later, hold=None, absent=False)
+            kept = {key: node for key, node in part.nodes.items() if node.role == "named"}
+            seen = replace(part, nodes=kept, edges=(), where=(), distinct=frozenset())
+            asked = replace(asked, scope=seen, steps=(alone,))
+        yield _told(atoms, scope, keys, writer, number, asked)
+
+
+def _told(
+    atoms: Sequence[_Atom],
+    scope: b.Scope,
+    keys: Sequence[str],
+    writer: Writer,
+    number: int,
+    query: b.Query,
+) -> PatternPart:
+    edges = [atom for atom in atoms if isinstance(atom, b.Edge)]
+    tests = [_written(atom, writer) for atom in atoms if not isinstance(atom, b.Edge | b.Node)]
+    paths = [writer.node(atom.key, atom.kinds) for atom in atoms if isinstance(atom, b.Node)]
+    paths += [writer.edge(edge, scope) for edge in edges]
+    text = ", ".join(paths)
+    text += (" WHERE " if paths and tests else "") + " AND ".join(tests)
+    labels = {writer.name(key, scope.kinds(key)): label_written(scope.kinds(key)) for key in keys}
+    drawn = tuple(
+        DrawnEdge(writer.name(edge.src), writer.name(edge.dst), _label(edge), edge.both)
+        for edge in edges
+    )
+    return PatternPart(text, number, query, labels, drawn, tuple(tests))
+
+
+def _written(condition: b.Bound, writer: Writer) -> str:
+    return value_text(condition) if b.is_temporal(condition) else writer.expression(condition)
+
+
+def _label(edge: b.Edge) -> str:
+    some = [relation for relation in RELATIONS if relation in edge.relations]
+    label = "any" if edge.relations == b.any_relation() else "|".join(some)
+    return label if edge.high == 1 else f"{label}*{edge.low}..{edge.high}"
+
+
+# What stays together ----------------------------------------------------------------------------------------
+
+
+def _groups(
+    scope: b.Scope, when: tuple[b.Bound, ...], pins: Mapping[str, int]
+) -> Iterator[list[_Atom]]:
+    """Atoms of a scope in reading order: those of a group are joined by what is not given."""
+    conditions = [part for one in scope.where for part in b.conjuncts(one)]
+    atoms: list[_Atom] = [*scope.edges, *conditions, *when]
+    said = {key for atom in atoms for key in _nodes(atom)}
+    atoms = [*(n for key, n in scope.nodes.items() if key not in said), *atoms]
+    asked = {key for atom in (*conditions, *when) for key in b.edges_of(atom)}
+    ties = [_ties(atom, pins, asked) for atom in atoms]
+    for one, other in _apart(scope, pins):
+        ties.append({f"node {one}", f"node {other}"})
+    roots: dict[str, str] = {}
+
+    def root(tie: str) -> str:
+        while roots.setdefault(tie, tie) != tie:
+            tie = roots[tie]
+        return tie
+
+    for together in ties:
+        first, *others = sorted(together) or [""]
+        for other in others:
+            roots[root(other)] = root(first)
+    groups: dict[object, list[_Atom]] = {}
+    for place, atom in enumerate(atoms):
+        name = root(min(ties[place])) if ties[place] else place
+        groups.setdefault(name, []).append(atom)
+    yield from groups.values()
+
+
+def _ties(atom: _Atom, pins: Mapping[str, int], asked: set[str]) -> set[str]:
+    """What joins an atom to others: nodes that are not given, and edges that conditions speak of."""
+    ties = {f"node {key}" for key in _nodes(atom) if key not in pins}
+    if isinstance(atom, b.Edge):
+        return ties | ({f"edge {atom.key}"} if atom.named or atom.key in asked else set())
+    if isinstance(atom, b.Node):
+        return ties
+    return ties | {f"edge {key}" for key in b.edges_of(atom)}
+
+
+def _apart(scope: b.Scope, pins: Mapping[str, int]) -> Iterator[tuple[str, str]]:
+    """Nodes, neither of them given, that must differ and could be the same."""
+    for one, other in scope.distinct:
+        if one not in pins and other not in pins and (scope.kinds(one) & scope.kinds(other)):
+            yield one, other
+
+
+def _nodes(atom: _Atom) -> frozenset[str]:
+    match atom:
+        case b.Node(key=key):
+            return frozenset({key})
+        case b.Edge(src=src, dst=dst):
+            return frozenset({src, dst})
+        case _:
+            return b.nodes_of(atom)
+
+
+def _spoken_of(atoms: Iterable[_Atom], scope: b.Scope) -> list[str]:
+    """Keys of the nodes that atoms speak of, in the order of the scope; where they speak of none, of one."""
+    found = {key for atom in atoms for key in _nodes(atom)}
+    keys = [key for key in scope.nodes if key in found]
+    anyone = sorted(scope.nodes, key=lambda key: bool(scope.nodes[key].kinds.other))
+    return keys or anyone[:1]
+
+
+def _narrowed(
+    scope: b.Scope,
+    atoms: Sequence[_Atom],
+    keys: Sequence[str],
+    pins: Mapping[str, int],
+    when: tuple[b.Bound, ...],
+) -> b.Scope:
+    """The scope of some atoms; nodes that are given are those with their ids, others are none of these."""
+    edges = tuple(atom for atom in atoms if isinstance(atom, b.Edge))
+    where = [
+        atom
+        for atom in atoms
+        if not isinstance(atom, b.Edge | b.Node) and not any(atom is one for one in when)
+    ]
+    where += [b.node_among(key, [pins[key]]) for key in keys if key in pins]
+    for pair in sorted(scope.distinct):
+        for one, other in (pair, pair[::-1]):
+            free = one in keys and one not in pins and other in pins and other not in keys
+            if free and scope.kinds(one) & scope.kinds(other):
+                of = b.NodeAttribute(one, _ID, Type.number)
+                value = b.Value(pins[other], Type.number)
+                where.append(b.Operation("<>", (of, value), Type.boolean))
+    nodes = {key: scope.nodes[key] for key in keys}
+    distinct = frozenset(pair for pair in scope.distinct if {*pair} <= {*keys})
+    return b.Scope(nodes, {}, edges, tuple(where), distinct)
+
+
+_ID: Final = NODE_ATTRIBUTES["id"]
+
+
+def _relations(edges: list[b.Edge], conditions: list[b.Bound]) -> frozenset[str]:
+    """Relations of edges, and of those in blocks of conditions."""
+    found = frozenset[str]().union(*(edge.relations for edge in edges))
+    for condition in conditions:
+        for block in b.blocks_of(condition):
+            found |= _relations([*block.scope.edges], [*block.inside])
+    return found
