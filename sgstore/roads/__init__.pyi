@@ -1,5 +1,7 @@
 # The face of this package: what others may import from it.
 
+from ._drawn import DrawnOutlines as DrawnOutlines
+from ._drawn import drawn_outlines as drawn_outlines
 from ._lanes import Sections as Sections
 from ._lanes import run_of as run_of
 from ._lane_lines import END as END
@@ -86,4 +88,6 @@ __all__ = [
     "turned",
     "with_shared_borders",
     "within",
+    "DrawnOutlines",
+    "drawn_outlines",
 ]

@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from sgstore.store._graphs import Graphs
     from sgstore.store._joins import JoinedTable, UserTables
     from sgstore.store._locking import Stamp
+    from sgstore.store._packing import Columns
     from sgstore.store._rows import ArrowStream, Parameters, UserTablesGiven
     from sgstore.store._similarity import SimilarFrames
     from sgstore.store._staging import Sealed
@@ -432,6 +433,86 @@ class StoreFile:
 
             self._graphs = Graphs()
         return self._graphs
+
+    def states(self, trace: int | str, first: int, last: int) -> tuple[Columns, Columns]:
+        """Frames of a trace from one number to another, and the states in them, as plain columns.
+
+        Returns
+        -------
+        frames, states : dict of str to array
+            See :mod:`sgstore.store._states`.
+
+        Raises
+        ------
+        StoreError
+            There is no such trace, or these are too many frames at once.
+        """
+        from sgstore.store._states import frame_times, states_between
+
+        with self.access.reading() as connection:
+            trace_id, _ = trace_named(connection, str(trace))
+            states = states_between(connection, trace_id, first, last)
+            return frame_times(connection, trace_id, first, last), states
+
+    def states_at(self, frames: Sequence[tuple[int, int]]) -> Columns:
+        """States in frames, told by the trace's id and the number; ``at`` says which of these a row is of."""
+        from sgstore.store._states import states_at
+
+        with self.access.reading() as connection:
+            return states_at(connection, frames)
+
+    def scenery(self, trace: int | str) -> Columns:
+        """What never moves in a trace, beside its road map, as plain columns."""
+        from sgstore.store._states import scenery
+
+        with self.access.reading() as connection:
+            return scenery(connection, trace_named(connection, str(trace))[0])
+
+    def series(
+        self, trace: int | str, attribute: str, node: int, other: int | None = None
+    ) -> Columns:
+        """An attribute of a node, or a number of a pair, over a trace: ``seq``, ``t`` and ``value``.
+
+        Raises
+        ------
+        StoreError
+            There is no such trace or number.
+        """
+        from sgstore.store._states import series
+
+        with self.access.reading() as connection:
+            trace_id, _ = trace_named(connection, str(trace))
+        with self.access.reading(public=True) as connection:
+            return series(connection, trace_id, attribute, node, other)
+
+    def entity_names(self, trace: int | str) -> dict[int, tuple[str, ...]]:
+        """Kind, the simulator's id and type name of each entity of a trace, by node id."""
+        from sgstore.store._states import names_of_nodes
+
+        with self.access.reading() as connection:
+            return names_of_nodes(connection, trace_named(connection, str(trace))[0])
+
+    def places(self) -> dict[str, tuple[float, float, str]]:
+        """By trace: the place that its positions are about, and the digest of its map; see ``_states``."""
+        from sgstore.store._states import places
+
+        with self.access.reading() as connection:
+            return places(connection)
+
+    def log_times(self, trace: int | str, first: int, last: int) -> NDArray[np.int64]:
+        """Log times of the frames of a trace from one number to another; ns."""
+        with self.access.reading() as connection:
+            trace_id, _ = trace_named(connection, str(trace))
+            sql = "SELECT log_time_ns FROM frame WHERE trace_id = ? AND seq BETWEEN ? AND ? ORDER BY seq"
+            found = connection.execute(sql, [trace_id, first, last]).fetchnumpy()
+            return found["log_time_ns"].astype(np.int64)
+
+    def codes(self) -> dict[str, list[str]]:
+        """Names of kinds and of states of lights, by their numbers in plain columns."""
+        from sgstore.store._states import kinds_of
+
+        with self.access.reading() as connection:
+            return kinds_of(connection)
 
     def road_map_text(self, trace: int | str) -> tuple[str, str] | None:
         """Name and OpenDRIVE text of the map of a trace; ``None`` if it has none."""

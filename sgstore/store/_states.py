@@ -1,0 +1,179 @@
+"""States of frames as plain columns, as a viewer draws them: where everything is, frame by frame.
+
+Positions are those of the tables, about the origin of the trace, so that they fit into 32 bits; what is not
+known is NaN. Kinds and states of lights are numbers; :func:`kinds_of` gives their names.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.arrays import np
+from sgstore.errors import StoreError
+from sgstore.quoting import quoted
+from sgstore.store._packing import frame_ids, seq_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from duckdb import DuckDBPyConnection
+    from numpy.typing import NDArray
+
+    from sgstore.store._packing import Columns
+
+MOST_FRAMES: Final = 20_000
+"""Frames whose states are given at once."""
+
+_STATE: Final = {
+    "node": "node_id",
+    "kind": "enum_code(kind)",
+    "ego": "is_ego",
+    **dict.fromkeys(("x", "y", "heading", "speed", "length", "width")),
+    "lights": "lights",
+    "light": "enum_code(light_state)",
+}
+_TYPES: Final[Mapping[str, Any]] = {
+    "node": "int32",
+    "kind": "uint8",
+    "ego": "uint8",
+    **dict.fromkeys(("x", "y", "heading", "speed", "length", "width"), "float32"),
+    "lights": "uint16",
+    "light": "uint8",
+}
+_OF_STATE: Final = ", ".join(f'{sql or name} AS "{name}"' for name, sql in _STATE.items())
+
+
+def frame_times(connection: DuckDBPyConnection, trace_id: int, first: int, last: int) -> Columns:
+    """Number, time since the trace began (s) and ego (-1: none) of frames, both ends included."""
+    low, high = _ids(trace_id, first, last)
+    found = connection.execute(
+        "SELECT f.seq AS seq, (f.time_ns - t.start_ns) / 1e9 AS t, coalesce(f.ego, -1) AS ego"
+        " FROM frame f JOIN trace t ON t.trace_id = f.trace_id"
+        " WHERE f.frame_id BETWEEN ? AND ? ORDER BY f.frame_id",
+        [low, high],
+    ).fetchnumpy()
+    return _typed(found, {"seq": "uint32", "t": "float64", "ego": "int32"})
+
+
+def states_between(connection: DuckDBPyConnection, trace_id: int, first: int, last: int) -> Columns:
+    """States of all that moves or changes in some frames, in their order, with the number of each frame.
+
+    Raises
+    ------
+    StoreError
+        More than :data:`MOST_FRAMES` are asked for.
+    """
+    if last - first >= MOST_FRAMES:
+        raise StoreError(
+            f"{last - first + 1} frames are asked for; {MOST_FRAMES} are given at once"
+        )
+    low, high = _ids(trace_id, first, last)
+    found = connection.execute(
+        f"SELECT frame_id, {_OF_STATE} FROM state WHERE frame_id BETWEEN ? AND ?"
+        " ORDER BY frame_id, node_id",
+        [low, high],
+    ).fetchnumpy()
+    return {"seq": seq_of(found.pop("frame_id")).astype(np.uint32), **_typed(found, _TYPES)}
+
+
+def states_at(connection: DuckDBPyConnection, frames: Sequence[tuple[int, int]]) -> Columns:
+    """States in frames, told by trace and number; ``at`` says which of these a row is of."""
+    if len(frames) > MOST_FRAMES:
+        raise StoreError(f"{len(frames)} frames are asked for; {MOST_FRAMES} are given at once")
+    ids = [int(frame_ids(trace, np.array([seq]))[0]) for trace, seq in frames]
+    found = connection.execute(
+        f"SELECT a.at AS at, {_OF_STATE} FROM"
+        " (SELECT unnest(?::BIGINT[]) AS id, unnest(range(?)) AS at) a"
+        " JOIN state s ON s.frame_id = a.id ORDER BY a.at, s.node_id",
+        [ids, len(ids)],
+    ).fetchnumpy()
+    return {"at": found.pop("at").astype(np.uint32), **_typed(found, _TYPES)}
+
+
+def scenery(connection: DuckDBPyConnection, trace_id: int) -> Columns:
+    """What never moves in a trace, beside its road map."""
+    found = connection.execute(
+        'SELECT node_id AS node, enum_code(kind) AS kind, x, y, heading, "length", width FROM entity'
+        " WHERE trace_id = ? AND is_static ORDER BY node_id",
+        [trace_id],
+    ).fetchnumpy()
+    return _typed(found, _TYPES)
+
+
+def names_of_nodes(connection: DuckDBPyConnection, trace_id: int) -> dict[int, tuple[str, ...]]:
+    """Kind, the simulator's id and type name of each entity of a trace; empty where not known."""
+    rows = connection.execute(
+        "SELECT node_id, kind::VARCHAR, coalesce(ident, ''), coalesce(type_name, '') FROM entity"
+        " WHERE trace_id = ? ORDER BY node_id",
+        [trace_id],
+    ).fetchall()
+    return {node: tuple(about) for node, *about in rows}
+
+
+def places(connection: DuckDBPyConnection) -> dict[str, tuple[float, float, str]]:
+    """By trace: the place that its positions are about (m, in the axes of its map), and the map's digest."""
+    rows = connection.execute(
+        "SELECT t.name, t.origin_x, t.origin_y, coalesce(m.digest, '')"
+        " FROM trace t LEFT JOIN map m ON m.map_id = t.map_id"
+    ).fetchall()
+    return {trace: (x, y, digest) for trace, x, y, digest in rows}
+
+
+def kinds_of(connection: DuckDBPyConnection) -> dict[str, list[str]]:
+    """Names of kinds and of states of lights, by the numbers in columns."""
+    row = connection.execute(
+        "SELECT enum_range(NULL::kind)::VARCHAR[], enum_range(NULL::light_state)::VARCHAR[]"
+    ).fetchone()
+    kinds, lights = row or ([], [])
+    return {"kind": list(kinds), "light": list(lights)}
+
+
+def series(
+    connection: DuckDBPyConnection, trace_id: int, attribute: str, node: int, other: int | None
+) -> Columns:
+    """An attribute of a node, or a number of two, over a trace.
+
+    Parameters
+    ----------
+    connection : DuckDBPyConnection
+        That sees the public views.
+    attribute : str
+        A column of numbers of the view ``nodes``; of ``pairs`` if there is another node.
+    node, other
+        Node ids.
+
+    Raises
+    ------
+    StoreError
+        There is no such column.
+    """
+    view = "nodes" if other is None else "pairs"
+    columns = connection.execute(f"DESCRIBE {view}").fetchall()
+    numbers = [c[0] for c in columns if c[1] in {"FLOAT", "DOUBLE", "TINYINT"}]
+    if attribute not in numbers:
+        raise StoreError(f"no number {attribute!r} in {view}; there are {', '.join(numbers)}")
+    low, high = _ids(trace_id, 0, (1 << 24) - 1)
+    whose = "n.node_id = ?" if other is None else "n.src = ? AND n.dst = ?"
+    found = connection.execute(
+        f"SELECT f.seq AS seq, f.t AS t, n.{quoted(attribute)}::DOUBLE AS value"
+        f" FROM {view} n JOIN frames f ON f.frame_id = n.frame_id"
+        f" WHERE n.frame_id BETWEEN ? AND ? AND f.frame_id BETWEEN ? AND ? AND {whose} ORDER BY f.seq",
+        [low, high, low, high, node, *([] if other is None else [other])],
+    ).fetchnumpy()
+    return _typed(found, {"seq": "uint32", "t": "float64", "value": "float32"})
+
+
+def _ids(trace_id: int, first: int, last: int) -> tuple[int, int]:
+    low, high = frame_ids(trace_id, np.array([first, min(last, (1 << 18) * 60 - 1)])).tolist()
+    return low, high
+
+
+def _typed(found: Mapping[str, NDArray[Any]], types: Mapping[str, Any]) -> Columns:
+    """Columns of their types; NaN, or 0, where something is NULL."""
+    told: Columns = {}
+    for name, values in found.items():
+        type_ = np.dtype(types[name])
+        missing = np.nan if type_.kind == "f" else 0
+        filled = np.ma.filled(values.astype(type_), missing) if np.ma.isMA(values) else values
+        told[name] = np.ascontiguousarray(filled, type_)
+    return told
