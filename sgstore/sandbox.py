@@ -22,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
@@ -43,12 +44,12 @@ from sgstore.files import new_place
 from sgstore.processes import command
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from sgstore.query import Store
 
-    Answering = Callable[[Store, dict[str, Any], int], dict[str, Any]]
-    """Reply to a question: of the store, the question, and the most rows; see :func:`plain`."""
+    Answering = Callable[[Store, dict[str, Any], int], dict[str, Any] | Iterator[dict[str, Any]]]
+    """Reply to a question, or replies: of the store, the question, and the most rows; see :func:`plain`."""
 
 TIMEOUT_S: Final = 5.0
 MEMORY: Final = 512 << 20
@@ -152,6 +153,7 @@ class Sandbox:
         self._folder: Path | None = None
         self._turn = threading.Lock()
         self._child: subprocess.Popen[bytes] | None = None
+        self._stopped = False
         with self._turn:
             self._ready()
 
@@ -214,16 +216,65 @@ class Sandbox:
         SqlError
             It takes too much time or memory.
         """
-        line = json.dumps(question)
-        if len(line) > MAX_QUESTION:
-            raise error(f"the question has {len(line)} characters; {MAX_QUESTION} are allowed")
+        line = _line(question, error)
         with self._turn:
             return _granted(self._exchange(self._ready(), line, self._timeout_s))
+
+    def replies(self, question: Mapping[str, object]) -> Iterator[dict[str, Any]]:
+        """Replies to a question, as they come; who stops reading stops the process.
+
+        All but the last have ``more``, which says so.
+
+        Parameters
+        ----------
+        question : mapping
+            What JSON can hold.
+
+        Raises
+        ------
+        SgstoreError
+            What the worker raised.
+        SqlError
+            It takes too much time or memory, or it was stopped.
+        """
+        line, finished = _line(question, QueryError), False
+        until = time.monotonic() + self._timeout_s
+        with self._turn:
+            try:
+                reply = self._exchange(self._ready(), line, self._timeout_s)
+                while reply.pop("more", False):
+                    yield reply
+                    assert self._child is not None  # noqa: S101 - it has just answered
+                    reply = self._exchange(self._child, None, until - time.monotonic())
+                finished = True
+            finally:
+                if not finished:
+                    self._abandon()
+        yield _granted(reply)
+
+    def stop(self) -> None:
+        """Stop what is asked now, by another thread: the process is killed."""
+        child = self._child
+        if child is not None:
+            self._stopped = True
+            child.kill()
+
+    def start(self) -> None:
+        """Have the process ready for the next question."""
+        with self._turn:
+            self._ready()
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether there is a process that can answer at once."""
+        child = self._child
+        return child is not None and child.poll() is None
 
     def _ready(self) -> subprocess.Popen[bytes]:
         """The process, started if there is none."""
         if self._child is None or self._child.poll() is not None:
             self._kill()
+            self._stopped = False
             self._child = subprocess.Popen(  # noqa: S603  a module of ours
                 command(self._worker),
                 stdin=subprocess.PIPE,
@@ -246,29 +297,33 @@ class Sandbox:
             _granted(reply)
         return self._child
 
-    def _exchange(self, child: subprocess.Popen[bytes], line: str, timeout_s: float) -> Any:
-        """Send a line and wait for one; the process does not outlive the deadline.
+    def _exchange(self, child: subprocess.Popen[bytes], line: str | None, timeout_s: float) -> Any:
+        """Send a line, if there is one, and wait for one; the process does not outlive the deadline.
 
         Nobody waits for its end then: a process with much memory takes its time to go.
         """
         replies: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         talk = threading.Thread(
             target=_sent_and_read,
-            args=(child, line.encode(), replies, self._max_bytes),
+            args=(child, None if line is None else line.encode(), replies, self._max_bytes),
             daemon=True,
         )
         talk.start()
         try:
-            reply = replies.get(timeout=timeout_s)
+            reply = replies.get(timeout=max(timeout_s, 0))
         except queue.Empty:
             self._abandon()
-            raise SqlError(f"stopped after {timeout_s:g} s") from None
+            told = self._timeout_s if line is None else timeout_s  # a later part has less left
+            raise SqlError(f"stopped after {told:g} s") from None
         except BaseException:
             self._kill()
             raise
         if reply.endswith(b"\n"):
             return json.loads(reply)
+        stopped = self._stopped
         self._kill()
+        if stopped:
+            raise SqlError("stopped")
         if len(reply) > self._max_bytes:
             raise SqlError(f"stopped: the answer is longer than {self._max_bytes} bytes")
         raise SqlError("stopped: it took more memory than is allowed")
@@ -298,15 +353,19 @@ def _bury(child: subprocess.Popen[bytes], folder: Path | None) -> None:
 
 
 def _sent_and_read(
-    child: subprocess.Popen[bytes], line: bytes, replies: queue.SimpleQueue[bytes], most: int
+    child: subprocess.Popen[bytes],
+    line: bytes | None,
+    replies: queue.SimpleQueue[bytes],
+    most: int,
 ) -> None:
     """Put the line that a process answers with; one without an end if it died or says too much."""
     reply = b""
     # Whoever kills the process may close its pipes while they are used here.
     with suppress(OSError, ValueError):
         if child.stdin is not None and child.stdout is not None:
-            child.stdin.write(line + b"\n")
-            child.stdin.flush()
+            if line is not None:
+                child.stdin.write(line + b"\n")
+                child.stdin.flush()
             reply = child.stdout.readline(most + 1)
     replies.put(reply)
 
@@ -315,6 +374,13 @@ _QUERY_ERRORS: Final = {kind.__name__: kind for kind in (QuerySyntaxError, Query
 _ERRORS: Final = {
     kind.__name__: kind for kind in (SqlError, StoreError, AbstractionError, ConfigError)
 }
+
+
+def _line(question: Mapping[str, object], error: type[SgstoreError]) -> str:
+    line = json.dumps(question)
+    if len(line) > MAX_QUESTION:
+        raise error(f"the question has {len(line)} characters; {MAX_QUESTION} are allowed")
+    return line
 
 
 def _granted(reply: Any) -> dict[str, Any]:
@@ -333,6 +399,127 @@ def _answer(reply: dict[str, Any]) -> Answer:
     columns, reasons = tuple(reply["columns"]), dict(reply["reasons"])
     graphs, notes = reply.get("graphs", False), tuple(reply.get("notes", ()))
     return Answer(columns, rows, reply["truncated"], reasons, graphs, notes)
+
+
+class SandboxPool:
+    """Sandboxes of one store, which answer several questions at a time; one more stands ready.
+
+    A question that is stopped, or takes too long, loses its process; the spare one takes its place, and a new
+    spare one is started beside. To be used with ``with``, or closed.
+
+    Parameters
+    ----------
+    store : str or Path
+    size : int
+        How many questions are answered at a time; the others wait.
+    **limits
+        As :class:`Sandbox` takes them.
+
+    Raises
+    ------
+    StoreError
+        As :class:`Sandbox`.
+    """
+
+    def __init__(self, store: str | Path, *, size: int = 2, **limits: Any) -> None:
+        self._changed = threading.Condition()
+        self._turns = threading.BoundedSemaphore(size)
+        self._free = [Sandbox(store, **limits)]
+        self._asked: dict[str, Sandbox | None] = {}
+        self._closed = False
+        self._make = lambda: Sandbox(store, **limits)
+        self._starting = [
+            threading.Thread(target=self._more, daemon=True, name="sgstore sandbox")
+            for _ in range(size)
+        ]
+        for thread in self._starting:
+            thread.start()
+
+    def __enter__(self) -> SandboxPool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End all processes; what is asked is stopped."""
+        with self._changed:
+            self._closed = True
+            boxes = [*self._free, *(box for box in self._asked.values() if box is not None)]
+            self._free.clear()
+        for box in boxes:
+            box.stop()
+        for thread in self._starting:
+            thread.join(START_S)
+        for box in boxes:
+            box.close()
+
+    def ask(self, question: Mapping[str, object], key: str) -> Iterator[dict[str, Any]]:
+        """Replies to a question, as :meth:`Sandbox.replies` gives them.
+
+        Parameters
+        ----------
+        question : mapping
+        key : str
+            What :meth:`cancel` calls it; no other that is under way has it.
+        """
+        with self._changed:
+            if key in self._asked:
+                raise QueryError(f"a question {key!r} is under way")
+            self._asked[key] = None
+        try:
+            with self._turns:
+                box = self._taken(key)
+                try:
+                    yield from box.replies(question)
+                finally:
+                    self._give_back(box)
+        finally:
+            with self._changed:
+                self._asked.pop(key, None)
+
+    def cancel(self, key: str) -> bool:
+        """Stop a question; false if there is none of that key under way."""
+        with self._changed:
+            box = self._asked.pop(key, None)
+            known = box is not None or key in self._asked
+        if box is not None:
+            box.stop()
+        return known
+
+    def _taken(self, key: str) -> Sandbox:
+        with self._changed:
+            self._changed.wait_for(lambda: self._free or self._closed)
+            if self._closed or key not in self._asked:
+                raise SqlError("stopped")
+            box = self._asked[key] = self._free.pop()
+        return box
+
+    def _give_back(self, box: Sandbox) -> None:
+        if box.is_ready:
+            self._put(box)
+            return
+        again = threading.Thread(target=self._again, args=(box,), daemon=True)
+        self._starting = [one for one in self._starting if one.is_alive()] + [again]
+        again.start()
+
+    def _more(self) -> None:
+        with suppress(SgstoreError):  # the first one was made, so that this is of passing nature
+            self._put(self._make())
+
+    def _again(self, box: Sandbox) -> None:
+        with suppress(SgstoreError):
+            box.start()
+        self._put(box)
+
+    def _put(self, box: Sandbox) -> None:
+        with self._changed:
+            closed = self._closed
+            if not closed:
+                self._free.append(box)
+                self._changed.notify()
+        if closed:
+            box.close()
 
 
 # The process ------------------------------------------------------------------------------------------------
@@ -376,12 +563,15 @@ def _serve(answering: Answering) -> None:
     for line in lines:
         question = json.loads(line)
         try:
-            _send(replies, answering(store, question, settings["rows"]))
+            reply = answering(store, question, settings["rows"])
+            for one in [reply] if isinstance(reply, dict) else reply:
+                _send(replies, one)
         except SgstoreError as error:
             _send(replies, _refusal(error))
 
 
-def _found(store: Store, question: dict[str, Any], most: int) -> dict[str, Any]:
+def rows_found(store: Store, question: dict[str, Any], most: int) -> dict[str, Any]:
+    """Rows of a statement, ``sql``, or of a pattern, ``find`` with its ``parameters``."""
     graphs, notes = False, ()
     if "sql" in question:
         rows = store.sql(question["sql"], max_rows=most)
@@ -448,4 +638,4 @@ def _limit(memory: int, *, files: int) -> None:
 
 
 if __name__ == "__main__":
-    serve(_found)
+    serve(rows_found)
