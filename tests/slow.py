@@ -30,6 +30,8 @@ SECONDS: Final = {
     "docs_queries": 17,
     "store_verify": 16,
     "mutants": 16,
+    "serve": 12,
+    "parts": 8,
     "monitor": 15,
     "lang_attributes": 15,
     "crowds": 15,

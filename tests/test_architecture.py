@@ -39,7 +39,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     ),
     frozenset({"mcap", "vocabulary"}),
     frozenset({"abstractions", "config", "files", "graph", "lang", "roads", "world"}),
-    frozenset({"contrib", "opendrive", "relations", "step", "trace_parts"}),
+    frozenset({"contrib", "opendrive", "relations", "step", "trace_parts", "truth_lanes"}),
     frozenset({"draw", "map_files", "readers", "sgg"}),
     frozenset({"store"}),
     frozenset({"derive", "importing", "matches", "segments"}),
@@ -49,6 +49,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"demo", "locks", "notebook", "sandbox"}),
     frozenset({"coverage", "pytest_plugin"}),
     frozenset({"assistant", "diff", "selection"}),
+    frozenset({"serve"}),
     frozenset({"cli"}),
 )
 OWNERS = {
@@ -65,8 +66,6 @@ OWNERS = {
     "shapely": {"geometry", "roads", "opendrive"},
     "lark": {"lang"},
     "highspy": {"selection"},
-    "sklearn": {"selection"},
-    "threadpoolctl": {"selection"},
     "matplotlib": {"draw"},
     "PIL": {"draw", "exporters"},
     "av": {"draw"},
@@ -78,6 +77,8 @@ OWNERS = {
     "pydantic": {"assistant"},
     "obstore": {"collection"},
     "ray": {"collection"},
+    "starlette": {"serve"},
+    "uvicorn": {"serve"},
 }
 MASKS_ARE_KNOWN_TO = {"store", "lang/_sql_masks", "lang/_results"}
 SQL_OF_MASKS = re.compile(r"\bmask\b|\bbit_or\b|\bbit_count\b|<<")

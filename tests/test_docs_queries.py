@@ -73,7 +73,9 @@ def store(town_store: Path) -> Iterator[sgstore.Store]:
         "SELECT frame_id, seq % 5 AS score, 2.0 AS error_deg FROM frames"
     )
     frames.csv(labels)
-    store = sgstore.open(town_store, tables={"labels": labels})
+    notes = town_store.with_name("notes.csv")  # tags of the explorer
+    notes.write_text("trace,seq,tag,note,who,at\ntown,12,check this,,,\n")
+    store = sgstore.open(town_store, tables={"labels": labels, "notes": notes})
     with store.file.snapshot():
         yield store
 

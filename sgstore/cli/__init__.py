@@ -33,9 +33,9 @@ VERBS: Final = {
     "stores": ("verify", "remove", "rebuild", "derive", "map", "payload", "config", "demo"),
     "queries": ("find", "why-not", "like", "translate", "sql", "patterns"),
     "checks": ("check", "monitor", "timeline"),
-    "coverage": ("coverage", "select", "diff", "lock"),
-    "prioritize": ("prioritize",),
+    "coverage": ("coverage", "select", "prioritize", "diff", "lock"),
     "exports": ("show", "export"),
+    "serve": ("serve",),
     "assistant": ("mcp",),
     "collections": ("collection",),
 }

@@ -1,0 +1,57 @@
+"""The verb that serves the explorer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+from typer import Option
+
+from sgstore.cli._options import StorePath, app
+from sgstore.cli._output import say
+
+PANEL: Final = "Pictures and exports"
+
+
+@app.command(rich_help_panel=PANEL)
+def serve(
+    store: StorePath,
+    compare: Annotated[
+        Path | None, Option("--compare", metavar="STORE", help="A second store, side by side.")
+    ] = None,
+    write_to: Annotated[
+        Path | None,
+        Option("--write-to", metavar="DIR", help="Let the page write locks and clips below DIR."),
+    ] = None,
+    host: Annotated[
+        str, Option("--host", help="Address to listen on; by default only this machine.")
+    ] = "127.0.0.1",
+    port: Annotated[int, Option("--port", min=0, max=65535, help="0: any that is free.")] = 0,
+    browse: Annotated[bool, Option("--open/--no-open", help="Open the page in a browser.")] = False,
+) -> int:
+    """Explore a store in a browser: search, watch matches, see why a frame matches or not.
+
+    Prints an address with a token, for this machine alone. Needs the extra ui. Ends with Ctrl-C.
+    """
+    from sgstore.serve import serve as run
+
+    if write_to is not None and not write_to.is_dir():
+        raise typer.BadParameter(f"--write-to {write_to}: no such folder")
+    if host not in {"127.0.0.1", "localhost", "::1"}:
+        say(f"{host}: whoever on the network has the address with its token sees the store")
+
+    def tell(address: str) -> None:
+        typer.echo(address)
+        say("Ctrl-C ends it")
+
+    run(
+        store,
+        host=host,
+        port=port,
+        other=compare,
+        write_to=write_to.resolve() if write_to else None,
+        browse=browse,
+        on_start=tell,
+    )
+    return 0

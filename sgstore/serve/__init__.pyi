@@ -1,0 +1,9 @@
+# The face of this package: what others may import from it.
+
+from ._app import Explorer as Explorer
+from ._app import application as application
+from ._notes import Note as Note
+from ._notes import NotesFile as NotesFile
+from ._serve import serve as serve
+
+__all__ = ["Explorer", "Note", "NotesFile", "application", "serve"]

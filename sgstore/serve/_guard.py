@@ -1,0 +1,112 @@
+"""Who may ask: the owner of a token, from a page of this server, in a browser that shows no other page's code.
+
+A page of somebody else's could send requests to this machine: by its name for it (DNS rebinding), as a form,
+as a picture. So the host, the origin and what the browser says of the request's site are compared before
+anything else, and everything but the first address needs a cookie that scripts cannot read.
+"""
+
+from __future__ import annotations
+
+import secrets
+from http.cookies import CookieError, SimpleCookie
+from typing import TYPE_CHECKING, Final
+from urllib.parse import parse_qs
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import PlainTextResponse, RedirectResponse, Response
+
+if TYPE_CHECKING:
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self' 'nonce-{nonce}';"
+    " style-src-attr 'unsafe-inline'; img-src 'self' blob: data:; connect-src 'self'; font-src 'self';"
+    " base-uri 'none'; form-action 'none'; frame-ancestors 'none'; require-trusted-types-for 'script'"
+)
+"""What the page may load; the editor's styles have the nonce, and the browser itself writes some attributes."""
+
+_ALWAYS: Final = {
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "cache-control": "no-store",
+}
+
+_DAY_S: Final = 86_400
+
+
+class Guard:
+    """An application behind a token; see the module.
+
+    Parameters
+    ----------
+    app : ASGIApp
+    token : str
+    hosts : tuple of str
+        Hosts, with ports, under which it may be asked for.
+    cookie : str
+        Name of the cookie.
+    """
+
+    def __init__(self, app: ASGIApp, token: str, hosts: tuple[str, ...], cookie: str) -> None:
+        self._app, self._token, self._hosts, self._cookie = app, token, hosts, cookie
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request, or refuse it."""
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        nonce = secrets.token_urlsafe(16)
+        scope.setdefault("state", {})["nonce"] = nonce
+
+        async def sent(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                headers["content-security-policy"] = POLICY.format(nonce=nonce)
+                for name, value in _ALWAYS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        answer = self._refusal(scope) if scope["type"] == "http" else Response(status_code=403)
+        await (answer or self._app)(scope, receive, sent)
+
+    def _refusal(self, scope: Scope) -> Response | None:
+        """What a request is refused with, or let in by; ``None``: it may pass."""
+        headers = Headers(scope=scope)
+        if headers.get("host", "") not in self._hosts:
+            return PlainTextResponse("wrong host", 403)
+        origin = headers.get("origin")
+        if origin is not None and origin not in {f"http://{host}" for host in self._hosts}:
+            return PlainTextResponse("wrong origin", 403)
+        plain = scope["method"] == "GET" and scope["path"] == "/"
+        site = headers.get("sec-fetch-site")
+        if site not in {None, "same-origin"} and not plain:
+            return PlainTextResponse("wrong site", 403)
+        if plain and scope["query_string"]:
+            told = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+            return self._let_in() if self._is_token(told) else _no_token()
+        return None if self._is_token(self._told(headers)) else _no_token()
+
+    def _is_token(self, told: str) -> bool:
+        return secrets.compare_digest(told.encode(), self._token.encode())
+
+    def _told(self, headers: Headers) -> str:
+        try:
+            found = SimpleCookie(headers.get("cookie", "")).get(self._cookie)
+        except CookieError:
+            return ""
+        return found.value if found else ""
+
+    def _let_in(self) -> Response:
+        response = RedirectResponse("/", 303)
+        response.set_cookie(
+            self._cookie, self._token, max_age=_DAY_S * 30, httponly=True, samesite="strict"
+        )
+        return response
+
+
+def _no_token() -> Response:
+    return PlainTextResponse(
+        "This page needs the address that 'sgstore serve' printed, with its token.", 403
+    )

@@ -1,0 +1,179 @@
+"""Tags and notes of people: a CSV file beside the store, which is a cache and holds none of them.
+
+A line a tag: ``trace,seq,tag,note,who,at``. Lines are added, never changed; who takes a tag away adds the
+same line with ``-`` before the tag. So two people can write at once, and nothing is lost.
+"""
+
+from __future__ import annotations
+
+import csv
+import getpass
+import io
+import os
+from contextlib import suppress
+from dataclasses import astuple, dataclass, fields
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Final
+
+from sgstore.errors import StoreError
+
+try:
+    import fcntl
+except (
+    ImportError
+):  # not on Windows: there a line is written at once, too, but nobody is kept waiting
+    fcntl = None
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+ENDING: Final = ".notes.csv"
+"""What the name of the file ends in, behind that of the store."""
+
+MOST_BYTES: Final = 64 << 20
+"""Largest file that is read."""
+
+LONGEST: Final = {"tag": 100, "note": 2000}
+"""Longest texts; characters."""
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """A tag at a frame.
+
+    Attributes
+    ----------
+    trace : str
+    seq : int
+    tag, note : str
+    who : str
+        Name of the account that wrote it.
+    at : str
+        When, by the clock of the machine; ISO 8601, UTC.
+    """
+
+    trace: str
+    seq: int
+    tag: str
+    note: str = ""
+    who: str = ""
+    at: str = ""
+
+
+COLUMNS: Final = tuple(field.name for field in fields(Note))
+
+
+class NotesFile:
+    """Tags of a store.
+
+    Parameters
+    ----------
+    store : Path
+    """
+
+    def __init__(self, store: Path) -> None:
+        self.path = store.with_name(store.name + ENDING)
+
+    def stamp(self) -> tuple[int, int]:
+        """Size and time of the file; zeros if there is none."""
+        try:
+            found = self.path.stat()
+        except OSError:
+            return 0, 0
+        return found.st_size, found.st_mtime_ns
+
+    def add(self, note: Note, *, gone: bool = False) -> Note:
+        """Write a tag, or that it is gone; the note as it was written.
+
+        Raises
+        ------
+        StoreError
+            A text is empty or too long, or the file cannot be written.
+        """
+        for name, most in LONGEST.items():
+            text = getattr(note, name)
+            if len(text) > most or (name == "tag" and not text.strip()) or text.startswith("-"):
+                raise StoreError(
+                    f"{name}: expected a text of at most {most} letters that does not begin with '-'"
+                )
+        known = Note(note.trace, note.seq, note.tag.strip(), note.note, _account(), _now())
+        line = io.StringIO()
+        told = (known.trace, known.seq, "-" * gone + known.tag, *astuple(known)[3:])
+        csv.writer(line, lineterminator="\n").writerow(told)
+        try:
+            self._append(line.getvalue().encode())
+        except OSError as error:
+            raise StoreError(f"{self.path}: {error.strerror}") from error
+        return known
+
+    def _append(self, line: bytes) -> None:
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+        file = os.open(self.path, flags, 0o644)
+        try:
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX)
+            if os.fstat(file).st_size == 0:
+                line = ",".join(COLUMNS).encode() + b"\n" + line
+            os.write(file, line)
+        finally:
+            os.close(file)
+
+    def read(self) -> list[Note]:
+        """Tags that are there, those that were taken away left out; lines that are none are passed over.
+
+        Raises
+        ------
+        StoreError
+            The file cannot be read, or is larger than :data:`MOST_BYTES`.
+        """
+        if self.stamp()[0] > MOST_BYTES:
+            raise StoreError(f"{self.path}: larger than {MOST_BYTES} bytes")
+        try:
+            text = self.path.read_text(encoding="utf-8", errors="replace")
+        except FileNotFoundError:
+            return []
+        except OSError as error:
+            raise StoreError(f"{self.path}: {error.strerror}") from error
+        found: dict[tuple[str, int, str], Note] = {}
+        for note in _notes_in(text):
+            key = note.trace, note.seq, note.tag.removeprefix("-")
+            if note.tag.startswith("-"):
+                found.pop(key, None)
+            else:
+                found[key] = note
+        return list(found.values())
+
+
+def write_table(notes: list[Note], to: Path) -> None:
+    """Write tags as a table that queries can join: one row a frame, several tags of one divided by commas."""
+    frames: dict[tuple[str, int], list[Note]] = {}
+    for note in notes:
+        frames.setdefault((note.trace, note.seq), []).append(note)
+    with to.open("w", encoding="utf-8", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(COLUMNS)
+        for (trace, seq), some in frames.items():
+            texts = (
+                ", ".join(filter(None, values))
+                for values in zip(*(astuple(n)[2:5] for n in some), strict=True)
+            )
+            table.writerow((trace, seq, *texts, some[-1].at))
+
+
+def _notes_in(text: str) -> Iterator[Note]:
+    with suppress(csv.Error):
+        for row in csv.reader(text.splitlines()):
+            if len(row) == len(COLUMNS) and row[1].isdecimal():
+                yield Note(row[0], int(row[1]), *row[2:])
+
+
+def _account() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError, ImportError):  # an account without a name
+        return ""
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")

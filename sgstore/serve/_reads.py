@@ -1,0 +1,262 @@
+"""What the page reads of a store by trace and frame: columns of states, maps, pictures, graphs, words.
+
+Each method takes the fields of a request, which it checks at once, and gives a function that reads.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from contextlib import suppress
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.errors import ExportError, SgstoreError, StoreError
+from sgstore.lang import patterns
+from sgstore.opendrive import read_map
+from sgstore.roads import drawn_outlines
+from sgstore.serve._requests import RequestError
+from sgstore.serve._wire import packed
+from sgstore.serve._words import words
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from sgstore.lang import Catalog
+    from sgstore.query import Store
+    from sgstore.serve._requests import Fields
+    from sgstore.store import StoredTrace
+
+    Read = Callable[[], Any]
+
+MOST_THUMBS: Final = 400
+"""Frames whose states are sent for small pictures at once."""
+
+_PICTURES: Final = {
+    "jpeg": "image/jpeg",
+    "png": "image/png",
+    "webp": "image/webp",
+    "bmp": "image/bmp",
+}
+"""Forms of pictures that a browser shows."""
+
+
+class Reads:
+    """Reader of one store for the page.
+
+    Parameters
+    ----------
+    store : Store
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._known: tuple[Catalog, dict[str, StoredTrace], dict[str, Any]] | None = None
+        self._maps: dict[str, bytes] = {}
+        self._reading = threading.Lock()
+
+    def _traces(self) -> tuple[dict[str, StoredTrace], dict[str, Any]]:
+        """The traces by name, and what the page is told of the store; remembered while the file stays."""
+        catalog = self._store.catalog()
+        if self._known is None or self._known[0] is not catalog:
+            with self._store.file.snapshot():
+                traces = {one.name: one for one in self._store.traces()}
+                self._known = catalog, traces, self._told(traces)
+        return self._known[1], self._known[2]
+
+    def _told(self, traces: dict[str, StoredTrace]) -> dict[str, Any]:
+        file, places = self._store.file, self._store.file.places()
+        listed = [
+            {
+                "name": name,
+                "frames": one.frames,
+                "seconds": (one.end_ns - one.start_ns) / 1e9,
+                "period": one.period_ns / 1e9,
+                "map": one.map,
+                "map_key": places[name][2],
+                "origin": places[name][:2],
+                "ego": one.ego,
+                "cameras": sorted(c.topic for c in file.channels(name) if "Image" in c.schema),
+                "answers": list(one.answers),
+            }
+            for name, one in traces.items()
+        ]
+        return {"store": file.path.name, "traces": listed, "codes": file.codes()}
+
+    def about(self) -> dict[str, Any]:
+        """The traces of the store, and the names of numbers in columns."""
+        return self._traces()[1]
+
+    def frame_id(self, trace: str, seq: int) -> int:
+        """Id of a frame.
+
+        Raises
+        ------
+        StoreError
+            There is no such trace or frame.
+        """
+        self._trace(trace)
+        return self._store.file.frame(f"{trace}#{seq}").frame_id
+
+    def _trace(self, name: str) -> StoredTrace:
+        """A trace by its whole name."""
+        found = self._traces()[0].get(name)
+        if found is None:
+            raise StoreError(f"no trace {name!r} in the store")
+        return found
+
+    # Columns -------------------------------------------------------------------------------------
+
+    def thumbs(self, fields: Fields) -> Read:
+        """States in some frames, for small pictures."""
+        frames = fields.frames()
+        if len(frames) > MOST_THUMBS:
+            raise RequestError(f"frames: expected at most {MOST_THUMBS}")
+
+        def read() -> bytes:
+            of = [(self._trace(trace).trace_id, seq) for trace, seq in frames]
+            return packed({}, self._store.file.states_at(of))
+
+        return read
+
+    def states(self, fields: Fields) -> Read:
+        """States in a window of frames: ``frame.…`` of each frame, the others of each state."""
+        trace, first, last = fields.text("trace"), fields.whole("first"), fields.whole("last")
+
+        def read() -> bytes:
+            of = self._trace(trace)
+            frames, states = self._store.file.states(of.trace_id, first, last)
+            # Where the states of each frame begin, so that the page need not look for them.
+            start = np.searchsorted(states["seq"], [*frames["seq"].tolist(), 1 << 31])
+            columns = {f"frame.{name}": column for name, column in frames.items()}
+            columns["frame.start"] = start.astype(np.uint32)
+            states = {name: column for name, column in states.items() if name != "seq"}
+            return packed({"trace": trace, "first": first, "last": last}, columns | states)
+
+        return read
+
+    def static(self, fields: Fields) -> Read:
+        """What never moves in a trace, and the names of all entities."""
+        trace = fields.text("trace")
+
+        def read() -> bytes:
+            of = self._trace(trace).trace_id
+            with self._store.file.snapshot():
+                names = self._store.file.entity_names(of)
+                columns = self._store.file.scenery(of)
+            return packed({"trace": trace, "names": names}, columns)
+
+        return read
+
+    def map(self, fields: Fields) -> Read:
+        """Outlines of the road map of a trace; without points where it has none."""
+        trace = fields.text("trace")
+        return partial(self._map, trace)
+
+    def _map(self, trace: str) -> bytes:
+        self._trace(trace)
+        key = self._store.file.places()[trace][2]
+        with self._reading:  # one map at a time: two who ask for one do not read it twice
+            if key not in self._maps:
+                self._maps[key] = self._outlines(trace)
+            return self._maps[key]
+
+    def _outlines(self, trace: str) -> bytes:
+        found = self._store.file.road_map_text(trace)
+        if found is None:
+            return packed({"origin": [0, 0], "words": []}, {})
+        drawn = drawn_outlines(read_map(found[1], found[0]))
+        names = ("x", "y", "start", "node", "word", "closed")
+        columns = {name: getattr(drawn, name) for name in names}
+        return packed({"origin": drawn.origin, "words": drawn.words}, columns)
+
+    def warm(self) -> None:
+        """Read the maps before they are asked for."""
+        for trace in self._traces()[0]:
+            with suppress(SgstoreError):
+                self._map(trace)
+
+    def series(self, fields: Fields) -> Read:
+        """An attribute over time."""
+        trace, attribute = fields.text("trace"), fields.text("attribute")
+        node = fields.whole("node", least=-(1 << 31))
+        other = fields.whole("other", least=-(1 << 31)) if fields.has("other") else None
+
+        def read() -> bytes:
+            of = self._trace(trace).trace_id
+            columns = self._store.file.series(of, attribute, node, other)
+            return packed({"trace": trace, "attribute": attribute}, columns)
+
+        return read
+
+    # Plain values, pictures --------------------------------------------------------------------------
+
+    def frame(self, fields: Fields) -> Read:
+        """The scene graph of a frame: all that is known of its nodes and edges."""
+        trace, seq = fields.text("trace"), fields.whole("seq")
+
+        def read() -> dict[str, Any]:
+            graph = self._store.file.graph(self.frame_id(trace, seq))
+            nodes = [{"id": node, **about} for node, about in graph.nodes.items()]
+            edges = [
+                {"src": src, "relation": relation, "dst": dst, **about}
+                for src, relation, dst, about in graph.edges
+            ]
+            return _clean({"nodes": nodes, "edges": edges})
+
+        return read
+
+    def picture(self, fields: Fields) -> Read:
+        """What a camera took at a frame, as it stands in the recording."""
+        trace, seq, channel = fields.text("trace"), fields.whole("seq"), fields.text("channel")
+
+        def read() -> tuple[bytes, str]:
+            media = self._store.file.carried(self.frame_id(trace, seq), channel)
+            if media.form not in _PICTURES:
+                raise ExportError(f"{channel}: the message holds {media.form}, no picture")
+            return media.data, _PICTURES[media.form]
+
+        return read
+
+    def words(self, _: Fields) -> Read:
+        """Words of the language, for completion."""
+        return lambda: words(self._store.catalog())
+
+    def library(self, _: Fields) -> Read:
+        """Patterns that have names, with their drawings."""
+
+        def read() -> list[dict[str, Any]]:
+            return [
+                {
+                    "name": one.name,
+                    "kind": one.kind,
+                    "query": one.query,
+                    "text": one.text,
+                    "sentence": one.sentence,
+                    "source": one.source,
+                    "library": one.library,
+                    "drawing": one.example,
+                    "parameters": [
+                        {"name": p.name, "type": p.type, "default": p.default, "meaning": p.meaning}
+                        for p in one.parameters.values()
+                    ],
+                }
+                for one in patterns().values()
+            ]
+
+        return read
+
+
+def _clean(value: Any) -> Any:
+    """A value as JSON holds it: numbers that are none are ``None``."""
+    if isinstance(value, dict):
+        return {str(key): _clean(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_clean(item) for item in value]
+    if isinstance(value, np.generic):
+        return _clean(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)

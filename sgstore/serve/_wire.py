@@ -1,0 +1,41 @@
+"""Columns as bytes, for a page that makes typed arrays of them without copying.
+
+``u32 length of the header, u32 0``, the header as JSON padded to 8 bytes, then each column, little-endian,
+padded to 8 bytes. The header names the columns with their types and lengths under ``columns``.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+
+def packed(header: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]) -> bytes:
+    """A header and columns as bytes.
+
+    Parameters
+    ----------
+    header : mapping
+        As JSON can hold it.
+    columns : mapping of str to array
+        Numbers, one dimension each.
+    """
+    listed = [[name, column.dtype.str[1:], len(column)] for name, column in columns.items()]
+    text = json.dumps({**header, "columns": listed}).encode()
+    parts = [struct.pack("<II", len(text), 0), text, _padding(text)]
+    for column in columns.values():
+        data = np.ascontiguousarray(column, column.dtype.newbyteorder("<")).tobytes()
+        parts += [data, _padding(data)]
+    return b"".join(parts)
+
+
+def _padding(data: bytes) -> bytes:
+    return bytes(-len(data) % 8)

@@ -1,0 +1,139 @@
+"""Questions of the explorer's page, answered in the process of a sandbox.
+
+A question has ``ask``, one of :data:`QUESTIONS`, ``text``, ``parameters``, ``frame`` and ``binding``.
+Replies come as they are found; one with ``more`` is followed by others.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.errors import QueryError
+from sgstore.lang import WhyNotSteps
+from sgstore.sandbox import plain, rows_found, serve
+
+if TYPE_CHECKING:
+    from sgstore.query import Store
+
+Reply = dict[str, Any]
+Asked = Callable[["Store", dict[str, Any], int], Iterator[Reply]]
+
+BATCH_S: Final = 0.1
+"""How long matches wait for others, to be sent together; s."""
+
+BATCH_ROWS: Final = 500
+"""Matches that are sent together."""
+
+
+def _told_matches(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
+    """Intervals with their bindings, in batches; before them, what the pattern binds and who cannot answer."""
+    with store.file.snapshot():
+        matches = store.find(question["text"], **question["parameters"])
+        names, found = tuple[str, ...](), list[list[Any]]()
+        many, sent = 0, time.monotonic()
+        yield {"more": True, "reasons": matches.reasons, "columns": matches.columns}
+        for interval in islice(matches.intervals(bound=True), most + 1):
+            many += 1
+            if many > most:
+                break
+            if names != tuple(interval.values):  # each part of a union binds nodes of its own
+                if found:
+                    yield {"more": True, "matches": found}
+                names, found = tuple(interval.values), []
+                yield {"more": True, "names": names}
+            times = (interval.start_seq, interval.end_seq, interval.start, interval.end)
+            found.append([interval.trace, *times, *map(plain, interval.values.values())])
+            if len(found) >= BATCH_ROWS or time.monotonic() - sent > BATCH_S:
+                yield {"more": True, "matches": found}
+                found, sent = [], time.monotonic()
+        yield {"more": True, "matches": found}
+        yield {"count": min(many, most), "truncated": many > most, "notes": matches.notes}
+
+
+def _told_rows(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
+    """Rows of a pattern or of a statement of SQL, as JSON holds them."""
+    key = "sql" if question["ask"] == "sql" else "find"
+    yield rows_found(store, {key: question["text"], "parameters": question["parameters"]}, most)
+
+
+def _told_parts(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
+    """Lanes of truth."""
+    binding = question["binding"]
+    lanes = store.parts(question["text"], question["frame"], binding, **question["parameters"])
+    yield {
+        "trace": lanes.trace,
+        "binding": lanes.binding,
+        "lanes": [
+            {
+                "text": lane.part.text,
+                "step": lane.part.step,
+                "nodes": lane.part.nodes,
+                "edges": [asdict(edge) for edge in lane.part.edges],
+                "conditions": lane.part.conditions,
+                "spans": lane.spans,
+                "unknown": lane.unknown,
+            }
+            for lane in lanes.lanes
+        ],
+        "together": {step: lanes.together(step) for step in lanes.steps},
+    }
+
+
+def _told_why(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
+    """The first part that fails in a frame, and numbers that would let it hold."""
+    text, values, frame = question["text"], question["parameters"], question["frame"]
+    answer = store.why_not(frame, text, **values)
+    steps = answer.steps if isinstance(answer, WhyNotSteps) else (answer,)
+    changes: list[dict[str, Any]] = []
+    for number, step in enumerate(steps):
+        for start, end, number_text in step.relaxed(text):
+            other = f"{text[:start]}{number_text}{text[end:]}"
+            try:
+                again = store.why_not(frame, other, **values)
+            except QueryError:
+                continue
+            now = again.steps[number] if isinstance(again, WhyNotSteps) else again
+            if now.failed != step.failed:
+                changes.append({"start": start, "end": end, "text": number_text})
+                break
+    yield {**answer.as_dict(), "relax": changes}
+
+
+def _told_check(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
+    """Verdicts of checks, each trace with its violations."""
+    run = store.check(question["text"], **question["parameters"])
+    many = 0
+    for verdict in run:
+        spans = [
+            [one.start_seq, one.end_seq, one.start, one.end, dict(one.values)]
+            for one in verdict.violations[: max(most - many, 0)]
+        ]
+        many += len(spans)
+        about = {"check": verdict.check, "trace": verdict.trace, "verdict": verdict.verdict}
+        about |= {"reason": verdict.reason, "violations": len(verdict.violations), "spans": spans}
+        yield {"more": True, "verdict": about}
+    yield {"count": many, "truncated": many >= most, "notes": run.notes}
+
+
+QUESTIONS: Final[Mapping[str, Asked]] = {
+    "matches": _told_matches,
+    "rows": _told_rows,
+    "sql": _told_rows,
+    "parts": _told_parts,
+    "why": _told_why,
+    "check": _told_check,
+}
+"""What ``ask`` may be; each is given the store, the question, and the most matches or rows."""
+
+
+def answer(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
+    """Replies to a question."""
+    return QUESTIONS[question["ask"]](store, question, most)
+
+
+if __name__ == "__main__":
+    serve(answer)

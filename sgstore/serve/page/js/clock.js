@@ -1,0 +1,111 @@
+// @ts-check
+// One clock over all that is open: the frame, whether it plays, and what the server says of it.
+import { computed, effect, signal } from "../vendor/vendor.js";
+import * as api from "./api.js";
+import { nameOf } from "./data.js";
+import { answer, matches, open, openMatch, parametersOf, playing, rate, reasonOf, say, seq, text, traces, writeAddress } from "./state.js";
+
+/** Lanes of truth of what is open: answers of the server. */
+export const lanes = signal(/** @type {any} */ (null));
+export const why = signal(/** @type {any} */ (null));
+export const camera = signal("");
+export const panel = signal("pattern");
+/** An attribute over time. */
+export const series = signal(/** @type {any} */ (null));
+
+export const frame = computed(() => Math.round(seq.value));
+export const asked = computed(() => answer.value.query || text.value.trim());
+
+/** Which parts hold now, by lane. @param {number} at */
+export const holdsAt = (at) => (lanes.value?.lanes || []).map((/** @type {any} */ lane) => (lane.unknown.length ? null
+  : lane.spans.some((/** @type {number[]} */ [a, z]) => (a ?? 0) <= at && at <= (z ?? 0))));
+
+let turn = 0, answered = /** @type {any} */ (null);
+// Lanes are asked for when another match is opened, not when their answer said which nodes are bound.
+effect(() => {
+  const now = open.value, query = asked.value;
+  if (now && now === answered) return;
+  const mine = ++turn;
+  lanes.value = null;
+  why.value = null;
+  series.value = null;
+  if (!now || !/\bMATCH\b/i.test(query)) return;
+  const body = { text: query, parameters: parametersOf(query), trace: now.trace, seq: Math.round(seq.peek()), binding: now.binding };
+  api.json("api/parts", body).then((found) => {
+    if (mine !== turn) return;
+    if (found.error) return;
+    lanes.value = found;
+    if (!now.binding && Object.keys(found.binding).length) open.value = answered = { ...now, binding: found.binding };
+  }).catch((error) => { if (mine === turn) say(reasonOf(error)); });
+});
+// The first camera of a trace, unless one was chosen that it has.
+effect(() => {
+  const cameras = traces.value.get(open.value?.trace || "")?.cameras || [];
+  if (!cameras.includes(camera.peek())) camera.value = cameras[0] || "";
+});
+
+export async function askWhy() {
+  const now = open.value, query = asked.value;
+  if (!now || !query) return;
+  try {
+    why.value = { at: frame.value, ...(await api.json("api/why", {
+      text: query, parameters: parametersOf(query), trace: now.trace, seq: frame.value })) };
+  } catch (error) { say(reasonOf(error)); }
+}
+
+/** The frame asked for by keys and buttons, inside the trace. @param {number} to */
+export function goTo(to) {
+  const about = traces.value.get(open.value?.trace || "");
+  if (!about) return;
+  seq.value = Math.max(0, Math.min(about.frames - 1, to));
+}
+
+export function copyLink() {
+  writeAddress();
+  navigator.clipboard.writeText(location.href).then(() => say("link copied"), () => say(location.href));
+}
+
+let last = 0;
+/** @param {number} now */
+function step(now) {
+  const about = traces.value.get(open.value?.trace || "");
+  if (playing.value && about) {
+    const next = seq.value + ((now - last) / 1000) * rate.value / (about.period || 0.1);
+    if (next >= about.frames - 1) { seq.value = about.frames - 1; playing.value = false; } else seq.value = next;
+  }
+  last = now;
+  if (playing.value) requestAnimationFrame(step);
+}
+effect(() => {
+  if (!playing.value) return;
+  last = performance.now();
+  requestAnimationFrame(step);
+});
+
+/** @param {number} direction */
+export function nextMatch(direction) {
+  const all = matches.value, now = open.value;
+  if (!all.length) return;
+  const at = now?.match ? all.findIndex((m) => m.index === now.match?.index)
+    : all.findIndex((m) => m.trace === now?.trace && m.first >= seq.value) - (direction > 0 ? 1 : 0);
+  const next = all[Math.max(0, Math.min(all.length - 1, at + direction))];
+  if (next) openMatch(next);
+}
+
+/** @param {string} attribute @param {number} node @param {number} [other] */
+export async function showSeries(attribute, node, other) {
+  const trace = open.value?.trace;
+  if (!trace) return;
+  try {
+    const body = { trace, attribute, node, ...(other === undefined ? {} : { other }) };
+    const { columns } = await api.columns(api.address("api/series", body));
+    series.value = { attribute, node, other, columns, label: `${attribute} · ${nameOf(trace, node)}${other === undefined ? "" : ` → ${nameOf(trace, other)}`}` };
+  } catch (error) { say(reasonOf(error)); }
+}
+
+/** Jump to an end of the match. @param {number} side */
+export function matchEnd(side) {
+  const m = open.value?.match;
+  if (m) goTo(side < 0 ? m.first : m.last);
+  else if (matches.value[0]) openMatch(matches.value[0]);
+}

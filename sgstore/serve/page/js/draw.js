@@ -1,0 +1,311 @@
+// @ts-check
+// Scenes on a canvas, from columns: the road map, what stands and what moves, what is matched.
+import { kindOf, lightOf, mapOf, stillOf } from "./data.js";
+import { traces } from "./state.js";
+
+/** @typedef {{x: number, y: number, turn: number, scale: number, width: number, height: number}} Look */
+/** @typedef {{src: number, dst: number, label: string, both: boolean, holds: boolean | null}} DrawnEdge */
+
+/** @type {Record<string, string>} */
+const LANES = {
+  driving: "#c9d2df", sidewalk: "#efdfbf", walking: "#efdfbf", shoulder: "#cfc8ba", border: "#dedfcb", biking: "#b9e0cd",
+  parking: "#bfdcf4", median: "#b9d49c", crosswalk: "#fdfdfb", stop: "#d9cdd4", curb: "#b8b09c", restricted: "#ebd0c6",
+  bus: "#d3c6e4", taxi: "#d3c6e4", HOV: "#d3c6e4", tram: "#d3c6e4", rail: "#d3c6e4", none: "#e7eae9",
+};
+/** @type {Record<string, string>} */
+const DARK_LANES = {
+  driving: "#39424f", sidewalk: "#4a4233", walking: "#4a4233", shoulder: "#35332c", border: "#33352b", biking: "#2c4a3d",
+  parking: "#2b4256", median: "#2f3d27", crosswalk: "#6d727b", stop: "#463b42", curb: "#3c3931", restricted: "#4a362f",
+  bus: "#413655", taxi: "#413655", HOV: "#413655", tram: "#413655", rail: "#413655", none: "#22272c",
+};
+/** @type {Record<string, string>} */
+const KINDS = {
+  car: "#c2408f", vehicle: "#c2408f", truck: "#6d2468", bus: "#6d2468", trailer: "#6d2468", motorcycle: "#d873b5",
+  bicycle: "#d873b5", person: "#e3115f", animal: "#e3115f", van: "#93307c", train: "#4a1a4c", traffic_light: "#3a4250",
+  stop_sign: "#5a6b85", yield_sign: "#5a6b85", speed_limit: "#5a6b85", sign: "#5a6b85", prop: "#a9a39b", pole: "#a9a39b",
+  barrier: "#a9a39b", building: "#d2cfc9", vegetation: "#c6d4ba", unknown: "#8f8a94",
+};
+/** @type {Record<string, string>} */
+const LIGHTS = { red: "#e5383b", red_yellow: "#ff8c1a", yellow: "#ffb703", green: "#2ec4a0", flashing: "#ffe08a", off: "#5a626f" };
+const SCENERY = new Set(["building", "vegetation", "prop", "pole", "barrier"]);
+
+/** Colours of the page now, light or dark. */
+export function inks() {
+  const style = getComputedStyle(document.documentElement);
+  const of = (/** @type {string} */ name) => style.getPropertyValue(name).trim();
+  const dark = matchMedia("(prefers-color-scheme: dark)").matches;
+  const theme = document.documentElement.dataset.theme;
+  const isDark = theme ? theme === "dark" : dark;
+  return {
+    dark: isDark, ink: of("--ink"), faint: of("--faint"), ego: of("--ego"), hold: of("--hold"), fail: of("--fail"),
+    mark: of("--mark"), ground: of("--map-ground"), raised: of("--raised"), lanes: isDark ? DARK_LANES : LANES,
+    line: isDark ? "#59636f" : "#ffffff",
+  };
+}
+
+/** Make the points of a canvas those of the screen; its size in points of the page. @param {HTMLCanvasElement} canvas */
+export function fitted(canvas) {
+  const ratio = Math.min(devicePixelRatio || 1, 2), box = canvas.getBoundingClientRect();
+  const width = Math.max(1, Math.round(box.width * ratio)), height = Math.max(1, Math.round(box.height * ratio));
+  if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
+  return { width: width / ratio, height: height / ratio, ratio };
+}
+
+/** Set the axes of a canvas to those of a trace: metres, y to the left of x.
+ * @param {CanvasRenderingContext2D} ctx @param {Look} look @param {number} ratio */
+function toWorld(ctx, look, ratio) {
+  ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
+  ctx.translate(look.width / 2, look.height / 2);
+  ctx.scale(look.scale, -look.scale);
+  ctx.rotate(look.turn);
+  ctx.translate(-look.x, -look.y);
+}
+
+/** A place of the trace on the canvas. @param {Look} look @param {number} x @param {number} y */
+export function placeOf(look, x, y) {
+  const dx = x - look.x, dy = y - look.y, cos = Math.cos(look.turn), sin = Math.sin(look.turn);
+  return [look.width / 2 + look.scale * (dx * cos - dy * sin), look.height / 2 - look.scale * (dx * sin + dy * cos)];
+}
+
+/** A place on the canvas in the trace. @param {Look} look @param {number} px @param {number} py */
+export function worldOf(look, px, py) {
+  const u = (px - look.width / 2) / look.scale, v = -(py - look.height / 2) / look.scale;
+  const cos = Math.cos(look.turn), sin = Math.sin(look.turn);
+  return [look.x + u * cos + v * sin, look.y - u * sin + v * cos];
+}
+
+/** @param {CanvasRenderingContext2D} ctx @param {string} trace @param {Look} look @param {number} ratio
+ * @param {ReturnType<typeof inks>} ink @param {Set<number>} marked @param {Set<number>} lit @param {boolean} small */
+function paintMap(ctx, trace, look, ratio, ink, marked, lit, small) {
+  const map = mapOf(trace), about = traces.value.get(trace);
+  if (!map || !about) return;
+  const dx = map.origin[0] - about.origin[0], dy = map.origin[1] - about.origin[1];
+  const reach = Math.hypot(look.width, look.height) / look.scale / 2;
+  const x = look.x - dx, y = look.y - dy;
+  toWorld(ctx, look, ratio);
+  ctx.translate(dx, dy);
+  ctx.lineWidth = (small ? 0.5 : 0.9) / look.scale;
+  ctx.strokeStyle = ink.line;
+  for (const ring of map.rings) {
+    const [x0, y0, x1, y1] = ring.box;
+    if (x1 < x - reach || x0 > x + reach || y1 < y - reach || y0 > y + reach) continue;
+    if (ring.closed) {
+      ctx.fillStyle = ink.lanes[ring.word] || (KINDS[ring.word] ? `${KINDS[ring.word]}38` : ink.lanes.none || "#888");
+      ctx.fill(ring.path);
+      if (!small && ring.word === "driving") ctx.stroke(ring.path);
+    } else if (!small) {
+      ctx.strokeStyle = KINDS[ring.word] || ink.faint;
+      ctx.stroke(ring.path);
+      ctx.strokeStyle = ink.line;
+    }
+  }
+  for (const node of [...marked, ...lit]) {
+    if (node >= 0) continue;
+    for (const ring of map.nodes.get(node) || []) {
+      ctx.fillStyle = lit.has(node) ? `${ink.mark}b0` : `${ink.mark}55`;
+      ctx.fill(ring.path);
+      ctx.strokeStyle = ink.mark;
+      ctx.lineWidth = 2 / look.scale;
+      ctx.stroke(ring.path);
+    }
+  }
+}
+
+/** @param {CanvasRenderingContext2D} ctx @param {any} c @param {number} i @param {number} scale
+ * @param {ReturnType<typeof inks>} ink @param {{marked: Set<number>, lit: Set<number>, chosen?: number | null}} what */
+function paintEntity(ctx, c, i, scale, ink, what) {
+  const kind = kindOf(c.kind[i]), node = c.node[i], ego = c.ego ? c.ego[i] : 0;
+  const least = (what.marked.has(node) ? 7 : 3.5) / scale;
+  const length = Math.max(c.length[i] || 0.5, least), width = Math.max(c.width[i] || 0.5, least * 0.7);
+  const heading = Number.isFinite(c.heading[i]) ? c.heading[i] : 0;
+  ctx.save();
+  ctx.translate(c.x[i], c.y[i]);
+  ctx.rotate(heading);
+  ctx.fillStyle = ego ? ink.ego : KINDS[kind] || KINDS.unknown || "#888";
+  if (kind === "traffic_light") ctx.fillStyle = LIGHTS[lightOf(c.light?.[i] ?? 0)] || ink.faint;
+  if (SCENERY.has(kind)) ctx.globalAlpha = 0.55;
+  ctx.beginPath();
+  if (kind === "person" || kind === "traffic_light" || kind === "pole") {
+    ctx.arc(0, 0, Math.max(length, width) / 2, 0, 7);
+  } else {
+    ctx.roundRect(-length / 2, -width / 2, length, width, Math.min(width, length) * 0.18);
+  }
+  ctx.fill();
+  if (what.marked.has(node) || what.lit.has(node) || what.chosen === node) {
+    ctx.globalAlpha = 1;
+    ctx.lineWidth = (what.lit.has(node) || what.chosen === node ? 4 : 2.6) / scale;
+    ctx.strokeStyle = what.chosen === node ? ink.ink : ink.mark;
+    ctx.stroke();
+    ctx.lineWidth = 1 / scale;
+    ctx.strokeStyle = ink.ink;
+    ctx.stroke();
+  }
+  if (width * scale > 7 && length > width && !SCENERY.has(kind)) { // which end is ahead
+    ctx.fillStyle = "rgba(255,255,255,.75)";
+    ctx.beginPath();
+    ctx.moveTo(length * 0.42, 0);
+    ctx.lineTo(length * 0.18, width * 0.32);
+    ctx.lineTo(length * 0.18, -width * 0.32);
+    ctx.fill();
+  }
+  ctx.restore();
+}
+
+/** The row of a node among the states of a frame; -1: it is not there. @param {any} states @param {number} node */
+export function rowOf(states, node) {
+  for (let i = states.from; i < states.to; i++) if (states.columns.node[i] === node) return i;
+  return -1;
+}
+
+/** A place of a node, of a part of the map too. @param {string} trace @param {any} states @param {number} node
+ * @param {number[]} [near] where it should be near, of a long lane */
+export function spotOf(trace, states, node, near) {
+  const row = rowOf(states, node);
+  if (row >= 0) return [states.columns.x[row], states.columns.y[row]];
+  if (node >= 0) {
+    const still = stillOf(trace)?.columns;
+    const at = still ? still.node.indexOf(node) : -1;
+    return at >= 0 ? [still.x[at], still.y[at]] : null;
+  }
+  const map = mapOf(trace), about = traces.value.get(trace), rings = map?.nodes.get(node);
+  if (!rings || !about) return null;
+  const dx = map.origin[0] - about.origin[0], dy = map.origin[1] - about.origin[1];
+  const [x0, y0, x1, y1] = rings[0].box;
+  const x = near ? Math.min(Math.max(near[0] ?? 0, x0 + dx), x1 + dx) : (x0 + x1) / 2 + dx;
+  const y = near ? Math.min(Math.max(near[1] ?? 0, y0 + dy), y1 + dy) : (y0 + y1) / 2 + dy;
+  return [x, y];
+}
+
+/** Paint a scene.
+ * @param {CanvasRenderingContext2D} ctx @param {string} trace @param {any} states @param {Look} look @param {number} ratio
+ * @param {{marked: Set<number>, lit: Set<number>, chosen?: number | null, names?: Map<number, string>, edges?: DrawnEdge[],
+ *   track?: number[][], small?: boolean}} what */
+export function paintScene(ctx, trace, states, look, ratio, what) {
+  const ink = inks();
+  ctx.setTransform(1, 0, 0, 1, 0, 0);
+  ctx.fillStyle = ink.ground;
+  ctx.fillRect(0, 0, ctx.canvas.width, ctx.canvas.height);
+  paintMap(ctx, trace, look, ratio, ink, what.marked, what.lit, !!what.small);
+  toWorld(ctx, look, ratio);
+  const reach = Math.hypot(look.width, look.height) / look.scale / 2 + 12;
+  const still = stillOf(trace)?.columns;
+  for (const [c, from, to] of [[still, 0, still?.node?.length || 0], [states?.columns, states?.from || 0, states?.to || 0]]) {
+    if (!c) continue;
+    for (let i = from; i < to; i++) {
+      if (Math.abs(c.x[i] - look.x) > reach || Math.abs(c.y[i] - look.y) > reach) continue;
+      paintEntity(ctx, c, i, look.scale, ink, what);
+    }
+  }
+  if (what.track && what.track.length > 1) {
+    ctx.strokeStyle = ink.ink;
+    ctx.lineWidth = 1.4 / look.scale;
+    ctx.setLineDash([4 / look.scale, 3 / look.scale]);
+    ctx.beginPath();
+    what.track.forEach(([x, y], i) => (i ? ctx.lineTo(x || 0, y || 0) : ctx.moveTo(x || 0, y || 0)));
+    ctx.stroke();
+    ctx.setLineDash([]);
+  }
+  if (!states || what.small) return;
+  ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
+  for (const edge of what.edges || []) paintEdge(ctx, trace, states, look, ink, edge);
+  ctx.font = "600 12px system-ui, sans-serif";
+  ctx.textBaseline = "middle";
+  paintNames(ctx, trace, states, look, ink, what.names || new Map());
+  paintScale(ctx, look, ink);
+}
+
+/** Names beside what they name, none of them on another. @param {CanvasRenderingContext2D} ctx @param {string} trace
+ * @param {any} states @param {Look} look @param {ReturnType<typeof inks>} ink @param {Map<number, string>} names */
+function paintNames(ctx, trace, states, look, ink, names) {
+  /** @type {[number, number, number][]} */
+  const taken = [];
+  for (const [node, name] of [...names].sort(([a], [b]) => b - a)) { // entities before parts of the map
+    const at = spotOf(trace, states, node, [look.x, look.y]);
+    if (!at) continue;
+    const [px, py] = /** @type {[number, number]} */ (placeOf(look, at[0] || 0, at[1] || 0)), wide = ctx.measureText(name).width + 10;
+    /** @type {[number, number][]} */
+    const spots = [[px + 10, py - 24], [px + 10, py + 6], [px - wide - 10, py - 24], [px - wide - 10, py + 6], [px + 10, py - 46], [px + 10, py + 28]];
+    const free = spots.find(([x, y]) => taken.every(([tx, ty, w]) => Math.abs(y - ty) > 20 || x > tx + w + 3 || tx > x + wide + 3));
+    const [x, y] = free || /** @type {[number, number]} */ (spots[0]);
+    taken.push([x, y, wide]);
+    ctx.fillStyle = ink.raised;
+    ctx.globalAlpha = 0.88;
+    ctx.beginPath();
+    ctx.roundRect(x, y, wide, 18, 5);
+    ctx.fill();
+    ctx.globalAlpha = 1;
+    ctx.fillStyle = ink.ink;
+    ctx.fillText(name, x + 5, y + 9.5);
+  }
+}
+
+/** @param {CanvasRenderingContext2D} ctx @param {string} trace @param {any} states @param {Look} look
+ * @param {ReturnType<typeof inks>} ink @param {DrawnEdge} edge */
+function paintEdge(ctx, trace, states, look, ink, edge) {
+  const near = spotOf(trace, states, edge.src >= 0 ? edge.src : edge.dst);
+  const from = spotOf(trace, states, edge.src, near || undefined), to = spotOf(trace, states, edge.dst, near || undefined);
+  if (!from || !to) return;
+  const [ax, ay] = placeOf(look, from[0] || 0, from[1] || 0), [bx, by] = placeOf(look, to[0] || 0, to[1] || 0);
+  ctx.strokeStyle = edge.holds === false ? ink.fail : edge.holds ? ink.hold : ink.faint;
+  ctx.lineWidth = 2.2;
+  ctx.setLineDash(edge.holds === false ? [5, 4] : []);
+  ctx.beginPath();
+  ctx.moveTo(ax || 0, ay || 0);
+  ctx.lineTo(bx || 0, by || 0);
+  ctx.stroke();
+  ctx.setLineDash([]);
+}
+
+/** A bar that says how long some metres are. @param {CanvasRenderingContext2D} ctx @param {Look} look @param {ReturnType<typeof inks>} ink */
+function paintScale(ctx, look, ink) {
+  const long = [1, 2, 5, 10, 20, 50, 100, 200, 500].find((m) => m * look.scale > 50) || 1000;
+  const x = 14, y = look.height - 16;
+  ctx.strokeStyle = ctx.fillStyle = ink.ink;
+  ctx.lineWidth = 1.5;
+  ctx.beginPath();
+  ctx.moveTo(x, y - 4);
+  ctx.lineTo(x, y);
+  ctx.lineTo(x + long * look.scale, y);
+  ctx.lineTo(x + long * look.scale, y - 4);
+  ctx.stroke();
+  ctx.font = "11px system-ui, sans-serif";
+  ctx.textBaseline = "alphabetic";
+  ctx.fillText(`${long} m`, x + 4, y - 5);
+}
+
+/** A look that shows some nodes, the ego's heading up.
+ * @param {string} trace @param {any} states @param {Iterable<number>} nodes @param {number} width @param {number} height
+ * @param {number} [most] how far it may reach; m @returns {Look} */
+export function lookAt(trace, states, nodes, width, height, most = 70) {
+  const ego = egoRow(states), c = states.columns;
+  const centre = ego >= 0 ? [c.x[ego], c.y[ego]] : [c.x[states.from] || 0, c.y[states.from] || 0];
+  const turn = ego >= 0 && Number.isFinite(c.heading[ego]) ? Math.PI / 2 - c.heading[ego] : 0;
+  let reach = 20, x = 0, y = 0, many = 0;
+  const spots = [];
+  for (const node of nodes) {
+    if (node < 0) continue;
+    const at = spotOf(trace, states, node);
+    if (at) { spots.push(at); x += at[0] || 0; y += at[1] || 0; many++; }
+  }
+  const middle = many ? [(x / many + centre[0]) / 2, (y / many + centre[1]) / 2] : centre;
+  for (const [sx, sy] of [...spots, centre]) reach = Math.max(reach, Math.hypot((sx || 0) - middle[0], (sy || 0) - middle[1]) * 1.25 + 6);
+  reach = Math.min(reach, most);
+  return { x: middle[0], y: middle[1], turn, scale: Math.min(width, height) / 2 / reach, width, height };
+}
+
+/** @param {any} states */
+export function egoRow(states) {
+  for (let i = states.from; i < states.to; i++) if (states.columns.ego[i]) return i;
+  return -1;
+}
+
+/** The node at a place of the canvas. @param {any} states @param {Look} look @param {number} px @param {number} py */
+export function nodeAt(states, look, px, py) {
+  const [x, y] = worldOf(look, px, py), c = states.columns;
+  let best = -1, away = 8 / look.scale;
+  for (let i = states.from; i < states.to; i++) {
+    const far = Math.hypot(c.x[i] - (x || 0), c.y[i] - (y || 0)) - Math.max(c.length[i] || 0, 1) / 2;
+    if (far < away) { best = c.node[i]; away = far; }
+  }
+  return best;
+}

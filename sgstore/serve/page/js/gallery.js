@@ -1,0 +1,103 @@
+// @ts-check
+// The matches as small pictures, grouped by trace; only what is in sight is there.
+import { h, htm, useEffect, useLayoutEffect, useRef, useState } from "../vendor/vendor.js";
+import { arrived, mapOf, stillOf, thumbOf, wantThumbs } from "./data.js";
+import { fitted, lookAt, paintScene } from "./draw.js";
+import { keyOf, matches, notes, open, openMatch, paints, tick, ticked, traces } from "./state.js";
+
+const html = htm.bind(h);
+const GAP = 12, HEAD = 32;
+
+/** Where everything stands: groups and rows, by their heights.
+ * @param {import("./state.js").Match[]} found @param {number} width */
+function layout(found, width) {
+  const across = Math.max(1, Math.floor((width - GAP) / 214)), wide = (width - GAP) / across - GAP, high = Math.round(wide * 0.62) + 27;
+  const rows = [];
+  let top = 4, at = 0;
+  while (at < found.length) {
+    const trace = /** @type {any} */ (found[at]).trace;
+    let end = at;
+    while (end < found.length && /** @type {any} */ (found[end]).trace === trace) end++;
+    rows.push({ top, height: HEAD, trace, many: end - at, first: at, last: at });
+    top += HEAD;
+    for (let i = at; i < end; i += across) {
+      rows.push({ top, height: high + GAP, trace: "", many: 0, first: i, last: Math.min(i + across, end) });
+      top += high + GAP;
+    }
+    top += 6;
+    at = end;
+  }
+  return { rows, height: top, across, wide, high };
+}
+
+/** @param {{match: import("./state.js").Match, x: number, y: number, wide: number, high: number}} props */
+function Tile({ match, x, y, wide, high }) {
+  const canvas = useRef(/** @type {HTMLCanvasElement | null} */ (null));
+  const painted = useRef("");
+  const waits = arrived.value, look = paints.value;
+  useLayoutEffect(() => {
+    const thumb = thumbOf(match.trace, match.first), about = traces.value.get(match.trace);
+    const map = mapOf(match.trace), still = stillOf(match.trace);
+    // What stands and moves first, the map when it has come.
+    const key = `${keyOf(match)} ${!!thumb} ${!!map} ${!!still} ${wide} ${look}`;
+    if (!canvas.current || !thumb?.columns || !about || painted.current === key) return;
+    painted.current = key;
+    const { width, height, ratio } = fitted(canvas.current), ctx = canvas.current.getContext("2d");
+    const nodes = Object.values(match.binding);
+    if (ctx) {
+      paintScene(ctx, match.trace, thumb, lookAt(match.trace, thumb, nodes, width, height, 45), ratio,
+        { marked: new Set(nodes), lit: new Set(), small: true });
+    }
+  }, [match, wide, waits, look]);
+  const isOpen = open.value?.match && keyOf(open.value.match) === keyOf(match), on = ticked.value.has(keyOf(match));
+  const tags = notes.value.filter((n) => n[0] === match.trace && n[1] >= match.first && n[1] <= match.last);
+  const who = Object.entries(match.names).filter(([name]) => name !== "e" && name !== "ego").map(([, v]) => v).join(", ");
+  return html`<div class=${`tile ${isOpen ? "chosen" : ""}`} style=${{ left: `${x}px`, top: `${y}px`, width: `${wide}px`, height: `${high}px` }}
+      data-index=${match.index} onClick=${() => openMatch(match)}>
+    <canvas ref=${canvas} aria-hidden="true"></canvas>
+    <div class="about">
+      <input type="checkbox" checked=${on} aria-label=${`Select ${match.trace} ${match.start.toFixed(1)} s`}
+        onClick=${(/** @type {any} */ event) => { event.stopPropagation(); tick(match); }} />
+      <button class="quiet small" aria-label=${`Open ${match.trace}, ${match.start.toFixed(1)}–${match.end.toFixed(1)} s`}>${match.start.toFixed(1)}–${match.end.toFixed(1)} s</button>
+      ${tags.map((n) => html`<span class="tag">${n[2]}</span>`)}<span class="who" title=${who}>${who}</span>
+    </div></div>`;
+}
+
+export function Gallery() {
+  const place = useRef(/** @type {HTMLElement | null} */ (null));
+  const [box, setBox] = useState({ width: 900, height: 600, top: 0 });
+  useEffect(() => {
+    const element = place.current;
+    if (!element) return undefined;
+    const measure = () => setBox({ width: element.clientWidth, height: element.clientHeight, top: element.scrollTop });
+    const watch = new ResizeObserver(measure);
+    watch.observe(element);
+    element.addEventListener("scroll", measure, { passive: true });
+    measure();
+    return () => { watch.disconnect(); element.removeEventListener("scroll", measure); };
+  }, []);
+  const found = matches.value, { rows, height, wide, high } = layout(found, box.width);
+  // The first row in sight, by halving.
+  let low = 0, end = rows.length;
+  while (low < end) {
+    const middle = (low + end) >> 1, row = /** @type {any} */ (rows[middle]);
+    if (row.top + row.height < box.top - 200) low = middle + 1; else end = middle;
+  }
+  const seen = /** @type {any[]} */ ([]);
+  for (let i = low; i < rows.length && /** @type {any} */ (rows[i]).top < box.top + box.height + 200; i++) seen.push(/** @type {any} */ (rows[i]));
+  useEffect(() => {
+    wantThumbs(seen.flatMap((row) => found.slice(row.first, row.last).map((m) => /** @type {[string, number]} */ ([m.trace, m.first]))));
+  });
+  const now = open.value?.match;
+  useEffect(() => { // what is open comes into sight
+    if (!now || !place.current) return;
+    const row = rows.find((one) => !one.trace && found.slice(one.first, one.last).some((m) => keyOf(m) === keyOf(now)));
+    if (row && (row.top < box.top || row.top + row.height > box.top + box.height)) place.current.scrollTop = row.top - box.height / 3;
+  }, [now]);
+  return html`<section class="gallery" ref=${place} aria-label="Matches"><div class="inner" style=${{ height: `${height}px` }}>
+    ${seen.map((row) => (row.trace
+      ? html`<div class="group" key=${`g ${row.trace}`} style=${{ top: `${row.top}px` }}>${row.trace} <span>${row.many} ${row.many === 1 ? "match" : "matches"}</span></div>`
+      : found.slice(row.first, row.last).map((match, i) => html`<${Tile} key=${keyOf(match)} match=${match} wide=${wide} high=${high}
+          x=${GAP + i * (wide + GAP)} y=${row.top} />`)))}
+  </div></section>`;
+}

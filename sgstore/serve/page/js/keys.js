@@ -1,0 +1,47 @@
+// @ts-check
+// Keys of the scene: what they do, and the list of them.
+import { h, htm } from "../vendor/vendor.js";
+import { camera, frame, goTo, matchEnd, nextMatch, panel } from "./clock.js";
+import { dialog, open, playing, tick, traces, writeAddress } from "./state.js";
+
+const html = htm.bind(h);
+const second = () => Math.max(1, Math.round(1 / (traces.value.get(open.value?.trace || "")?.period || 0.1)));
+
+/** Keys as they are listed: their signs, what they do, and the act of each.
+ * @type {[string, string, Record<string, () => void>][]} */
+export const keys = [
+  ["n  p", "next match, match before", { n: () => nextMatch(1), p: () => nextMatch(-1) }],
+  ["space", "play, pause", { " ": () => { if (open.value) playing.value = !playing.value; } }],
+  ["← →", "a frame", { ArrowLeft: () => goTo(frame.value - 1), ArrowRight: () => goTo(frame.value + 1) }],
+  [", .", "a second", { ",": () => goTo(frame.value - second()), ".": () => goTo(frame.value + second()) }],
+  ["[ ]", "ends of the match", { "[": () => matchEnd(-1), "]": () => matchEnd(1) }],
+  ["x", "select the match", { x: () => { if (open.value?.match) tick(open.value.match); } }],
+  ["c", "next camera", { c: () => {
+    const all = traces.value.get(open.value?.trace || "")?.cameras || [];
+    camera.value = all[(all.indexOf(camera.value) + 1) % (all.length || 1)] || "";
+  } }],
+  ["g", "next panel: pattern, nodes, edges", { g: () => {
+    const all = ["pattern", "nodes", "edges"];
+    panel.value = all[(all.indexOf(panel.value) + 1) % 3] || "pattern";
+  } }],
+  ["Esc", "close", { Escape: () => {
+    if (dialog.value) dialog.value = "";
+    else if (open.value) { playing.value = false; open.value = null; writeAddress(); }
+  } }],
+  ["?", "these keys", { "?": () => { dialog.value = "keys"; } }],
+];
+
+export function Keys() {
+  return html`<h2>Keys</h2><dl>${keys.map(([sign, what]) => html`<dt><kbd>${sign}</kbd></dt><dd>${what}</dd>`)}</dl>`;
+}
+
+addEventListener("keydown", (event) => {
+  const at = /** @type {HTMLElement} */ (event.target);
+  const typing = at.closest?.("input:not([type=checkbox]):not([type=range]), select, textarea, .cm-editor");
+  if (event.ctrlKey || event.metaKey || event.altKey || (typing && event.key !== "Escape")) return;
+  if (event.key === " " && at.closest?.("button, input")) return;
+  const act = keys.find(([, , acts]) => event.key in acts)?.[2][event.key];
+  if (!act || (dialog.value && event.key !== "Escape")) return;
+  event.preventDefault();
+  act();
+});

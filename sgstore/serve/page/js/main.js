@@ -1,0 +1,165 @@
+// @ts-check
+// The page: its head, the search, what was found, and the view that is open; keys.
+import { effect, h, htm, render, untracked, useEffect } from "../vendor/vendor.js";
+import * as api from "./api.js";
+import { askWhy, copyLink, frame } from "./clock.js";
+import { Editor, focusEditor, NumberSlider, setQuery } from "./editor.js";
+import { Gallery } from "./gallery.js";
+import { Keys, keys } from "./keys.js";
+import { Scene } from "./scene.js";
+import { Compare, Coverage, countLibrary, Selection, Start, Verdicts } from "./sheets.js";
+import {
+  answer, cancel, dialog, find, history, library, namesIn, notes, open, openFrame, paints, playing, readAddress, reasonOf, say, seq, store, tag,
+  text, theme, ticked, toast, values, view, words, writeAddress, writeAddressSoon,
+} from "./state.js";
+import { Status } from "./status.js";
+
+const html = htm.bind(h);
+const VIEWS = [["find", "Find"], ["coverage", "Coverage"], ["selection", "Selection"], ["compare", "Compare"]];
+
+function Head() {
+  const about = store.value, frames = about.traces.reduce((/** @type {number} */ n, /** @type {any} */ t) => n + t.frames, 0);
+  const next = theme.value === "" ? "dark" : theme.value === "dark" ? "light" : "";
+  return html`<header><span class="brand"><img src="static/icon.svg" alt="" />sgstore</span>
+    <h1>${about.store} · ${about.traces.length} ${about.traces.length === 1 ? "trace" : "traces"} · ${frames.toLocaleString("en")} frames</h1>
+    <nav aria-label="Views">${VIEWS.map(([key, name]) => html`<button aria-current=${view.value === key ? "page" : undefined}
+      onClick=${() => { view.value = key || "find"; writeAddress(); }}>${name}${key === "selection" && ticked.value.size ? html` <span class="badge">${ticked.value.size}</span>` : null}</button>`)}</nav>
+    <button class="quiet" title="light, dark, or as the system has it" aria-label=${`Colours: ${theme.value || "of the system"}`} onClick=${() => { theme.value = next; }}>${theme.value === "dark" ? "☾" : theme.value === "light" ? "☀" : "◐"}</button>
+    <button class="quiet" onClick=${() => { dialog.value = "keys"; }}><kbd>?</kbd> keys</button></header>`;
+}
+
+function Search() {
+  const names = namesIn(text.value), patterns = library.value.filter((p) => p.kind !== "predicate");
+  const choose = (/** @type {any} */ event) => {
+    const one = library.value.find((p) => p.name === event.target.value);
+    event.target.value = "";
+    if (one) usePattern(one);
+  };
+  const groups = [...new Set(patterns.map((p) => p.library))];
+  return html`<section class="search" aria-label="Search"><${Editor} />
+    <div class="tools">
+      <select aria-label="Library of patterns" onChange=${choose}><option value="">library</option>
+        ${groups.map((name) => html`<optgroup label=${name}>${patterns.filter((p) => p.library === name).map((p) => html`<option value=${p.name} title=${p.sentence}>${p.name}</option>`)}</optgroup>`)}</select>
+      <select aria-label="History" onChange=${(/** @type {any} */ e) => { if (e.target.value) { setQuery(e.target.value); find(); } e.target.value = ""; }}><option value="">history</option>
+        ${history().map((one) => html`<option value=${one}>${one.replace(/\s+/g, " ").slice(0, 90)}</option>`)}</select>
+      ${names.map((name) => html`<label>$${name} <input size="8" aria-label=${`Value of $${name}`} value=${values.value[name] || ""}
+        onInput=${(/** @type {any} */ e) => { values.value = { ...values.value, [name]: e.target.value }; }}
+        onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter") find(); }} /></label>`)}
+      <${NumberSlider} /><span class="grow"></span>
+      ${answer.value.state === "busy" ? html`<button onClick=${cancel}>Stop</button>` : null}
+      <button class="main" onClick=${() => find()}>Find <kbd>${navigator.platform.startsWith("Mac") ? "⌘" : "Ctrl "}⏎</kbd></button>
+    </div></section>`;
+}
+
+/** Put a pattern of the library into the editor, its parameters being fields. @param {any} one */
+export function usePattern(one) {
+  values.value = {};
+  setQuery(one.text);
+  find();
+}
+
+function Rows() {
+  const { columns, rows } = answer.value;
+  return html`<div class="sheet" tabindex="0"><table><thead><tr>${columns.map((/** @type {string} */ c) => html`<th>${c}</th>`)}</tr></thead>
+    <tbody>${rows.slice(0, 2000).map((/** @type {any[]} */ row) => html`<tr>${row.map((v) => html`<td class=${typeof v === "number" ? "number" : ""}>${shown(v)}</td>`)}</tr>`)}</tbody></table>
+    ${rows.length > 2000 ? html`<p class="note">2,000 of ${rows.length} rows are shown; add LIMIT or a condition</p>` : null}</div>`;
+}
+
+/** @param {any} v */
+const shown = (v) => (v === null ? "" : typeof v === "object" ? JSON.stringify(v) : typeof v === "number" && !Number.isInteger(v) ? String(Number(v.toPrecision(7))) : String(v));
+
+function TagForm() {
+  const now = open.value;
+  if (!now) return null;
+  const mine = notes.value.filter((n) => n[0] === now.trace && n[1] === frame.value);
+  const write = async (/** @type {any} */ event) => {
+    event.preventDefault();
+    const form = new FormData(event.target);
+    try {
+      await tag({ trace: now.trace, seq: frame.value, tag: form.get("tag"), note: form.get("note") });
+      dialog.value = "";
+      say("tagged");
+    } catch (error) { say(reasonOf(error)); }
+  };
+  const known = [...new Set(notes.value.map((n) => n[2]))];
+  return html`<h2>Tag ${now.trace}#${frame.value}</h2><form onSubmit=${write}>
+    <p><label>Tag <input name="tag" required maxlength="100" list="tags" autofocus /></label><datalist id="tags">${known.map((one) => html`<option value=${one} />`)}</datalist></p>
+    <p><label>Note <input name="note" size="40" maxlength="2000" /></label></p>
+    ${mine.map((n) => html`<p class="row"><span class="chip">${n[2]}</span> ${n[3]} <span class="faint">${n[4]}</span>
+      <button type="button" class="small" onClick=${() => tag({ trace: n[0], seq: n[1], tag: n[2], do: "remove" }).catch((e) => say(reasonOf(e)))}>remove</button></p>`)}
+    <button class="main">Tag</button></form>
+    <p class="faint">Tags lie in a file beside the store; a query can ask for them: WHERE notes.tag = '…'</p>`;
+}
+
+function Dialog() {
+  const what = dialog.value;
+  useEffect(() => { /** @type {HTMLElement | null} */ (document.querySelector(".dialog input, .dialog button"))?.focus(); }, [what]);
+  if (!what) return null;
+  return html`<div class="dialog" onClick=${(/** @type {any} */ e) => { if (e.target === e.currentTarget) dialog.value = ""; }}>
+    <div role="dialog" aria-modal="true" aria-label=${what}>${what === "keys" ? html`<${Keys} />` : html`<${TagForm} />`}
+      <p><button onClick=${() => { dialog.value = ""; }}>Close</button></p></div></div>`;
+}
+
+function Found() {
+  const told = answer.value;
+  if (told.state === "idle" && !open.value) return html`<${Start} />`;
+  if (told.rows) return html`<${Rows} />`;
+  if (open.value) return html`<main class="open"><${Gallery} /><${Scene} /></main>`;
+  if (told.verdicts && !told.matches.length) return html`<${Verdicts} />`;
+  if (told.error || (told.state !== "busy" && !told.matches.length)) return html`<${Nothing} />`;
+  return html`<main><${Gallery} /></main>`;
+}
+
+/** What to do where nothing was found: mend the text, or look at a frame and ask why it does not match. */
+function Nothing() {
+  const { error, query } = answer.value, chars = [...query];
+  if (error) {
+    if (!Number.isInteger(error.start)) return html`<div class="sheet"><p class="error">${error.reason}</p></div>`;
+    const before = chars.slice(0, error.start).join(""), line = before.split("\n").length;
+    return html`<div class="sheet"><pre class="wrong">${before}<mark>${chars.slice(error.start, Math.max(error.end, error.start + 1)).join("") || " "}</mark>${chars.slice(Math.max(error.end, error.start + 1)).join("")}</pre>
+      <p class="error">line ${line}, column ${error.start - before.lastIndexOf("\n")}: ${error.reason}</p>${error.hint ? html`<p>${error.hint}</p>` : null}</div>`;
+  }
+  const could = store.value.traces.filter((/** @type {any} */ t) => !(t.name in answer.value.reasons));
+  return html`<div class="sheet"><h2>Nothing matches</h2><p class="faint">Open a trace: the lanes below it say where each part of the pattern holds, and <kbd>w</kbd> what is missing in a frame.</p>
+    <p class="row wrap">${could.slice(0, 60).map((/** @type {any} */ t) => html`<button onClick=${() => openFrame(t.name, 0)}>${t.name}</button>`)}</p></div>`;
+}
+
+function App() {
+  if (!store.value) return html`<p class="loading">Reading the store …</p>`;
+  const shownView = view.value;
+  return html`<${Head} />${shownView === "find" ? html`<${Search} /><${Status} /><${Found} />`
+    : shownView === "coverage" ? html`<${Coverage} />` : shownView === "selection" ? html`<${Selection} />` : html`<${Compare} />`}
+    <${Dialog} />${toast.value ? html`<div class="toast" role="status">${toast.value}</div>` : null}`;
+}
+
+keys.unshift(["/", "editor", { "/": focusEditor }], ["Ctrl ⏎", "find", {}]);
+keys.push(["t", "tag this frame", { t: () => { if (open.value) dialog.value = "tag"; } }],
+  ["w", "why does this frame match, or not", { w: () => { askWhy(); } }], ["y", "copy a link", { y: copyLink }]);
+
+effect(() => {
+  if (theme.value) document.documentElement.dataset.theme = theme.value; else delete document.documentElement.dataset.theme;
+  localStorage.setItem("sgstore theme", theme.value);
+  untracked(() => { paints.value++; });
+});
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { paints.value++; });
+
+async function begin() {
+  const place = /** @type {HTMLElement} */ (document.getElementById("app"));
+  try {
+    store.value = await api.json("api/store");
+  } catch (error) {
+    place.textContent = reasonOf(error);
+    return;
+  }
+  place.textContent = "";
+  render(html`<${App} />`, place);
+  await readAddress();
+  addEventListener("hashchange", readAddress);
+  effect(() => { open.value; seq.value; view.value; values.value; if (!playing.value) writeAddressSoon(); });
+  api.json("api/notes").then((told) => { notes.value = told.notes; }).catch((error) => say(reasonOf(error)));
+  api.json("api/words").then((told) => { words.value = told; }).catch((error) => say(reasonOf(error)));
+  library.value = await api.json("api/library");
+  countLibrary();
+}
+
+begin();

@@ -1,0 +1,232 @@
+// @ts-check
+// A match, or a frame: camera, view from above, the pattern, lanes of truth, all by one clock.
+import { effect, h, htm, signal, useEffect, useLayoutEffect, useRef, useState } from "../vendor/vendor.js";
+import * as api from "./api.js";
+import { asked, askWhy, camera, copyLink, frame, holdsAt, lanes, nextMatch, panel, series, showSeries, why } from "./clock.js";
+import { arrived, nameOf, pictureAt, statesAt } from "./data.js";
+import { egoRow, fitted, lookAt, nodeAt, paintScene, rowOf } from "./draw.js";
+import { replacePart, setQuery } from "./editor.js";
+import { PatternDrawing } from "./pattern.js";
+import { chosen, find, lit, open, openFrame, paints, playing, rate, reasonOf, say, text, traces, writeAddress } from "./state.js";
+import { Timeline } from "./timeline.js";
+
+const html = htm.bind(h);
+
+/** What the user set of the view: how near, and how far aside. */
+const zoom = signal({ factor: 1, dx: 0, dy: 0, north: false });
+effect(() => { open.value?.trace; zoom.value = { ...zoom.peek(), dx: 0, dy: 0 }; });
+
+/** Let a number be what it must be so that this frame may match, and ask again. @param {any} change */
+function relax(change) {
+  const raw = text.value, lead = raw.length - raw.trimStart().length;
+  const now = open.value;
+  replacePart(change.start + lead, change.end + lead, change.text);
+  find({ keep: true }).then(() => { if (now) { why.value = null; openFrame(now.trace, frame.value, null); } });
+}
+
+// Camera ------------------------------------------------------------------------------------------------------
+
+function Camera() {
+  const canvas = useRef(/** @type {HTMLCanvasElement | null} */ (null));
+  const now = open.value, about = traces.value.get(now?.trace || "");
+  arrived.value;
+  const ahead = playing.value ? Math.max(1, Math.round(rate.value)) : 1;
+  const picture = now && camera.value ? pictureAt(now.trace, camera.value, frame.value, ahead) : null;
+  useLayoutEffect(() => {
+    const ctx = canvas.current?.getContext("2d");
+    if (!canvas.current || !ctx || !picture?.image) return;
+    const { width, height, ratio } = fitted(canvas.current), image = picture.image;
+    const scale = Math.min(width / image.width, height / image.height);
+    ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
+    ctx.clearRect(0, 0, width, height);
+    ctx.drawImage(image, (width - image.width * scale) / 2, (height - image.height * scale) / 2, image.width * scale, image.height * scale);
+  });
+  return html`<div class="panel camera">
+    <div class="caption">${(about?.cameras.length || 0) > 1
+      ? html`<select aria-label="Camera" value=${camera.value} onChange=${(/** @type {any} */ e) => { camera.value = e.target.value; }}>
+          ${about?.cameras.map((c) => html`<option>${c}</option>`)}</select>`
+      : html`<span class="chip">${camera.value}</span>`}</div>
+    <canvas ref=${canvas} role="img" aria-label="Camera picture"></canvas>
+    ${picture?.failed ? html`<div class="none">${reasonOf(picture.failed)}</div>` : null}
+  </div>`;
+}
+
+// View from above ---------------------------------------------------------------------------------------------------
+
+function Above() {
+  const canvas = useRef(/** @type {HTMLCanvasElement | null} */ (null));
+  const look = useRef(/** @type {any} */ (null)), drag = useRef(/** @type {any} */ (null));
+  const now = open.value, at = frame.value;
+  const [, redraw] = useState(0);
+  const states = now ? statesAt(now.trace, at) : null;
+  const seen = useRef(/** @type {any} */ (null));
+  if (states) seen.current = states;
+  useEffect(() => {
+    const watch = new ResizeObserver(() => redraw((/** @type {number} */ n) => n + 1));
+    if (canvas.current) watch.observe(canvas.current);
+    return () => watch.disconnect();
+  }, []);
+  arrived.value; paints.value;
+  const { factor, dx, dy, north } = zoom.value, marks = lit.value, picked = chosen.value, known = lanes.value;
+  useLayoutEffect(() => {
+    const ctx = canvas.current?.getContext("2d");
+    if (!canvas.current || !ctx || !now || !seen.current) return;
+    const { width, height, ratio } = fitted(canvas.current), nodes = Object.values(now.binding || {});
+    const base = lookAt(now.trace, seen.current, nodes, width, height);
+    if (north) base.turn = 0;
+    // The scale stays while it plays: it is that of the whole match.
+    const kept = look.current?.key === `${now.trace} ${now.match?.index} ${width} ${height}` ? look.current : null;
+    const reach = kept ? kept.base : base.scale;
+    const cos = Math.cos(base.turn), sin = Math.sin(base.turn);
+    const mine = { ...base, scale: reach * factor, x: base.x - (dx * cos + dy * sin), y: base.y - (-dx * sin + dy * cos) };
+    look.current = { ...mine, base: reach, key: `${now.trace} ${now.match?.index} ${width} ${height}` };
+    const holds = holdsAt(at), names = new Map(), edges = /** @type {any[]} */ ([]);
+    for (const [key, node] of Object.entries(now.binding || {})) names.set(node, `${key} · ${(node < 0 && now.match?.names[key]) || nameOf(now.trace, node)}`);
+    if (picked !== null && !names.has(picked)) names.set(picked, nameOf(now.trace, picked));
+    (known?.lanes || []).forEach((/** @type {any} */ lane, /** @type {number} */ i) => {
+      for (const edge of lane.edges) {
+        const src = now.binding?.[edge.src], dst = now.binding?.[edge.dst];
+        if (src !== undefined && dst !== undefined) edges.push({ ...edge, src, dst, holds: holds[i] });
+      }
+    });
+    paintScene(ctx, now.trace, seen.current, mine, ratio, {
+      marked: new Set(nodes), lit: marks, chosen: picked, names, edges, track: picked === null ? undefined : trackOf(now.trace, picked, at),
+    });
+  });
+  const wheel = (/** @type {WheelEvent} */ e) => {
+    e.preventDefault();
+    zoom.value = { ...zoom.value, factor: Math.max(0.15, Math.min(12, factor * Math.exp(-e.deltaY / 500))) };
+  };
+  useEffect(() => {
+    const element = canvas.current;
+    element?.addEventListener("wheel", wheel, { passive: false });
+    return () => element?.removeEventListener("wheel", wheel);
+  });
+  const down = (/** @type {PointerEvent} */ e) => {
+    drag.current = { x: e.clientX, y: e.clientY, dx, dy, moved: false };
+    canvas.current?.setPointerCapture(e.pointerId);
+  };
+  const move = (/** @type {PointerEvent} */ e) => {
+    if (!drag.current || !look.current) return;
+    const mx = e.clientX - drag.current.x, my = e.clientY - drag.current.y;
+    if (Math.abs(mx) + Math.abs(my) > 4) drag.current.moved = true;
+    if (drag.current.moved) zoom.value = { ...zoom.value, dx: drag.current.dx + mx / look.current.scale, dy: drag.current.dy - my / look.current.scale };
+  };
+  const up = (/** @type {PointerEvent} */ e) => {
+    const held = drag.current;
+    drag.current = null;
+    if (!held || held.moved || !seen.current || !canvas.current) return;
+    const box = canvas.current.getBoundingClientRect();
+    const node = nodeAt(seen.current, look.current, e.clientX - box.left, e.clientY - box.top);
+    chosen.value = node < 0 ? null : node;
+    if (node >= 0) { panel.value = "node"; showSeries("speed", node); }
+  };
+  return html`<div class="panel above">
+    <div class="caption">
+      <button class="small" aria-pressed=${north} onClick=${() => { zoom.value = { ...zoom.value, north: !north }; }}>${north ? "north up" : "heading up"}</button>
+      <button class="small" aria-label="Nearer" onClick=${() => { zoom.value = { ...zoom.value, factor: factor * 1.4 }; }}>+</button>
+      <button class="small" aria-label="Farther" onClick=${() => { zoom.value = { ...zoom.value, factor: factor / 1.4 }; }}>−</button>
+      ${factor !== 1 || dx || dy ? html`<button class="small" onClick=${() => { zoom.value = { factor: 1, dx: 0, dy: 0, north }; }}>reset</button>` : null}
+    </div>
+    <canvas ref=${canvas} role="img" aria-label="View from above" onPointerDown=${down} onPointerMove=${move} onPointerUp=${up}></canvas>
+  </div>`;
+}
+
+/** Places of a node around now, where they are known. @param {string} trace @param {number} node @param {number} at */
+function trackOf(trace, node, at) {
+  const found = [];
+  for (let s = Math.max(0, at - 100); s <= at + 100; s += 4) {
+    const states = statesAt(trace, s), row = states ? rowOf(states, node) : -1;
+    if (states && row >= 0) found.push([states.columns.x[row], states.columns.y[row]]);
+  }
+  return found;
+}
+
+// Pattern, tables ---------------------------------------------------------------------------------------------------
+
+const PAIRS = ["distance", "gap", "ttc", "headway", "bearing", "closing_speed"];
+const OF_NODE = ["speed", "accel", "yaw_rate", "heading", "steer", "brake"];
+
+function Details() {
+  const tabs = [["pattern", "pattern"], ["nodes", "nodes"], ["edges", "edges"], ...(chosen.value === null ? [] : [["node", nameOf(open.value?.trace || "", chosen.value)]])];
+  const now = panel.value === "node" && chosen.value === null ? "pattern" : panel.value;
+  return html`<div class="panel pattern">
+    <div class="tabs" role="tablist">${tabs.map(([key, name]) => html`<button role="tab" aria-selected=${now === key}
+      onClick=${() => { panel.value = key || "pattern"; }}>${name}</button>`)}</div>
+    ${now === "pattern" ? html`<${PatternDrawing} lanes=${lanes.value} holds=${holdsAt(frame.value)} />`
+      : now === "node" ? html`<${NodePanel} />` : html`<${GraphTable} what=${now} />`}
+  </div>`;
+}
+
+function NodePanel() {
+  const now = open.value, node = chosen.value, states = now ? statesAt(now.trace, frame.value) : null;
+  if (!now || node === null) return null;
+  const row = states ? rowOf(states, node) : -1, c = states?.columns, ego = states ? egoRow(states) : -1;
+  const about = row < 0 || !c ? [] : [["speed", `${c.speed[row].toFixed(2)} m/s`], ["heading", `${((c.heading[row] * 180) / Math.PI).toFixed(1)}°`],
+    ["size", `${c.length[row].toFixed(1)} × ${c.width[row].toFixed(1)} m`], ["place", `${c.x[row].toFixed(1)}, ${c.y[row].toFixed(1)} m`]];
+  const other = ego >= 0 && c && c.node[ego] !== node ? c.node[ego] : undefined;
+  return html`<div class="scroll" style=${{ padding: "8px 12px" }}>
+    <table><tbody>${about.map(([name, value]) => html`<tr><td class="faint">${name}</td><td>${value}</td></tr>`)}</tbody></table>
+    <div class="row wrap" style=${{ marginTop: "8px" }}>
+      ${OF_NODE.map((name) => html`<button class="small" aria-pressed=${series.value?.attribute === name} onClick=${() => showSeries(name, node)}>${name}</button>`)}
+      ${other === undefined ? null : PAIRS.map((name) => html`<button class="small" onClick=${() => showSeries(name, other, node)}>${name} from ego</button>`)}
+    </div>
+    <p class="row wrap"><button class="small" onClick=${() => { setQuery(`MATCH (e:Ego), (x) WHERE x.id = ${node} AND trace.name = '${now.trace.replace(/'/g, "\\'")}' AND dist(e, x) < 30`); find(); }}>as a query</button></p>
+  </div>`;
+}
+
+/** @param {{what: string}} props */
+function GraphTable({ what }) {
+  const [graph, setGraph] = useState(/** @type {any} */ (null));
+  const now = open.value, at = playing.value ? -1 : frame.value;
+  useEffect(() => {
+    if (!now || at < 0) return;
+    api.json(api.address("api/frame", { trace: now.trace, seq: at })).then(setGraph).catch((error) => say(reasonOf(error)));
+  }, [now?.trace, at]);
+  if (!graph) return html`<p class="faint" style=${{ padding: "8px 12px" }}>${playing.value ? "pause to read the graph of a frame" : "…"}</p>`;
+  const bound = new Set(Object.values(now?.binding || {}));
+  if (what === "edges") {
+    const names = new Map(graph.nodes.map((/** @type {any} */ n) => [n.id, n.name || n.id]));
+    const some = graph.edges.filter((/** @type {any} */ e) => !bound.size || bound.has(e.src) || bound.has(e.dst));
+    return html`<div class="scroll"><table><thead><tr><th>from</th><th>relation</th><th>to</th></tr></thead><tbody>
+      ${some.slice(0, 600).map((/** @type {any} */ e) => html`<tr onMouseEnter=${() => { lit.value = new Set([e.src, e.dst]); }} onMouseLeave=${() => { lit.value = new Set(); }}>
+        <td>${names.get(e.src)}</td><td>${e.relation}</td><td>${names.get(e.dst)}</td></tr>`)}</tbody></table>
+      ${some.length > 600 ? html`<p class="faint">600 of ${some.length} edges</p>` : null}</div>`;
+  }
+  const listed = graph.nodes.filter((/** @type {any} */ n) => n.id >= 0).sort((/** @type {any} */ a, /** @type {any} */ b) => Number(bound.has(b.id)) - Number(bound.has(a.id)));
+  return html`<div class="scroll"><table><thead><tr><th>node</th><th>kind</th><th>speed</th></tr></thead><tbody>
+    ${listed.map((/** @type {any} */ n) => html`<tr class=${chosen.value === n.id ? "chosen" : ""} onMouseEnter=${() => { lit.value = new Set([n.id]); }}
+      onMouseLeave=${() => { lit.value = new Set(); }} onClick=${() => { chosen.value = n.id; panel.value = "node"; showSeries("speed", n.id); }}>
+      <td>${n.name || n.id}</td><td>${n.kind}</td><td class="number">${n.speed === undefined || n.speed === null ? "" : `${n.speed.toFixed(1)}`}</td></tr>`)}</tbody></table></div>`;
+}
+
+// All of it -----------------------------------------------------------------------------------------------------------
+
+/** @param {{path: string}} props */
+const Icon = ({ path }) => html`<svg class="icon" viewBox="0 0 14 14" aria-hidden="true"><path d=${path} fill="currentColor" /></svg>`;
+
+function Transport() {
+  const now = open.value, about = traces.value.get(now?.trace || ""), states = now ? statesAt(now.trace, frame.value) : null;
+  const t = states ? states.t : frame.value * (about?.period || 0.1);
+  const told = why.value?.at === frame.value ? why.value : null, gap = told?.steps ? told.steps.find((/** @type {any} */ s) => s.failed) : told;
+  return html`<div class="transport">
+    <button aria-label="Match before" title="match before (p)" onClick=${() => nextMatch(-1)}><${Icon} path="M3 2h2v10H3zM13 2v10L5.5 7z" /></button>
+    <button class="main" aria-label=${playing.value ? "Pause" : "Play"} title="space" onClick=${() => { playing.value = !playing.value; }}><${Icon} path=${playing.value ? "M2 2h3.6v10H2zM8.4 2H12v10H8.4z" : "M3 1.5v11L12.5 7z"} /></button>
+    <button aria-label="Next match" title="next match (n)" onClick=${() => nextMatch(1)}><${Icon} path="M9 2h2v10H9zM1 2v10l7.5-5z" /></button>
+    <select aria-label="Speed" value=${rate.value} onChange=${(/** @type {any} */ e) => { rate.value = Number(e.target.value); }}>
+      ${[0.25, 0.5, 1, 2, 4].map((r) => html`<option value=${r}>${r}×</option>`)}</select>
+    <span class="time"><b>${now?.trace}</b>#${frame.value} · ${t.toFixed(2)} s</span>
+    <span class="grow"></span>
+    <button title="why does this frame match, or not (w)" aria-expanded=${told ? "true" : "false"} onClick=${() => { if (told) why.value = null; else askWhy(); }}>Why?</button>
+    <button title="copy a link (y)" onClick=${copyLink}>Link</button>
+    <button aria-label="Close" title="close (Esc)" onClick=${() => { playing.value = false; open.value = null; writeAddress(); }}>✕</button>
+    ${told ? html`<span class="gap" role="status">${gap?.failed ? html`<span><b>fails</b> <code>${gap.failed}</code>${gap.found ? html` · found <code>${gap.found}</code>` : null}</span>`
+      : told.error ? told.error.reason : "all of it holds in this frame"}
+      ${(told.relax || []).map((/** @type {any} */ change) => html`<button class="small" onClick=${() => relax(change)}>${asked.value.slice(change.start, change.end)} → ${change.text}</button>`)}</span>` : null}
+  </div>`;
+}
+
+export function Scene() {
+  const seen = traces.value.get(open.value?.trace || "")?.cameras.length;
+  return html`<section class=${seen ? "scene" : "scene blind"} aria-label="Scene">${seen ? html`<${Camera} />` : null}<${Above} /><${Details} /><${Timeline} /><${Transport} /></section>`;
+}

