@@ -9,7 +9,7 @@ import pytest
 
 from sgstore.cli import run
 from sgstore.demo import RECORDING
-from sgstore.draw import draw_timelines, lines_of, timelines
+from sgstore.draw import draw_timelines, lines_of, parts_timeline, timelines
 from sgstore.draw._swimlanes import Lane, Timeline
 from sgstore.query import Store
 
@@ -65,6 +65,31 @@ def test_the_verb_prints_lanes_or_draws_them(
     assert "phi6" in drawn
     assert drawn.count("apart · ") == text.count("apart · ")
     assert run(["timeline", str(town)]) == 2
+
+
+def test_parts_of_a_pattern_have_lanes_and_what_they_have_in_common(
+    town: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    query = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle) WHERE e.speed > 3"
+    store = Store(town)
+    match = next(store.find(query).intervals())
+    frame = f"{match.trace}#{match.start_seq}"
+    timeline = parts_timeline(store, query, frame, {})
+    lanes = store.parts(query, frame)
+
+    assert [lane.name for lane in timeline.lanes] == [
+        "(e)-[:near_coll]->(v)",
+        "e.speed > 3",
+        "all of it",
+    ]
+    assert [len(lane.spans) for lane in timeline.lanes[:2]] == [
+        len(one.spans) for one in lanes.lanes
+    ]
+    assert (match.start, match.end, False) in timeline.lanes[2].spans
+
+    assert run(["timeline", str(town), query, "--parts", frame]) == 0
+    assert "\n  all of it  " in re.sub(" +", lambda found: found[0][:2], capsys.readouterr().out)
+    assert run(["timeline", str(town), query, "-p", "phi6", "--parts", frame]) == 2
 
 
 @pytest.mark.parametrize(

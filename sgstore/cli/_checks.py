@@ -379,17 +379,31 @@ def timeline(
     output: Annotated[
         Path | None, Option("--output", "-o", help="A picture: FILE.png or FILE.svg.")
     ] = None,
+    parts: Annotated[
+        str | None,
+        Option(
+            "--parts",
+            metavar="FRAME",
+            help="Where each part of one pattern holds for the match in this frame.",
+        ),
+    ] = None,
     *,
     bounds: QueryLimits,
 ) -> int:
     """Plot matches and rule violations over time, one lane per entity, for each trace.
 
-    In the terminal, or with -o as a picture.
+    In the terminal, or with -o as a picture. With --parts FRAME one lane for each part of a pattern.
     """
-    from sgstore.draw import LETTERS, NAME, lines_of, timelines
+    from sgstore.draw import LETTERS, NAME, lines_of, parts_timeline, timelines
 
     asked = _asked(queries or [], files or [], names or [], parameters_of(parameters))
-    found = timelines(bounds.opened(store), asked, traces or ())
+    if parts is None:
+        found = timelines(bounds.opened(store), asked, traces or ())
+    else:
+        if len(asked) > 1 or traces:
+            raise typer.BadParameter("--parts FRAME takes one pattern, and the trace of the frame")
+        ((text, values),) = asked.values()
+        found = [parts_timeline(bounds.opened(store), text, parts, values)]
     for name in {*(traces or ())} - {one.trace for one in found}:
         raise typer.BadParameter(f"--trace: the store has no trace {name!r}")
     say_unknown((lane.name, one.trace, lane.reason) for one in found for lane in one.lanes)

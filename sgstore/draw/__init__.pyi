@@ -22,6 +22,7 @@ from ._swimlanes import NAME as NAME
 from ._swimlanes import Timeline as Timeline
 from ._swimlanes import draw_timelines as draw_timelines
 from ._swimlanes import lines_of as lines_of
+from ._swimlanes import parts_timeline as parts_timeline
 from ._swimlanes import timelines as timelines
 
 __all__ = [
@@ -45,6 +46,7 @@ __all__ = [
     "frame_image",
     "graph_picture",
     "lines_of",
+    "parts_timeline",
     "range_of",
     "thumbnail",
     "timelines",

@@ -116,6 +116,50 @@ def timelines(
     return list(found.values())
 
 
+def parts_timeline(
+    store: Store, text: str, frame: int | str, values: Mapping[str, Any]
+) -> Timeline:
+    """The lanes of truth of a match: each part of a pattern over the trace of a frame, then all together.
+
+    Parameters
+    ----------
+    store : Store
+    text : str
+        A pattern.
+    frame : int or str
+        As :meth:`sgstore.query.Store.graph` takes it: its first match is meant, or what comes nearest to one.
+    values : mapping
+        Of the parameters of the pattern.
+
+    Raises
+    ------
+    QueryError
+        The text is no query.
+    StoreError
+        There is no such frame.
+    """
+    with store.file.snapshot():
+        found = store.parts(text, frame, **values)
+        one = store.file.trace(found.trace)
+        sql = "SELECT seq, t FROM frames WHERE trace = ? ORDER BY seq"
+        times = dict(store.file.rows(sql, [found.trace]).values)
+
+    def spans(of: Iterable[tuple[int, int]]) -> list[LaneSpan]:
+        return [(times[first], times[last], False) for first, last in of]
+
+    whole = Timeline(one.name, (one.end_ns - one.start_ns) / 1e9)
+    steps = len(found.steps) > 1
+    for lane in found.lanes:
+        name = f"{lane.part.step}. {lane.part.text}" if steps else lane.part.text
+        reason = f"nothing is known of {', '.join(lane.unknown)}" if lane.unknown else ""
+        verdict = "unknown" if lane.unknown else ""
+        whole.lanes.append(Lane(name, "", verdict, spans(lane.spans), reason))
+    for step in found.steps:
+        name = f"all of step {step}" if steps else "all of it"
+        whole.lanes.append(Lane(name, "", "", spans(found.together(step))))
+    return whole
+
+
 def _checked(store: Store, text: str, values: Mapping[str, Any]) -> Iterator[tuple[str, Lane]]:
     for verdict in store.check(text, **values):
         lane = Lane(verdict.check, "", verdict.verdict, reason=verdict.reason)
