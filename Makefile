@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: help demo check test tests test-edges test-wheel test-versions lint format bench fuzz kill mutants soak pyg oracle patterns sample clean duckdb-versions fuzz-queries frozen house api cluster
+.PHONY: help demo check test tests test-edges test-ui test-wheel test-versions lint format bench fuzz kill mutants soak pyg oracle patterns sample clean duckdb-versions fuzz-queries frozen house api vendor cluster
 
 help:
 	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
@@ -12,6 +12,7 @@ help:
 	@echo "make test    format, lint, types and the tests of the core: from a recording to an answer"
 	@echo "make tests   the tests of the core only"
 	@echo "make test-edges  the other tests: what is made of answers, pages, other formats, programs that run long"
+	@echo "make test-ui     the explorer in a browser (Chromium), and the types of its page; without a browser it says so"
 	@echo "make test-wheel  build the wheel, install it elsewhere, and run the short tests there"
 	@echo "make test-versions  ingest, verify and find under the lowest and the highest versions of other packages"
 	@echo "make lint    format, lint and types only"
@@ -29,6 +30,7 @@ help:
 	@echo "make duckdb-versions  every construct of the language under DuckDB 1.5 and 2.0: equal answers (minutes)"
 	@echo "make patterns  draw the examples of the library, and write its page, again"
 	@echo "make api     write docs/api.md and docs/relations.md from the code again"
+	@echo "make vendor  make the part of the explorer's page again that is of other packages (npm)"
 	@echo "make sample  record the bundled sample again (runs SUMO)"
 
 # One environment, and a stamp for each set of packages in it: made again when pyproject.toml changes.
@@ -42,6 +44,10 @@ $(VENV)/.base: pyproject.toml
 $(VENV)/.dev: $(VENV)/.base
 	@$(BIN)/python -m pip install -q --disable-pip-version-check -U 'pip>=25.1'
 	@$(BIN)/python -m pip install -q --disable-pip-version-check --group dev -e '.[arrow]'
+	@touch $@
+
+$(VENV)/.browser: $(VENV)/.dev
+	@$(BIN)/python -m pip install -q --disable-pip-version-check --group browser
 	@touch $@
 
 $(VENV)/.sample: $(VENV)/.base
@@ -74,17 +80,23 @@ EDGES := coverage coverage_docs derive derive_using like locks selection selecti
   draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap export_viewers exports exports_docs timeline \
   assistant notebook carla_live collection collection_landing collection_ray collection_remote importing junit lang_sgl pytest_plugin record sample \
   docs_house docs_queries lang_docs packaging views_page \
-  fuzz mutants
+  fuzz mutants serve
 tests-of = $(foreach name,$(1),tests/test_$(name).py)
 
 # A file of tests at a time in each process: what its tests share is made once. The longest come first
 # (tests/slow.py), so that no process is left alone with one of them.
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --durations 25 --durations-min 3
 tests: $(VENV)/.dev
-	$(PYTEST) $(addprefix --ignore=,$(call tests-of,$(EDGES)))
+	$(PYTEST) $(addprefix --ignore=,$(call tests-of,$(EDGES) $(UI)))
 
 test-edges: $(VENV)/.dev
 	$(PYTEST) $(call tests-of,$(EDGES))
+
+# What needs a browser, and node for the types of the page, which comes with the checker of types of Python.
+UI := explorer
+test-ui: $(VENV)/.browser
+	$(BIN)/python tests/vendor.py --check
+	$(BIN)/python -m pytest -q -rs --durations 10 --durations-min 3 $(call tests-of,$(UI))
 
 test-wheel: $(VENV)/.dev
 	$(BIN)/python tests/packages.py wheel
@@ -125,7 +137,7 @@ pyg: $(VENV)/.base
 # Files of tests that try more where SGSTORE_LONG is set (tests/thorough.py).
 LONG := collection collection_ray temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \
   lang_after lang_attributes lang_counting lang_match lang_oracle lang_subgraphs doors frozen ingest_data ingest_hardship \
-  monitor notebook assistant online sgg_traces store_transactions tolerance
+  monitor notebook assistant online serve sgg_traces store_transactions tolerance
 oracle: $(VENV)/.dev
 	$(BIN)/python tests/oracle_temporal.py 100000
 	$(BIN)/python tests/oracle_monitor.py 100000
@@ -151,6 +163,9 @@ duckdb-versions: $(VENV)/.dev
 
 patterns: $(VENV)/.dev
 	$(BIN)/python tests/library_page.py
+
+vendor: $(VENV)/.dev
+	$(BIN)/python tests/vendor.py
 
 api: $(VENV)/.dev
 	$(BIN)/python tests/api_page.py

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 SECONDS: Final = {
+    "explorer": 60,
     "importing": 45,
     "cli_ending": 33,
     "exports": 30,
