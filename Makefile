@@ -77,7 +77,7 @@ test: $(VENV)/.dev
 # pictures, exports, graphs and simulators of others, plug-ins of other programs, pages of the docs, and parts of the long
 # programs below. A file that is not listed is of the core.
 EDGES := coverage coverage_docs derive derive_using like locks selection selection_docs selection_overlapping prioritize \
-  draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap export_viewers exports exports_docs timeline \
+  draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap export_scenarios export_viewers exports exports_docs timeline \
   assistant notebook carla_live collection collection_landing collection_ray collection_remote importing junit lang_sgl pytest_plugin record sample \
   docs_house docs_queries lang_docs packaging views_page \
   fuzz mutants serve
@@ -137,7 +137,7 @@ pyg: $(VENV)/.base
 # Files of tests that try more where SGSTORE_LONG is set (tests/thorough.py).
 LONG := collection collection_ray temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \
   lang_after lang_attributes lang_counting lang_match lang_oracle lang_subgraphs doors frozen ingest_data ingest_hardship \
-  monitor notebook assistant online serve sgg_traces store_transactions tolerance
+  export_scenarios monitor notebook assistant online serve sgg_traces store_transactions tolerance
 oracle: $(VENV)/.dev
 	$(BIN)/python tests/oracle_temporal.py 100000
 	$(BIN)/python tests/oracle_monitor.py 100000

@@ -402,7 +402,9 @@ class StoreTools:
         name: Annotated[str, Field(description="of a new folder for them: letters, digits, - _ .")],
         before: Annotated[float, Field(ge=0, le=600, description="before each match; s")] = 2.0,
         after: Annotated[float, Field(ge=0, le=600, description="after each match; s")] = 2.0,
-        form: Annotated[str, Field(description="mcap, parquet, frames, nx, pyg, s3c")] = "mcap",
+        form: Annotated[
+            str, Field(description="mcap, parquet, frames, nx, pyg, s3c, xosc")
+        ] = "mcap",
         with_graph: Annotated[bool, Field(description="mcap: with the scene graphs")] = False,  # noqa: FBT002
         limit: Annotated[int, Field(ge=1, description="clips at most")] = ROWS,
         parameters: Values = None,

@@ -145,9 +145,9 @@ def export(
 ) -> int:
     """Cut matches out of their recordings, as clips with the original messages.
 
-    Other formats: tables (parquet), pictures and clouds (frames), graphs for
-    networkx (nx), PyTorch Geometric (pyg) and S3C (s3c). RETURN CLIPS(-3s, +5s)
-    in the query wins over --before and --after.
+    Other formats: tables (parquet), pictures and clouds (frames), scenarios to drive
+    again (xosc), graphs for networkx (nx), PyTorch Geometric (pyg) and S3C (s3c).
+    RETURN CLIPS(-3s, +5s) in the query wins over --before and --after.
     """
     from sgstore.exporters import exporter_named, labelled, parse_labels, write_export
 

@@ -72,6 +72,7 @@ EXPORTERS: Final = (
     _of("nx", "abstraction", "graphml"),
     _of("pyg", "abstraction"),
     _of("s3c", "abstraction"),
+    _of("xosc"),
 )
 """The formats of this package."""
 
