@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, overload
 import numpy as np
 
 from sgstore.columns import taken
-from sgstore.vocabulary import MOST_RELATIONS, RELATION_CODE, RELATIONS
+from sgstore.vocabulary import MOST_RELATIONS, RELATION_CODE, RELATIONS, SIGNALS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sgstore.world import Codes, Floats, FrameBlock, Ints
 
     Places = Sequence[tuple[int, float]]
+    Stretches = Sequence[tuple[int, float, float]]
     Whole = NDArray[np.signedinteger[Any]]
     Attributes = dict[str, Any]
     EdgeRecord = tuple[int, str, int, Attributes]
@@ -262,13 +263,21 @@ class LaneDistances:
     start : (n,) float64
         Of ``other``, along the lanes from the start of ``lane``; negative where one drives from ``other`` to
         ``lane``; m.
+    parts : iterable of (int, str, int, float, float)
+        Parts of the map, what each is, lanes on which it lies, and from where to where along these; m.
     """
 
     FARTHEST: Final = 200.0
     """How far is looked; m. The view ``pairs`` has this number too."""
 
-    def __init__(self, lane: Ints, other: Ints, start: Floats) -> None:
-        self._columns = lane, other, start
+    def __init__(
+        self,
+        lane: Ints,
+        other: Ints,
+        start: Floats,
+        parts: Iterable[tuple[int, str, int, float, float]] = (),
+    ) -> None:
+        self._columns, self._parts = (lane, other, start), tuple(parts)
 
     @cached_property
     def _starts(self) -> dict[tuple[int, int], list[float]]:
@@ -278,19 +287,65 @@ class LaneDistances:
             found.setdefault((lane, other), []).append(start)
         return found
 
+    @cached_property
+    def _onward(self) -> dict[int, list[tuple[int, float]]]:
+        """Lane → lanes to which one can drive from it, itself among them, and their starts."""
+        found: dict[int, list[tuple[int, float]]] = {}
+        for (lane, other), starts in self._starts.items():
+            found.setdefault(lane, []).extend((other, start) for start in starts if start >= 0)
+        return found
+
+    @cached_property
+    def _of_parts(self) -> dict[int, list[tuple[int, float, float]]]:
+        found: dict[int, list[tuple[int, float, float]]] = {}
+        for node, _, lane, start, end in self._parts:
+            found.setdefault(node, []).append((lane, start, end))
+        return found
+
+    @cached_property
+    def _on_lanes(self) -> dict[tuple[str, int], list[tuple[float, float]]]:
+        found: dict[tuple[str, int], list[tuple[float, float]]] = {}
+        for _, what, lane, start, end in self._parts:
+            found.setdefault((what, lane), []).append((start, end))
+        return found
+
+    def stretches(self, node: int) -> Stretches:
+        """Lanes on which a part of the map lies, and from where to where along them; m."""
+        return self._of_parts.get(node, ())
+
+    def stretches_of(self, what: str, lane: int) -> Sequence[tuple[float, float]]:
+        """From where to where along a lane parts of the map of one sort lie; m."""
+        return self._on_lanes.get((what, lane), ())
+
     def distance(self, one: Places, other: Places) -> float | None:
         """Distance from one entity to another, by their places; see :meth:`SceneGraph.lane_dist`."""
+        ends = ([(lane, along, along) for lane, along in places] for places in (one, other))
+        return self.between(*ends)
+
+    def between(self, one: Stretches, other: Stretches) -> float | None:
+        """Distance from the end of one to the start of another, 0 where they overlap, negative behind; m."""
         ahead, behind = math.inf, -math.inf
-        for lane, along in one:
-            for to, at in other:
-                for start in self._starts.get((lane, to), ()):
-                    way = start + (at - along)
-                    if way >= 0:
-                        ahead = min(ahead, way)
+        for lane, first, last in one:
+            for to, start, end in other:
+                for way in self._starts.get((lane, to), ()):
+                    if (far := way + (start - last)) >= 0:
+                        ahead = min(ahead, far)
+                    elif (back := way + (end - first)) < 0:
+                        behind = max(behind, back)
                     else:
-                        behind = max(behind, way)
+                        ahead = 0.0
         nearest = ahead if ahead <= -behind else behind
         return nearest if abs(nearest) <= self.FARTHEST else None
+
+    def next(self, one: Stretches, what: str) -> float | None:
+        """Distance to the next part of the map of one sort, driving on; 0 on it; m."""
+        found = math.inf
+        for lane, first, last in one:
+            for to, way in self._onward.get(lane, ()):
+                for start, end in self.stretches_of(what, to):
+                    if way + (end - first) >= 0:
+                        found = min(found, max(way + (start - last), 0.0))
+        return found if found <= self.FARTHEST else None
 
 
 class EdgeColumns(Sequence["EdgeRecord"]):
@@ -395,18 +450,54 @@ class SceneGraph:
                 found.setdefault(src, []).append((dst, about["along"]))
         return found
 
+    def stretches(self) -> dict[int, Stretches]:
+        """Lanes on which entities are, and from where to where along these: node id → (lane, start, end).
+
+        Lights and signs are where the lanes that they control are waited on: see
+        :mod:`sgstore.roads._places`.
+        """
+        found: dict[int, list[tuple[int, float, float]]] = {}
+        signals = {node for node, about in self.nodes.items() if about["kind"] in SIGNALS}
+        for src, relation, dst, about in self.edges:
+            if relation == "isIn" and src not in signals:
+                if about.get("is_own") and "along" in about:
+                    found.setdefault(src, []).append((dst, about["along"], about["along"]))
+            elif relation == "controlsTrafficOf" and src in signals and src >= 0:
+                stops = ((dst, *at) for at in self._stops(self.nodes[src]["kind"], dst))
+                found.setdefault(src, []).extend(stops)
+        return dict(found)
+
+    def _stops(self, what: str, lane: int) -> Sequence[tuple[float, float]]:
+        """Where a lane is waited on before a signal."""
+        known = self.reach.stretches_of(what, lane) if self.reach is not None else ()
+        about = self.nodes.get(lane, {})
+        if not known and ("junction" in about or "length" in about):
+            at = 0.0 if "junction" in about else float(about["length"])
+            return [(at, at)]
+        return known
+
     def lane_dist(self, a: int, b: int) -> float | None:
-        """Distance along the lanes from one entity to another; m.
+        """Distance along the lanes from one entity, or part of the map, to another; m.
 
         From centre to centre along the centre lines of their own lanes (:attr:`LaneStates.own`) and of those
         that ``travelsTo`` leads through; positive where one drives from a to b, negative where one drives from
-        b to a; of several ways the shortest. ``None`` if there is no way of at most 200 m: lane changes are
-        none.
+        b to a; of several ways the shortest. A lane, a road, a junction, a crosswalk lies on lanes from one
+        place to another, so that it is 0 within; a light or a sign where one waits. ``None`` if there is no way
+        of at most 200 m: lane changes are none.
         """
-        places = self.places()
         if self.reach is None:
             return None
-        return self.reach.distance(places.get(a, ()), places.get(b, ()))
+        known = self.stretches()
+        ends = (known.get(n, ()) if n >= 0 else self.reach.stretches(n) for n in (a, b))
+        return self.reach.between(*ends)
+
+    def to_next(self, node: int, what: str) -> float | None:
+        """Distance from an entity along the lanes to the next part of the map of one sort, 0 on it; m.
+
+        ``what`` is ``junction``, ``crosswalk``, ``stop_line``, ``traffic_light``, ``stop_sign``, …; ``None`` if
+        there is none within 200 m.
+        """
+        return None if self.reach is None else self.reach.next(self.stretches().get(node, ()), what)
 
     def to_networkx(self) -> nx.MultiDiGraph[int]:
         """The graph as a ``networkx.MultiDiGraph``.
@@ -429,13 +520,13 @@ class SceneGraph:
             ego=self.ego,
         )
         graph.add_nodes_from(self.nodes.items())
-        places = {} if self.reach is None else self.places()
+        places = {} if self.reach is None else self.stretches()
         known: dict[tuple[int, int], dict[str, Any]] = {}
         for src, relation, dst, attributes in self.edges:
             more: dict[str, Any] = {}
             if self.reach is not None and src in places and dst in places:
                 if (src, dst) not in known:
-                    far = self.reach.distance(places[src], places[dst])
+                    far = self.reach.between(places[src], places[dst])
                     known[src, dst] = {} if far is None else {"lane_dist": far}
                 more = known[src, dst]
             about = {"relation": relation, **attributes, **more}

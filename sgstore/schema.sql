@@ -17,7 +17,7 @@
 -- state of lights, or can answer a relation, that the type does not have, it is added behind the others, in place.
 --
 -- Changes
---   * Version 4: recordings, with a row for each however many egos were seen in it; maps and settings by their digests; gear and hand brake.
+--   * Version 4: map_place. recordings, with a row for each however many egos were seen in it; maps and settings by their digests; gear and hand brake.
 --     Tables are in a schema of their own. Kinds and states of lights are open, as relations are; attributes of a client's own. The kind 'vehicle'. pairs.ttc: first contact; pairs.closing_time: what it was. What stands for ever has velocity 0.
 --     The view criticality. Columns that are always known are NOT NULL; store_info holds a digest of these statements.
 --     Places in lanes and gaps that are the same in frames of a bucket that follow one another are kept once: lane_single, lane_repeated,
@@ -205,6 +205,10 @@ CREATE TABLE map_reach (                                       -- for each two l
   map_id BIGINT NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL, -- lanes, a lane and itself among them
   start DOUBLE NOT NULL);                                      -- of dst, from the start of src; below 0: one drives back to src; m
 
+CREATE TABLE map_place (                                       -- where parts of a map lie along its lanes
+  map_id BIGINT NOT NULL, node_id INTEGER NOT NULL, what VARCHAR NOT NULL, -- what: the kind of the part, or stop_line
+  lane INTEGER NOT NULL, start DOUBLE NOT NULL, "end" DOUBLE NOT NULL); -- m from the start of the lane; a light, a sign: where one waits
+
 -- For sgstore verify ------------------------------------------------------------------------------------------------
 
 CREATE TABLE manifest (                                        -- what was published: rows of a trace, a recording, a map, or settings
@@ -330,11 +334,13 @@ FROM (
     FROM inside.frame f JOIN inside.lane_state a ON a.bucket = f.bucket AND a.frame_id = f.frame_id
          JOIN inside.lane_state b ON b.bucket = f.bucket AND b.frame_id = f.frame_id AND b.node_id <> a.node_id
          JOIN inside.map_reach r ON r.map_id = f.map_id AND r.src = a.lane AND r.dst = b.lane
-    WHERE a.is_own AND b.is_own)
+    WHERE a.is_own AND b.is_own
+      AND a.kind <> 'traffic_light' AND a.kind <> 'stop_sign' AND a.kind <> 'yield_sign' AND a.kind <> 'speed_limit' AND a.kind <> 'sign'
+      AND b.kind <> 'traffic_light' AND b.kind <> 'stop_sign' AND b.kind <> 'yield_sign' AND b.kind <> 'speed_limit' AND b.kind <> 'sign')
   WHERE way BETWEEN -200 AND 200
   GROUP BY ALL);
 
-COMMENT ON VIEW main.lane_dists IS 'How far it is along the lanes: one row for each ordered pair of entities that a way of at most 200 m joins (lane changes are none). lane_dist: from centre to centre, positive where one drives from src to dst, negative where one drives from dst to src; the shorter one counts, m.';
+COMMENT ON VIEW main.lane_dists IS 'How far it is along the lanes: one row for each ordered pair of entities, lights and signs aside, that a way of at most 200 m joins (lane changes are none). lane_dist: from centre to centre, positive where one drives from src to dst, negative where one drives from dst to src; the shorter one counts, m.';
 
 CREATE VIEW main.classes AS
 SELECT f.frame_id, c.abstraction, replace(c.class::VARCHAR, '-', '') AS class

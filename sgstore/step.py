@@ -364,7 +364,7 @@ class Records:
         if road_map is not None:
             edges = road_map.edges
             about = cache(partial(_map_node, road_map))
-            reach = LaneDistances(*road_map.reach)
+            reach = LaneDistances(*road_map.reach, road_map.places.rows())
             self._map = MapRecords(about, edges.src, edges.relation, edges.dst, reach)
 
     def stand(self, known: EntityConstants, states: States, row: int) -> None:

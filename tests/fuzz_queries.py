@@ -114,6 +114,7 @@ PAIRS = (
     ),
     *("lane_dist", "closing_speed", "rel_speed", "ttc", "headway"),
 )
+NEXT = ("to_junction", "to_crosswalk", "to_stop_line", "to_traffic_light", "to_stop_sign")
 PREDICATES = (
     *(
         "lead",
@@ -271,6 +272,7 @@ class Writer:
             f"delta({a}.speed, 1s) {sign} {value}",
             f"{self.rng.choice(WINDOWS)}({a}.speed, {self.rng.choice(('2s', '5frames'))}) {sign} {value}",
             f"{self.rng.choice(OF_ONE)}({a}.y) {sign} pow({b}.x, {value})",
+            f"{self.rng.choice(NEXT)}({a}) {sign} {value}",
         ]
         if depth and self.rng.random() < 0.35:
             return self.inner(depth, sign)

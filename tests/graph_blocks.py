@@ -17,7 +17,7 @@ import numpy as np
 
 from sgstore.config import Config
 from sgstore.graph import Edges, GraphBlock, LaneGaps, LaneStates, StaticPresence
-from sgstore.roads import MapEdges, MapNodes
+from sgstore.roads import MapEdges, MapNodes, MapPlaces
 from sgstore.vocabulary import KIND_CODE, OWN_ENTITY_KINDS, OWN_RELATIONS, RELATION_CODE
 from sgstore.world import (
     Channel,
@@ -53,6 +53,7 @@ class MapStub:
     nodes: MapNodes
     edges: MapEdges
     reach: tuple[Any, Any, Any]
+    places: MapPlaces
 
 
 def map_stub(seed: int = 0, lanes: int = 30, name: str = "stub") -> Any:
@@ -90,6 +91,7 @@ def map_stub(seed: int = 0, lanes: int = 30, name: str = "stub") -> Any:
             dst=-1 - edges[:, 2],
         ),
         reach=_reach(lanes, rng),
+        places=MapPlaces.none(),
     )
 
 

@@ -18,7 +18,7 @@ from sgstore.opendrive import read_map
 from sgstore.query import Store
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
-from sgstore.vocabulary import RELATION_CODE
+from sgstore.vocabulary import RELATION_CODE, SIGNALS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -119,13 +119,14 @@ def test_the_view_the_language_the_graph_and_networkx_say_the_same_to_the_last_b
                 far = graph.lane_dist(a, b)
                 assert view.pair("lane_dist", a, b) == far
                 assert asked[frame, a, b] == far
-                if (frame, a, b) in told:  # the view has what moves
+                signals = {graph.nodes[a]["kind"], graph.nodes[b]["kind"]} & {*SIGNALS}
+                if (frame, a, b) in told and not signals:  # the view has what moves
                     assert told[frame, a, b] == far
                 known += far is not None
-                assert far is None or (a in places and b in places)
+                assert far is None or signals or (a in places and b in places)
                 for edge in (drawn.get_edge_data(a, b) or {}).values():
                     assert edge.get("lane_dist") == far
-    assert known > 50
+    assert known > 40
 
 
 TOWN = PaperMap(
@@ -207,7 +208,12 @@ def test_it_stands_in_conditions_blocks_orders_and_counts_and_under_an_abstracti
     near = "lane_dist(a, b) >= 0 AND lane_dist(a, b) <= 60"
     told = "RETURN frame.id, a.id, b.id"
     moving = {
-        row[0] for row in store.sql("SELECT DISTINCT node_id FROM nodes WHERE speed > -1").values
+        row[0]
+        for row in store.sql(
+            "SELECT DISTINCT node_id, kind FROM nodes JOIN frames USING (frame_id)"
+            " WHERE speed > -1 AND trace = 'drive'"
+        ).values
+        if row[1] not in SIGNALS
     }
 
     def found(query: str) -> list[tuple[int, ...]]:

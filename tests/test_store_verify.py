@@ -54,7 +54,16 @@ def test_what_was_published_is_without_fault(store: Any) -> None:
     assert found.faults == []
     assert found.traces == 2
     tables = ("trace", "channel", "context", "entity", "bucket", "frame", "state", "node", "edge")
-    tables += (*REPEATED, *REPEATED.values(), "payload", "map", "map_node", "map_edge", "map_reach")
+    tables += (
+        *REPEATED,
+        *REPEATED.values(),
+        "payload",
+        "map",
+        "map_node",
+        "map_edge",
+        "map_reach",
+        "map_place",
+    )
     tables += ("frame_class", "lane_role", "recording", "config")
     count = sum(store.rows(f"SELECT count(*) FROM {table}").values[0][0] for table in tables)
     assert found.rows == count

@@ -63,6 +63,7 @@ from sgstore.lang.ir import (
     any_relation,
 )
 from sgstore.lang.syntax import CheckClause, MatchClause
+from sgstore.pair_numbers import as_written
 from sgstore.records import dataclass
 from sgstore.vocabulary import KINDS, RELATIONS, asking, entity_kinds, normalize_name
 
@@ -475,7 +476,7 @@ def _leaf(value: Bound) -> str:
         case EdgeRelation(edge=edge):
             text = f"type({edge})"
         case PairNumber(function=function, a=a, b=b):
-            text = f"{function}({a}, {b})"
+            text = as_written(function, a, b)
         case LabelTest(node=node, kinds=kinds):
             text = f"{node} is {kinds_text(kinds)}"
         case _:

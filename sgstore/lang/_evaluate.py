@@ -19,9 +19,9 @@ import numpy as np
 from sgstore.lang import ir as b
 from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit, Type
 from sgstore.lang._operators import OPERATORS, Column
-from sgstore.pair_numbers import COLUMNS, LANE_DIST, PairNumbers
+from sgstore.pair_numbers import COLUMNS, LANE_DIST, NEXT_PARTS, PART_DIST, WAYS, PairNumbers
 from sgstore.records import dataclass
-from sgstore.vocabulary import MAP_KINDS
+from sgstore.vocabulary import MAP_KINDS, SIGNALS
 
 if TYPE_CHECKING:
     from sgstore.graph import SceneGraph
@@ -123,8 +123,14 @@ class FrameView:
         """A number of a pair of entities; ``None`` where something that it needs is missing."""
         if name == LANE_DIST:
             reach = self.graph.reach
-            places = self._places.get(one, ()), self._places.get(other, ())
-            return None if reach is None else reach.distance(*places)
+            return None if reach is None else reach.between(self._on(one), self._on(other))
+        if name == PART_DIST:
+            reach = self.graph.reach
+            ends = (self._on(node, parts=True) for node in (one, other))
+            return None if reach is None else reach.between(*ends)
+        if name in NEXT_PARTS:
+            reach = self.graph.reach
+            return None if reach is None else reach.next(self._on(one), NEXT_PARTS[name])
         place = self.rows.get(other)
         if place is None or one not in self.rows:
             return None
@@ -149,9 +155,16 @@ class FrameView:
             self._pairs[key] = PairNumbers(own, boxes) if ahead else PairNumbers(boxes, own)
         return self._pairs[key][name]
 
+    def _on(self, node: int, *, parts: bool = False) -> Sequence[tuple[int, float, float]]:
+        """The stretches of lanes on which an entity, or with ``parts`` a part of the map, is."""
+        reach, kind = self.graph.reach, self.nodes[node]["kind"]
+        if node >= 0 or reach is None:
+            return self._stretches.get(node, ())
+        return reach.stretches(node) if parts or kind in SIGNALS else ()
+
     @cached_property
-    def _places(self) -> Mapping[int, Sequence[tuple[int, float]]]:
-        return self.graph.places()
+    def _stretches(self) -> Mapping[int, Sequence[tuple[int, float, float]]]:
+        return self.graph.stretches()
 
     @cached_property
     def _pairs(self) -> dict[tuple[int, bool], PairNumbers]:
@@ -436,7 +449,7 @@ def _of_crowd(part: b.Bound, key: str) -> Columns[Asked] | None:
                 return _of_others(part)
             name, truth = attribute.name, attribute.type is Type.boolean
             return lambda asked: asked[1].attribute(asked[0].view, name, truth=truth)
-        case b.PairNumber(function=function, a=one, b=other) if function != LANE_DIST:
+        case b.PairNumber(function=function, a=one, b=other) if function not in WAYS:
             if key not in {one, other}:
                 return _of_others(part)
             if one == other:

@@ -40,33 +40,6 @@ if TYPE_CHECKING:
     from sgstore.lang.ir import Edge
 
 
-def way_text(frame: str, a: str, b: str, conditions: Iterable[str]) -> str:
-    """Return the SQL of the distance along the lanes from a to b.
-
-    Parameters
-    ----------
-    frame, a, b : str
-        Columns of the frame and of both ids.
-    conditions : iterable of str
-        What is known of the rows ``"a"`` and ``"b"`` of ``lane_state`` besides, so that fewer are looked at.
-    """
-    # Each row is tied to the frame asked for, not to the others: that is what tells DuckDB where to begin.
-    more = "".join(f"\n        AND {condition}" for condition in conditions)
-    ahead = """min(CASE WHEN "way" >= 0 THEN "way" END)"""
-    behind = """max(CASE WHEN "way" < 0 THEN "way" END)"""
-    return f"""(
-    SELECT CASE WHEN {behind} IS NULL OR {ahead} <= -{behind} THEN {ahead} ELSE {behind} END
-    FROM (
-      SELECT "r"."start" + (CAST("b"."along" AS DOUBLE) - CAST("a"."along" AS DOUBLE)) AS "way"
-      FROM "lane_state" AS "a", "lane_state" AS "b", "frame" AS "f", "map_reach" AS "r"
-      WHERE "a"."frame_id" = {frame} AND "a"."node_id" = {a} AND "a"."is_own"
-        AND "b"."frame_id" = {frame} AND "b"."node_id" = {b} AND "b"."is_own"
-        AND "f"."frame_id" = {frame} AND "r"."map_id" = "f"."map_id"
-        AND "r"."src" = "a"."lane" AND "r"."dst" = "b"."lane"{more}
-    ) AS "ways" WHERE "way" BETWEEN -200 AND 200
-  )"""  # noqa: S608  columns that the compiler named
-
-
 def pair_column(name: str, a: str, b: str) -> str:
     """The column of a number of a pair, or of a column of one of the two (``a_x``: x of a)."""
     if stage_of(name):

@@ -11,11 +11,12 @@ from sgstore.lang._aggregates import AGGREGATES, aggregate, is_aggregate
 from sgstore.lang._bind_temporal import course
 from sgstore.lang._catalog import NODE_ATTRIBUTES, PAIR_NAMES, Type
 from sgstore.lang._hints import said_of
+from sgstore.lang._kinds import on_lanes
 from sgstore.lang._needs import in_range
 from sgstore.lang._operators import EXTREMES, NUMERIC, OF_TEXT, OF_TWO
 from sgstore.lang._symbols import CLASSES, Symbol, SymbolTable, abstraction_named, class_count
 from sgstore.lang.library import pattern_named, patterns, predicates
-from sgstore.pair_numbers import PAIR_FUNCTIONS
+from sgstore.pair_numbers import LANE_DIST, NEXT_PARTS, PAIR_FUNCTIONS, PART_DIST
 from sgstore.vocabulary import entity_kinds, normalize_name, relation_named
 
 if TYPE_CHECKING:
@@ -37,7 +38,10 @@ _COURSES: Final = (
 )
 _TEMPORAL: Final = frozenset(map(normalize_name, _COURSES))
 FUNCTIONS: Final = frozenset(
-    {*PAIR_FUNCTIONS, *NUMERIC, *EXTREMES, *OF_TWO, *_OTHERS, *AGGREGATES, *_COURSES}
+    {
+        *(*PAIR_FUNCTIONS, *NEXT_PARTS, *NUMERIC, *EXTREMES, *OF_TWO),
+        *(*_OTHERS, *AGGREGATES, *_COURSES),
+    }
 )
 
 MAX_CALLS: Final = 30
@@ -138,20 +142,48 @@ def _signature(name: str) -> str | None:
 def _pair(e: s.Call, names: SymbolTable) -> b.PairNumber:
     _expect(e, 2, 2, names)
     function = PAIR_NAMES[normalize_name(e.name)]
+    if function == LANE_DIST:
+        _refuse_sort(e, names)
     keys = [_entity(function, argument, names) for argument in e.arguments]
+    if function == LANE_DIST:
+        every = [names.scope.kinds(key).every for key in keys]
+        function = LANE_DIST if all(kinds & entity_kinds() for kinds in every) else PART_DIST
     return b.PairNumber(function, keys[0], keys[1])
+
+
+def _refuse_sort(e: s.Call, names: SymbolTable) -> None:
+    """Refuse ``lane_dist(e, junction)``, which is what one would write before one has seen the page."""
+    one, other = e.arguments
+    sorts = {normalize_name(sort): function for function, sort in NEXT_PARTS.items()}
+    if isinstance(other, s.Variable) and (sort := normalize_name(other.name)) in sorts:
+        try:
+            names.bind(other)
+        except QueryError as error:
+            who = one.name if isinstance(one, s.Variable) else "v"
+            hint = f"as far as the next one it is {sorts[sort]}({who})"
+            raise type(error)(error.reason, text=error.text, span=error.span, hint=hint) from None
+
+
+def _next_part(e: s.Call, names: SymbolTable) -> b.PairNumber:
+    _expect(e, 1, 1, names)
+    name = normalize_name(e.name)
+    function = next(one for one in NEXT_PARTS if normalize_name(one) == name)
+    node = _entity(function, e.arguments[0], names)
+    return b.PairNumber(function, node, node)
 
 
 def _entity(function: str, argument: s.Expression, names: SymbolTable) -> str:
     found = names.bind(argument)
+    takes = "an entity" if function in NEXT_PARTS else "two entities"
+    if function == LANE_DIST:
+        takes += ", lanes, roads, junctions or crosswalks"
     if not isinstance(found, b.NodeValue):
-        names.session.refuse(
-            f"{function}() takes two entities", argument.span, f"write {function}(a, b)"
-        )
+        form = f"{function}(a)" if function in NEXT_PARTS else f"{function}(a, b)"
+        names.session.refuse(f"{function}() takes {takes}", argument.span, f"write {form}")
     kinds = names.scope.kinds(found.node).every
-    if not kinds & entity_kinds():
+    if not kinds & (on_lanes() if function == LANE_DIST else entity_kinds()):
         names.session.refuse(
-            f"{function}() takes two entities, and this is a {' or '.join(sorted(kinds))}",
+            f"{function}() takes {takes}, and this is a {' or '.join(sorted(kinds))}",
             argument.span,
             "how an entity lies in a lane stands on the edge: (e)-[r:isIn]->(l), r.offset, r.along",
         )
@@ -268,6 +300,7 @@ def _meaning(argument: s.Expression, names: SymbolTable) -> Symbol:
 
 _FUNCTIONS: Final[dict[str, Callable[[s.Call, SymbolTable], b.Bound]]] = {
     **dict.fromkeys(PAIR_NAMES, _pair),
+    **dict.fromkeys(map(normalize_name, NEXT_PARTS), _next_part),
     **dict.fromkeys(NUMERIC, _numeric),
     **dict.fromkeys(EXTREMES, _extreme),
     **dict.fromkeys(OF_TWO, _of_two),

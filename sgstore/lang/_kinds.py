@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 from sgstore.lang._catalog import DisplayUnit, Home
 from sgstore.lang._operators import COMPARISONS, OPERATORS
 from sgstore.lang.ir import Bound, Operation, PairNumber, Scope, any_relation
+from sgstore.pair_numbers import PART_DIST
 from sgstore.quoting import literal
 from sgstore.vocabulary import KINDS, RELATIONS, entity_kinds
 
@@ -153,9 +154,18 @@ def entities_of_pairs(scope: Scope, _: Catalog) -> Scope:
     for condition in scope.where:
         if isinstance(condition, Operation) and condition.word in COMPARISONS:
             for pair in (p for operand in condition.operands for p in _needed(operand)):
+                may_be = on_lanes() if pair.function == PART_DIST else entity_kinds()
                 for key in {pair.a, pair.b} & set(nodes):
-                    nodes[key] = replace(nodes[key], kinds=nodes[key].kinds.only(entity_kinds()))
+                    nodes[key] = replace(nodes[key], kinds=nodes[key].kinds.only(may_be))
     return replace(scope, nodes=nodes)
+
+
+def on_lanes() -> frozenset[str]:
+    """The kinds of what lies on lanes: entities, and parts of the map."""
+    return entity_kinds() | _ON_LANES
+
+
+_ON_LANES: Final = frozenset({"lane", "road", "junction", "crosswalk"})
 
 
 def _needed(expression: Bound) -> Iterator[PairNumber]:

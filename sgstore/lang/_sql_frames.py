@@ -33,7 +33,6 @@ from sgstore.lang._formulas import (
     pair_text,
     raw_text,
     role_text,
-    way_text,
 )
 from sgstore.lang._kinds import Profile, homes_of, kind_conditions
 from sgstore.lang._operators import COMPARISONS, Column
@@ -54,12 +53,14 @@ from sgstore.lang._sql_masks import (
     told_kinds,
     with_blocks,
 )
+from sgstore.lang._sql_ways import WayEnd, way_text
 from sgstore.lang.ir import (
     BlockValue,
     Bound,
     EdgeAttribute,
     EdgeRelation,
     FrameAttribute,
+    GroupKey,
     NodeAttribute,
     NodeValue,
     Operation,
@@ -69,7 +70,7 @@ from sgstore.lang.ir import (
     blocks_of,
     nodes_of,
 )
-from sgstore.pair_numbers import LANE_DIST, PAIR_FUNCTIONS, needed_for, parts_of, stage_of
+from sgstore.pair_numbers import PAIR_FUNCTIONS, WAYS, needed_for, parts_of, stage_of
 from sgstore.quoting import quoted
 
 if TYPE_CHECKING:
@@ -88,7 +89,7 @@ Part = tuple[str, str, str]
 
 def _pairs(found: Iterable[Leaf]) -> list[PairNumber]:
     """The numbers of pairs among values that are computed in layers."""
-    return [leaf for leaf in found if isinstance(leaf, PairNumber) and leaf.function != LANE_DIST]
+    return [leaf for leaf in found if isinstance(leaf, PairNumber) and leaf.function not in WAYS]
 
 
 @dataclass(slots=True)
@@ -630,7 +631,7 @@ def _second_phase(
     if sql.found is not None:
         told |= {leaf: f"{PATTERN}.{quoted(name)}" for leaf, name in sql.found.told.items()}
     for leaf in needed:
-        if not (isinstance(leaf, PairNumber) and leaf.function != LANE_DIST):
+        if not (isinstance(leaf, PairNumber) and leaf.function not in WAYS):
             join.texts[leaf] = told.get(leaf) or _value_text(sql, join, scope, given, leaf)
 
 
@@ -717,8 +718,10 @@ def _value_text(  # noqa: PLR0911 - a case each
             return frame_text(leaf, FRAME, TRACE, MAP)
         case BlockValue():
             return _of_block(sql, join, given, leaf)
-        case PairNumber(a=a, b=b):  # along lanes; the others are computed in layers
-            return _of_ways(sql, join, scope, a, b)
+        case PairNumber():  # along lanes; the others are computed in layers
+            return _of_ways(sql, join, scope, leaf)
+        case GroupKey():  # which stands above groups only
+            raise TypeError(leaf)
 
 
 def _of_node(sql: SqlBuilder, join: Join, scope: Scope, node: str, attribute: Attribute) -> str:
@@ -753,16 +756,9 @@ def _of_edge(sql: SqlBuilder, join: Join, scope: Scope, key: str, leaf: EdgeAttr
     return lane_text(leaf, alias)
 
 
-def _of_ways(sql: SqlBuilder, join: Join, scope: Scope, a: str, b: str) -> str:
-    every = sql.catalog.moving | sql.catalog.fixed
-    conditions = [
-        condition
-        for alias, key in (('"a"', a), ('"b"', b))
-        for condition in kind_conditions(
-            scope.kinds(key), f'{alias}."kind"', f'{alias}."is_ego"', every
-        )
-    ]
-    return way_text(join.frame, join.nodes[a], join.nodes[b], conditions)
+def _of_ways(sql: SqlBuilder, join: Join, scope: Scope, leaf: PairNumber) -> str:
+    ends = [WayEnd(join.nodes[key], scope.kinds(key)) for key in (leaf.a, leaf.b)]
+    return way_text(leaf.function, join.frame, (ends[0], ends[1]), sql.catalog)
 
 
 def _of_block(sql: SqlBuilder, join: Join, given: SharedRelation | None, leaf: BlockValue) -> str:
@@ -817,7 +813,7 @@ def _valued(leaf: Leaf) -> frozenset[str]:
         case NodeAttribute(node=node, attribute=attribute):
             return frozenset() if attribute.unit in _BARE else frozenset({node})
         case PairNumber(function=function, a=a, b=b):
-            return frozenset() if function == LANE_DIST else frozenset({a, b})
+            return frozenset() if function in WAYS else frozenset({a, b})
         case _:
             return frozenset()
 

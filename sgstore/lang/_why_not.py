@@ -20,6 +20,7 @@ from sgstore.lang._evaluate import Binding, FrameView
 from sgstore.lang._formulas import leaves
 from sgstore.lang._operators import INFIX
 from sgstore.lang._search import ScopeSearch, expression
+from sgstore.pair_numbers import as_written
 from sgstore.vocabulary import KINDS, RELATIONS, SUPER_KINDS, entity_kinds
 
 if TYPE_CHECKING:
@@ -181,7 +182,7 @@ class Writer:
             case b.EdgeRelation(edge=edge):
                 text = f"type({self.edge_name(edge)})"
             case b.PairNumber(function=function, a=one, b=other):
-                text = f"{function}({self.name(one)}, {self.name(other)})"
+                text = as_written(function, self.name(one), self.name(other))
             case b.TraceAttribute(attribute=attribute):
                 text = f"trace.{attribute.name}"
             case b.FrameAttribute():

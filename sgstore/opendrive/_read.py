@@ -167,6 +167,7 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
     beside = [*crosswalks.shapes, *poles, *scenery.shapes]
     shapes[len(nodes) - len(beside) :] = beside
     document.settle()
+    signal, lane, s = signals.places(first_signal)
     return RoadMap(
         name=name or _header_name(document) or _short_digest(text),
         text=text,
@@ -179,6 +180,8 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
         junction_types=junction_types(document),
         controllers=read_controllers(document),
         warnings=[*odd_sections(document), *network.warnings],
+        stops=(signal, lane, ribbons.along_at(lane, s)),
+        stop_lines=signals.stop_lines(first_signal),
         variant=signals.told,
     )
 

@@ -233,8 +233,14 @@ _LIGHT: Final = re.compile(r"10000(0[1-9]|1\d|2\d)$")
 """Codes of traffic lights in the catalogue that OpenDRIVE's country ``OpenDRIVE`` means."""
 _NOT_LIGHTS: Final = {"1000003", "1000004"}
 """Crossings for people and bicycles, painted on the road."""
+_STOP_LINE: Final = "294"
+"""Code of the line at which one stops: StVO (Germany), which other countries' maps use, too."""
 _SPEED_OBJECT: Final = re.compile(r"speed_(\d+(?:\.\d+)?)", re.IGNORECASE)
 _STOP_STENCIL: Final = "stencil_stop"
+
+
+Stops = frozenset[tuple[int, float]]
+"""Lanes, counted from 0, and places ``s`` on their roads; m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,22 +250,36 @@ class Signals:
     Attributes
     ----------
     nodes : MapNodes
-    lanes : list of frozenset of int
-        Lanes, counted from 0, that each applies to.
+    lanes : list of Stops
+        Lanes that each applies to, and where.
+    codes : list of str
+        The type of each in the file.
     told : str
         Which kinds are what the client says that they are, and how orientations are read if that is not as
         the standard says and matters; empty: none, and it is.
     """
 
     nodes: MapNodes
-    lanes: list[frozenset[int]]
+    lanes: list[Stops]
+    codes: list[str]
     told: str = ""
 
     def edges(self, first: int) -> Edge:
         """``controlsTrafficOf``; ``first`` is the row of the first signal among the nodes."""
-        pairs = [(first + row, lane) for row, lanes in enumerate(self.lanes) for lane in lanes]
+        found = {(first + row, lane) for row, lanes in enumerate(self.lanes) for lane, _ in lanes}
+        pairs = sorted(found)
         signal, lane = np.array(pairs, np.int64).reshape(-1, 2).T
         return ("controlsTrafficOf", signal, FIRST_LANE + lane)
+
+    def places(self, first: int) -> tuple[Ints, Ints, Floats]:
+        """Rows of signals among the nodes, lanes that they apply to, and the places ``s`` on their roads."""
+        rows = [(row, *one) for row, lanes in enumerate(self.lanes) for one in sorted(lanes)]
+        row, lane = np.array([one[:2] for one in rows], np.int64).reshape(-1, 2).T
+        return first + row, lane, np.array([s for *_, s in rows], np.float64)
+
+    def stop_lines(self, first: int) -> Ints:
+        """Rows, among the nodes, of those that are painted stop lines."""
+        return first + np.array([r for r, c in enumerate(self.codes) if c == _STOP_LINE], np.int64)
 
 
 def read_signals(document: Document, plan: PlanView, network: Network, signs: Signs) -> Signals:
@@ -272,6 +292,7 @@ def read_signals(document: Document, plan: PlanView, network: Network, signs: Si
     return Signals(
         chained([part.nodes for part in parts]),
         [s for p in parts for s in p.lanes],
+        [code for p in parts for code in p.codes],
         " ".join(filter(None, (parts[0].told, other))),
     )
 
@@ -398,28 +419,33 @@ def _elements(
     road, s = document[kind].road, document.rough_numbers(kind, "s")
     reach.doubts.kinds = dict(zip(ids, kinds, strict=True))
     referred = _referred(document, reach)
-    lanes = [
-        reach.valid((kind, row, name), (int(road[row]), float(s[row])))
-        | referred.get(name, frozenset())
-        for row, name in zip(rows.tolist(), ids, strict=True)
-    ]
+    lanes: list[Stops] = []
+    for row, name in zip(rows.tolist(), ids, strict=True):
+        place = int(road[row]), float(s[row])
+        own = _stops(reach.valid((kind, row, name), place), place)
+        lanes.append(own | referred.get(name, frozenset()))
     columns = node_columns(document, plan, kind, rows)
     nodes = MapNodes.of(kinds, ids, speed_limit=np.array(limits), **columns)
-    return Signals(nodes, lanes, repr(told) if told else "")
+    return Signals(nodes, lanes, codes, repr(told) if told else "")
 
 
-def _referred(document: Document, reach: _Reach) -> dict[str, frozenset[int]]:
-    """Id of a signal → lanes that references to it, anywhere in the map, make it apply to."""
+def _stops(lanes: frozenset[int], place: tuple[int, float]) -> Stops:
+    return frozenset((lane, place[1]) for lane in lanes)
+
+
+def _referred(document: Document, reach: _Reach) -> dict[str, Stops]:
+    """Id of a signal → lanes that references to it, anywhere in the map, make it apply to, and where."""
     kind = "road/signalReference"
     table = document[kind]
     s = document.rough_numbers(kind, "s")
-    found: dict[str, set[frozenset[int]]] = {}
+    found: dict[str, Stops] = {}
     for row in np.flatnonzero(np.isfinite(s)).tolist():
         attributes = table.attributes[row]
         place = (int(table.road[row]), float(s[row]))
         name = attributes.get("id", "")
-        found.setdefault(name, set()).add(reach.valid((kind, row, name), place))
-    return {name: frozenset[int]().union(*parts) for name, parts in found.items()}
+        lanes = _stops(reach.valid((kind, row, name), place), place)
+        found[name] = found.get(name, frozenset()) | lanes
+    return found
 
 
 def _limit(attributes: dict[str, str]) -> float:
@@ -436,7 +462,7 @@ def _signal_objects(document: Document, plan: PlanView, reach: _Reach) -> Signal
     rows = standing(document, kind, np.flatnonzero(named), reach.warnings)
     kinds: list[str] = []
     limits: list[float] = []
-    lanes: list[frozenset[int]] = []
+    lanes: list[Stops] = []
     s = document.rough_numbers(kind, "s")
     for row in rows.tolist():
         attributes = table.attributes[row]
@@ -445,7 +471,8 @@ def _signal_objects(document: Document, plan: PlanView, reach: _Reach) -> Signal
         limits.append(speed(limit[1], "km/h") if limit else np.nan)
         left = attributes.get("orientation", "") == "+"
         place = (int(table.road[row]), float(s[row]))
-        lanes.append(reach.on_side(place, left=left))
+        lanes.append(_stops(reach.on_side(place, left=left), place))
     ids = [table.attributes[row].get("id", "") for row in rows.tolist()]
     columns = node_columns(document, plan, kind, rows)
-    return Signals(MapNodes.of(kinds, ids, speed_limit=np.array(limits), **columns), lanes)
+    nodes = MapNodes.of(kinds, ids, speed_limit=np.array(limits), **columns)
+    return Signals(nodes, lanes, [""] * len(ids))

@@ -3,7 +3,6 @@
 from ._arrays import COLUMNS as COLUMNS
 from ._arrays import PairNumbers as PairNumbers
 from ._arrays import gap as gap
-from ._boxes import LANE_DIST as LANE_DIST
 from ._declared import PairFunction as PairFunction
 from ._table import PAIR_FUNCTIONS as PAIR_FUNCTIONS
 from ._table import columns_needed as columns_needed
@@ -12,13 +11,22 @@ from ._table import pair_sql as pair_sql
 from ._table import pairs_view as pairs_view
 from ._table import parts_of as parts_of
 from ._table import stage_of as stage_of
+from ._ways import LANE_DIST as LANE_DIST
+from ._ways import NEXT_PARTS as NEXT_PARTS
+from ._ways import PART_DIST as PART_DIST
+from ._ways import WAYS as WAYS
+from ._ways import as_written as as_written
 
 __all__ = [
     "COLUMNS",
     "LANE_DIST",
+    "NEXT_PARTS",
     "PAIR_FUNCTIONS",
+    "PART_DIST",
     "PairFunction",
     "PairNumbers",
+    "WAYS",
+    "as_written",
     "columns_needed",
     "gap",
     "needed_for",

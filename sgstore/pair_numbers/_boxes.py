@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from sgstore.pair_numbers._declared import PairFunction
+from sgstore.pair_numbers._ways import LANE_DIST
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,9 +20,6 @@ GAP: Final = (
     + ")) END"
 )
 """The distance of b's centre from the octagon."""
-
-LANE_DIST: Final = "lane_dist"
-"""The number that is no expression: it is looked up, by lanes and ways between them."""
 
 BEYOND: Final = {
     "out1": "abs(lon) - reach1",
@@ -127,7 +125,7 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
         worse="low",
     ),
     LANE_DIST: PairFunction(
-        "from centre to centre along the lanes, negative where b is behind",
+        "from a to b along the lanes, negative where b is behind, 0 within a part of the map",
         "m",
         "",
         note="NULL beyond 200 m",

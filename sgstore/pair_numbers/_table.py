@@ -11,6 +11,7 @@ import sgstore.pair_numbers._crossing as crossing
 import sgstore.pair_numbers._encounter as encounter
 import sgstore.pair_numbers._following as following
 import sgstore.pair_numbers._rss as rss
+from sgstore.pair_numbers._ways import WAYS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -49,7 +50,7 @@ def stage_of(name: str) -> int:
 @cache
 def needed_for(name: str) -> frozenset[str]:
     """A number of a pair with all that it is made of; nothing for one that is looked up."""
-    if name == boxes.LANE_DIST:
+    if name in WAYS:
         return frozenset()
     if name not in EXPRESSIONS:
         return frozenset({name})

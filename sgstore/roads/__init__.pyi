@@ -39,6 +39,7 @@ from ._map import point_shapes as point_shapes
 from ._map import summary as summary
 from ._map import turn_words as turn_words
 from ._map import within as within
+from ._places import MapPlaces as MapPlaces
 from ._ribbons import LanePoints as LanePoints
 from ._ribbons import Ribbons as Ribbons
 from ._ribbons import conflicts as conflicts
@@ -59,6 +60,7 @@ __all__ = [
     "MAX_POINTS",
     "MapEdges",
     "MapNodes",
+    "MapPlaces",
     "OFF_ROAD",
     "OF_LANES",
     "PlainLane",

@@ -16,6 +16,14 @@ from numpy.typing import NDArray
 
 from sgstore.columns import taken
 from sgstore.roads._footprints import LaneIndex
+from sgstore.roads._places import (
+    STOP_LINE,
+    MapPlaces,
+    made_of_lanes,
+    of_signals,
+    on_crosswalks,
+    together,
+)
 from sgstore.roads._ribbons import LanePoints, Ribbons, lane_polygons, waypoints
 from sgstore.vocabulary import DRIVING, ENTITY_KINDS, KIND_CODE, KINDS, RELATION_CODE, SIGNALS
 
@@ -274,6 +282,10 @@ class RoadMap:
     lane_changes : LaneChanges, optional
     road_types, junction_types, controllers : mapping, optional
     warnings : iterable of str, optional
+    stops : (m,) int64, int64 and float64, optional
+        Signals, as columns among the nodes, lanes that they apply to, counted from 0, and where along these; m.
+    stop_lines : (n,) int64, optional
+        Columns of the signals that are painted stop lines.
     variant : str, optional
         In what it differs from the map that the text alone describes.
 
@@ -320,6 +332,8 @@ class RoadMap:
         junction_types: Mapping[str, str] | None = None,
         controllers: Mapping[str, tuple[str, ...]] | None = None,
         warnings: Iterable[str] = (),
+        stops: tuple[Ints, Ints, Floats] | None = None,
+        stop_lines: Ints | None = None,
         variant: str = "",
     ) -> None:
         self.name = name
@@ -334,6 +348,9 @@ class RoadMap:
         self.controllers = dict(controllers or {})
         self.warnings = tuple(warnings)
         self._shapes = shapes
+        nothing = np.zeros(0, np.int64)
+        self._stops = stops or (nothing, nothing, np.zeros(0))
+        self._stop_lines = nothing if stop_lines is None else stop_lines
         self._variant = variant
         self._lanes = len(ribbons.offsets) - 1
 
@@ -497,6 +514,8 @@ class RoadMap:
             junction_types=self.junction_types,
             controllers=self.controllers,
             warnings=self.warnings,
+            stops=self._stops,
+            stop_lines=self._stop_lines,
             variant=f"{self._variant}{_MERGED}",
         )
 
@@ -546,6 +565,35 @@ class RoadMap:
         starts = np.concatenate([np.zeros(len(every)), start, -start])
         order = np.lexsort((starts, other, lane))
         return _FIRST_LANE - lane[order], _FIRST_LANE - other[order], starts[order]
+
+    @cached_property
+    def places(self) -> MapPlaces:
+        """Where junctions, crosswalks and signals lie along the lanes.
+
+        Of a map without sections there is none, as of :attr:`reach`.
+        """
+        nodes, lanes = self.nodes, slice(1, 1 + self._lanes)
+        if not self._lanes or _MERGED in self._variant:
+            return MapPlaces.none()
+        what = [KINDS[int(code)] for code in nodes.kind]
+        columns = {
+            of: {nodes.name[column]: column for column, kind in enumerate(what) if kind == of}
+            for of in ("road", "junction")
+        }
+        columns["lane"] = {str(column): column for column in range(1, lanes.stop)}
+        names = {"lane": list(columns["lane"]), "road": nodes.road[lanes]}
+        names["junction"] = nodes.junction[lanes]
+        wholes = [made_of_lanes(self.ribbons, of, names[of], columns[of]) for of in columns]
+        for column in self._stop_lines.tolist():
+            what[column] = STOP_LINE
+        crosswalks, _ = self._crosswalks
+        shapes, z = self._shapes[crosswalks], nodes.z[crosswalks]
+        control = self.edges.relation == RELATION_CODE["controlsTrafficOf"]
+        applies = -1 - self.edges.src[control], _FIRST_LANE - self.edges.dst[control]
+        signals = of_signals(self.ribbons, names["junction"], what, applies, self._stops)
+        return together(
+            [*wholes, on_crosswalks(self.ribbons, crosswalks, shapes, z, STOREY), signals]
+        )
 
     @cached_property
     def _index(self) -> LaneIndex:

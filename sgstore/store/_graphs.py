@@ -118,6 +118,9 @@ SELECT node_id, kind, false AS is_ego, name, true AS is_static, x, y, z, degrees
 FROM map_node WHERE map_id = $map_id
 """
 _MAP_REACH: Final = "SELECT src, dst, start FROM map_reach WHERE map_id = $map_id"
+_MAP_PLACES: Final = (
+    'SELECT node_id, what, lane, start, "end" FROM map_place WHERE map_id = $map_id'
+)
 
 FIRST: Final = 2_000
 """Frames of any traces that are read first; then as many as have about so many edges together:"""
@@ -360,7 +363,8 @@ def _map_records(connection: DuckDBPyConnection, map_id: int) -> MapRecords:
         of[name].astype(np.int64) for of in (edges, reach) for name in ("src", "dst")
     )
     relation = codes_of(connection, "relation")[edges["relation"]]
-    starts = LaneDistances(along, other, reach["start"].astype(np.float64))
+    parts = connection.execute(_MAP_PLACES, where).fetchall()
+    starts = LaneDistances(along, other, reach["start"].astype(np.float64), parts)
     return MapRecords(nodes.__getitem__, src, relation, dst, starts)
 
 

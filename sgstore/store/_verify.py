@@ -231,6 +231,15 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
         LEFT JOIN map_node b ON b.map_id = r.map_id AND b.node_id = r.dst
         WHERE a.kind IS DISTINCT FROM 'lane' OR b.kind IS DISTINCT FROM 'lane'""",
     ),
+    (
+        "map",
+        "a place along lanes of a map is of what is no part of it, or on what is no lane",
+        """
+        SELECT NULL FROM map_place p
+        LEFT JOIN map_node a ON a.map_id = p.map_id AND a.node_id = p.node_id
+        LEFT JOIN map_node b ON b.map_id = p.map_id AND b.node_id = p.lane
+        WHERE a.kind IS NULL OR b.kind IS DISTINCT FROM 'lane'""",
+    ),
 )
 """What is looked at, what is wrong where a statement gives rows, and that statement: ids of traces at fault."""
 

@@ -390,6 +390,7 @@ def _map_tables(road_map: RoadMap) -> dict[str, Columns]:
     columns |= {"node_id": -1 - np.arange(count), "kind": nodes.kind}
     edges, kind = road_map.edges, road_map.nodes.kind
     src, dst, start = road_map.reach
+    places = road_map.places
     return {
         "map": {name: texts([getattr(road_map, name)]) for name in ("digest", "name", "text")},
         "map_node": columns,
@@ -401,4 +402,11 @@ def _map_tables(road_map: RoadMap) -> dict[str, Columns]:
             "dst_kind": kind[-1 - edges.dst],
         },
         "map_reach": {"src": src, "dst": dst, "start": start},
+        "map_place": {
+            "node_id": -1 - places.part,
+            "what": texts(places.what),
+            "lane": -2 - places.lane,
+            "start": places.start,
+            "end": places.end,
+        },
     }

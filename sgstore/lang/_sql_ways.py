@@ -1,0 +1,155 @@
+"""SQL of distances along the lanes: between two nodes, and to the next part of the map of one sort.
+
+A node is on stretches of lanes: an entity in one place of each of its own lanes, a light or a sign where the
+lanes that it controls are waited on, a part of the map where ``map_place`` has it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from sgstore.lang._kinds import kind_conditions
+from sgstore.lang._sql_masks import in_mask
+from sgstore.pair_numbers import LANE_DIST, NEXT_PARTS, PART_DIST
+from sgstore.quoting import literal
+from sgstore.vocabulary import SIGNALS, entity_kinds
+
+if TYPE_CHECKING:
+    from sgstore.lang._catalog import Catalog
+    from sgstore.lang.ir import Kinds
+
+_SIGNALS: Final = frozenset(SIGNALS)
+
+
+@dataclass(frozen=True, slots=True)
+class WayEnd:
+    """A node that a way leads from or to: the column of its id, and what it may be."""
+
+    node: str
+    kinds: Kinds
+
+
+def way_text(function: str, frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog) -> str:
+    """Return the SQL of a number of :data:`sgstore.pair_numbers.WAYS`.
+
+    Parameters
+    ----------
+    function : str
+    frame : str
+        The column of the frame.
+    ends : (WayEnd, WayEnd)
+        The same twice, where it is a function of one.
+    catalog : Catalog
+    """
+    if function in NEXT_PARTS:
+        return _next_text(frame, ends[0], NEXT_PARTS[function], catalog)
+    signals = _SIGNALS & (catalog.moving | catalog.fixed | catalog.mapped)
+    if function == LANE_DIST and not any(end.kinds.every & signals for end in ends):
+        return _between_entities(frame, ends, catalog)
+    return _between(frame, ends, catalog, parts=function == PART_DIST)
+
+
+_AHEAD: Final = """min(CASE WHEN "way" >= 0 THEN "way" END)"""
+_BEHIND: Final = """max(CASE WHEN "way" < 0 THEN "way" END)"""
+
+
+def _between_entities(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog) -> str:
+    """The distance between two places, which need no stretches."""
+    conditions = [
+        condition
+        for alias, end in zip("ab", ends, strict=True)
+        for condition in _kinds_of(end, alias, catalog)
+    ]
+    a, b = (end.node for end in ends)
+    # Each row is tied to the frame asked for, not to the others: that is what tells DuckDB where to begin.
+    more = "".join(f"\n        AND {condition}" for condition in conditions)
+    return f"""(
+    SELECT CASE WHEN {_BEHIND} IS NULL OR {_AHEAD} <= -{_BEHIND} THEN {_AHEAD} ELSE {_BEHIND} END
+    FROM (
+      SELECT "r"."start" + (CAST("b"."along" AS DOUBLE) - CAST("a"."along" AS DOUBLE)) AS "way"
+      FROM "lane_state" AS "a", "lane_state" AS "b", "frame" AS "f", "map_reach" AS "r"
+      WHERE "a"."frame_id" = {frame} AND "a"."node_id" = {a} AND "a"."is_own"
+        AND "b"."frame_id" = {frame} AND "b"."node_id" = {b} AND "b"."is_own"
+        AND "f"."frame_id" = {frame} AND "r"."map_id" = "f"."map_id"
+        AND "r"."src" = "a"."lane" AND "r"."dst" = "b"."lane"{more}
+    ) AS "ways" WHERE "way" BETWEEN -200 AND 200
+  )"""  # noqa: S608  columns that the compiler named
+
+
+def _between(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog, *, parts: bool) -> str:
+    """The distance from the end of one stretch to the start of the other, 0 where they overlap."""
+    one, other = (_stretches(frame, end, catalog, parts=parts) for end in ends)
+    near = '"r"."start" + ("b"."first" - "a"."last")'
+    far = '"r"."start" + ("b"."last" - "a"."first")'
+    return f"""(
+    SELECT CASE WHEN {_BEHIND} IS NULL OR {_AHEAD} <= -{_BEHIND} THEN {_AHEAD} ELSE {_BEHIND} END
+    FROM (
+      SELECT CASE WHEN {near} >= 0 THEN {near} WHEN {far} < 0 THEN {far} ELSE 0 END AS "way"
+      FROM ({one}) AS "a", ({other}) AS "b", "frame" AS "f", "map_reach" AS "r"
+      WHERE "f"."frame_id" = {frame} AND "r"."map_id" = "f"."map_id"
+        AND "r"."src" = "a"."lane" AND "r"."dst" = "b"."lane"
+    ) AS "ways" WHERE "way" BETWEEN -200 AND 200
+  )"""  # noqa: S608  columns that the compiler named
+
+
+def _next_text(frame: str, end: WayEnd, what: str, catalog: Catalog) -> str:
+    """The distance to the next part of the map of one sort, 0 on it."""
+    places = _stretches(frame, end, catalog, parts=False)
+    return f"""(
+    SELECT min(CASE WHEN "near" < 0 THEN 0 ELSE "near" END)
+    FROM (
+      SELECT "r"."start" + ("p"."start" - "a"."last") AS "near",
+        "r"."start" + ("p"."end" - "a"."first") AS "far"
+      FROM ({places}) AS "a", "frame" AS "f", "map_reach" AS "r", "map_place" AS "p"
+      WHERE "f"."frame_id" = {frame} AND "r"."map_id" = "f"."map_id"
+        AND "r"."src" = "a"."lane" AND "r"."start" >= 0
+        AND "p"."map_id" = "f"."map_id" AND "p"."lane" = "r"."dst" AND "p"."what" = {literal(what)}
+    ) AS "ways" WHERE "far" >= 0 AND "near" <= 200
+  )"""  # noqa: S608  columns that the compiler named
+
+
+def _stretches(frame: str, end: WayEnd, catalog: Catalog, *, parts: bool) -> str:
+    """A relation of the lanes on which a node is, from where to where along them."""
+    kinds, held = end.kinds.every, catalog.moving | catalog.fixed
+    found: list[str] = []
+    if kinds & entity_kinds() - _SIGNALS:
+        more = "".join(f" AND {one}" for one in _kinds_of(end, "s", catalog))
+        along = 'CAST("s"."along" AS DOUBLE)'
+        found.append(
+            f'SELECT "s"."lane" AS "lane", {along} AS "first", {along} AS "last" FROM "lane_state" AS "s"'  # noqa: S608
+            f' WHERE "s"."frame_id" = {frame} AND "s"."node_id" = {end.node} AND "s"."is_own"{more}'
+        )
+    if kinds & _SIGNALS & held:
+        found.append(_controlled(frame, end.node, kinds & _SIGNALS & held))
+    if parts or kinds & _SIGNALS & catalog.mapped:
+        signs = ", ".join(map(literal, (*SIGNALS, "stop_line")))
+        more = "" if parts else f' AND "p"."what" IN ({signs})'
+        found.append(
+            'SELECT "p"."lane" AS "lane", "p"."start" AS "first", "p"."end" AS "last"'  # noqa: S608
+            ' FROM "frame" AS "g", "map_place" AS "p"'
+            f' WHERE "g"."frame_id" = {frame} AND "p"."map_id" = "g"."map_id"'
+            f' AND "p"."node_id" = {end.node}{more}'
+        )
+    nowhere = 'SELECT "lane", "start" AS "first", "end" AS "last" FROM "map_place" WHERE FALSE'
+    return "\n        UNION ALL ".join(found or [nowhere])
+
+
+def _controlled(frame: str, node: str, kinds: frozenset[str]) -> str:
+    """Where the lanes that a light or a sign controls are waited on: as the map says, else at a junction."""
+    at = """coalesce("p"."start", CASE WHEN "m"."junction" IS NOT NULL THEN 0 ELSE "m"."length" END)"""
+    signals = ", ".join(literal(kind) for kind in SIGNALS if kind in kinds)
+    return f"""SELECT "c"."dst" AS "lane", {at} AS "first", {at} AS "last"
+        FROM "edge" AS "c" JOIN "bucket" AS "g" ON "g"."bucket" = "c"."bucket"
+          JOIN "map_node" AS "m" ON "m"."map_id" = "g"."map_id" AND "m"."node_id" = "c"."dst"
+          LEFT JOIN "map_place" AS "p" ON "p"."map_id" = "g"."map_id" AND "p"."lane" = "c"."dst"
+            AND "p"."what" = CAST("c"."src_kind" AS VARCHAR)
+        WHERE "c"."relation" = 'controlsTrafficOf' AND "c"."bucket" = {frame} >> 6 AND "c"."src" = {node}
+          AND "c"."src_kind" IN ({signals}) AND {in_mask('"c"', frame)}"""  # noqa: S608  columns that the compiler named
+
+
+def _kinds_of(end: WayEnd, alias: str, catalog: Catalog) -> list[str]:
+    """What is known of the rows of ``lane_state`` of an entity besides, so that fewer are looked at."""
+    kinds = end.kinds.only(entity_kinds() - _SIGNALS)
+    held = catalog.moving | catalog.fixed
+    return kind_conditions(kinds, f'"{alias}"."kind"', f'"{alias}"."is_ego"', held)

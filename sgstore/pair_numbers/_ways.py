@@ -1,0 +1,33 @@
+"""Distances along the lanes, which are no expressions: they are looked up, by lanes and ways between them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+LANE_DIST: Final = "lane_dist"
+"""From one entity to another."""
+PART_DIST: Final = "part_dist"
+"""``lane_dist`` where one of the two is a part of the map, which is told by the labels of a query."""
+
+NEXT_PARTS: Final[Mapping[str, str]] = {
+    "to_junction": "junction",
+    "to_crosswalk": "crosswalk",
+    "to_stop_line": "stop_line",
+    "to_traffic_light": "traffic_light",
+    "to_stop_sign": "stop_sign",
+    "to_yield_sign": "yield_sign",
+    "to_speed_limit": "speed_limit",
+}
+"""Functions of one entity → the sort of the part of the map that comes next along the lanes."""
+
+WAYS: Final = frozenset({LANE_DIST, PART_DIST, *NEXT_PARTS})
+
+
+def as_written(name: str, a: str, b: str) -> str:
+    """A number of a pair as the language has it, given the names of both entities."""
+    if name in NEXT_PARTS:
+        return f"{name}({a})"
+    return f"{LANE_DIST if name == PART_DIST else name}({a}, {b})"

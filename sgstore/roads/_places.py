@@ -1,0 +1,180 @@
+"""Where junctions, crosswalks, signals and stop lines lie along the lanes of a map.
+
+A road or a junction lies on its lanes, all along, and so does a lane on itself. A crosswalk lies where it
+covers the centre line of a lane of its storey. A signal lies on the lanes that it applies to, in one place:
+in a junction at the start of the lane, for that is where one waits, whatever the place of the pole; else where
+the map has it, and where the map does not say it, at the end of the lane.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import shapely
+
+from sgstore.columns import chained
+from sgstore.roads._ribbons import centre_lines
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from sgstore.roads._ribbons import Ribbons
+    from sgstore.world import Floats, Ints
+
+
+STOP_LINE: Final = "stop_line"
+"""What a signal is called that is a line painted on the road."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapPlaces:
+    """Stretches of lanes on which parts of a map lie, ordered by part, lane and start; shape (n,).
+
+    Attributes
+    ----------
+    part : int64
+        Columns of the parts among the nodes.
+    what : tuple of str
+        ``stop_line``, else the kind of the part.
+    lane : int64
+        Lanes, counted from 0.
+    start, end : float64
+        Along the centre line of the lane; m.
+    """
+
+    part: Ints
+    what: tuple[str, ...]
+    lane: Ints
+    start: Floats
+    end: Floats
+
+    def __len__(self) -> int:
+        return len(self.part)
+
+    def rows(self) -> Iterator[tuple[int, str, int, float, float]]:
+        """Node id, sort, node id of the lane, start and end of each."""
+        ids = ((-1 - self.part).tolist(), self.what, (-2 - self.lane).tolist())
+        return zip(*ids, self.start.tolist(), self.end.tolist(), strict=True)
+
+    @classmethod
+    def none(cls) -> MapPlaces:
+        """No part lies on any lane."""
+        no_parts, nowhere = np.zeros(0, np.int64), np.zeros(0)
+        return cls(no_parts, (), no_parts, nowhere, nowhere)
+
+    @classmethod
+    def of(
+        cls, part: Ints, what: Sequence[str], lane: Ints, start: Floats, end: Floats
+    ) -> MapPlaces:
+        """Stretches from columns in any order."""
+        order = np.lexsort((end, start, lane, part))
+        told = tuple(what[int(row)] for row in order)
+        return cls(part[order], told, lane[order], start[order], end[order])
+
+
+def made_of_lanes(
+    ribbons: Ribbons, what: str, names: Sequence[str], column: dict[str, int]
+) -> MapPlaces:
+    """Lanes, roads or junctions on their lanes, all along.
+
+    Parameters
+    ----------
+    ribbons : Ribbons
+    what : str
+    names : sequence of str
+        The one that each lane belongs to; empty: none.
+    column : dict of str to int
+        The column of each among the nodes.
+    """
+    found = [(column[name], lane) for lane, name in enumerate(names) if name in column]
+    part, lane = np.array(found, np.int64).reshape(-1, 2).T
+    return MapPlaces.of(part, [what] * len(part), lane, np.zeros(len(lane)), ribbons.lengths[lane])
+
+
+def on_crosswalks(
+    ribbons: Ribbons, columns: Ints, shapes: Any, z: Floats, storey: float
+) -> MapPlaces:
+    """Crosswalks on the lanes that they cross, from the first place in them to the last.
+
+    Parameters
+    ----------
+    ribbons : Ribbons
+    columns : (n,) int64
+        Of the crosswalks among the nodes.
+    shapes : (n,) object
+        Their geometries.
+    z : (n,) float64
+        Their heights; m. NaN: on any storey.
+    storey : float
+        Least difference of height between two storeys; m.
+    """
+    lines = centre_lines(ribbons)
+    lane, place = shapely.STRtree(shapes).query(lines, predicate="intersects")
+    inside: Any = shapely.intersection(lines[lane], shapes[place])
+    points, of = shapely.get_coordinates(inside, return_index=True)
+    if not len(of):
+        return MapPlaces.none()
+    at: Any = shapely.line_locate_point(lines[lane[of]], shapely.points(points))
+    starts = np.flatnonzero(np.diff(of, prepend=-1))
+    ends = [np.minimum.reduceat(at, starts), np.maximum.reduceat(at, starts)]
+    row = of[starts]
+    lane, place = lane[row], place[row]
+    start, end = (_by_length(ribbons, lane, along) for along in ends)
+    level = np.abs(ribbons.at(lane, (start + end) / 2).z - z[place])
+    on = np.flatnonzero(~(level > storey))
+    what = ["crosswalk"] * len(on)
+    return MapPlaces.of(columns[place[on]], what, lane[on], start[on], end[on])
+
+
+def _by_length(ribbons: Ribbons, lane: Ints, at: Floats) -> Floats:
+    """Lengths of centre lines up to places that are told by the lengths of their polylines; m."""
+    x, y = (ribbons.left_x + ribbons.right_x) / 2, (ribbons.left_y + ribbons.right_y) / 2
+    found = np.empty(len(lane))
+    for one in np.unique(lane).tolist():
+        own = slice(ribbons.offsets[one], ribbons.offsets[one + 1])
+        steps = np.hypot(np.diff(x[own]), np.diff(y[own]))
+        rows = lane == one
+        run = np.concatenate((np.zeros(1), np.cumsum(steps)))
+        found[rows] = np.interp(at[rows], run, ribbons.along[own])
+    return found
+
+
+def of_signals(
+    ribbons: Ribbons,
+    junction: Sequence[str],
+    what: Sequence[str],
+    applies: tuple[Ints, Ints],
+    stops: tuple[Ints, Ints, Floats],
+) -> MapPlaces:
+    """Signals on the lanes that they apply to.
+
+    Parameters
+    ----------
+    ribbons : Ribbons
+    junction : sequence of str
+        The junction of each lane; empty: none.
+    what : sequence of str
+        What each node is called.
+    applies : (n,) int64 twice
+        Signals, as columns among the nodes, and lanes that they apply to.
+    stops : (m,) int64, int64 and float64
+        Signals, lanes, and where along these the map has them; m.
+    """
+    within = np.array([bool(name) for name in junction], np.bool_)
+    told = {*zip(*(column.tolist() for column in stops[:2]), strict=True)}
+    pairs = {*zip(*(column.tolist() for column in applies), strict=True)}
+    rows = [(*one, 0.0) for one in pairs if within[one[1]]]
+    rows += [(*one, float(ribbons.lengths[one[1]])) for one in pairs - told if not within[one[1]]]
+    columns = zip(*(column.tolist() for column in stops), strict=True)
+    rows += {one for one in columns if not within[one[1]] and one[:2] in pairs}
+    part, lane = np.array([one[:2] for one in rows], np.int64).reshape(-1, 2).T
+    at = np.array([one[2] for one in rows], np.float64)
+    return MapPlaces.of(part, [what[int(one)] for one in part], lane, at, at)
+
+
+def together(parts: Sequence[MapPlaces]) -> MapPlaces:
+    """Stretches of several, as one."""
+    one = chained(parts)
+    return MapPlaces.of(one.part, one.what, one.lane, one.start, one.end)
