@@ -468,7 +468,7 @@ class SceneGraph:
         return dict(found)
 
     def _stops(self, what: str, lane: int) -> Sequence[tuple[float, float]]:
-        """Where a lane is waited on before a signal."""
+        """Places where a lane is waited on before a signal."""
         known = self.reach.stretches_of(what, lane) if self.reach is not None else ()
         about = self.nodes.get(lane, {})
         if not known and ("junction" in about or "length" in about):

@@ -315,7 +315,7 @@ class Matches(Tabular):
         return [{name: row[i] for i, name in names.items()} for row in found]
 
     def parts(self, frame: FrameRef, binding: Mapping[str, int] | None = None) -> TruthLanes:
-        """Where each part of the pattern holds for the nodes of a match; see :meth:`sgstore.Store.parts`."""
+        """Intervals of each part of the pattern, for the nodes of a match; see :meth:`sgstore.Store.parts`."""
         with self._compiled() as compiled:
             found = self.bindings(frame) if binding is None else [dict(binding)]
 
@@ -458,7 +458,7 @@ class Matches(Tabular):
                             return
 
     def as_table(self, name: str, *, apart: bool = False) -> list[Given]:
-        """What makes a table of all rows, for a statement that speaks of it by a name.
+        """Maker of a table of all rows, for a statement that speaks of it by a name.
 
         ``apart``: with columns that tell nodes of several traces apart which have the same number.
 
@@ -631,7 +631,7 @@ class UnionMatches(Matches):
     def _merged(
         self, parts: Sequence[Iterable[T]], key: Callable[[T], Any], told: Callable[[T], object]
     ) -> Iterator[T]:
-        """What parts give in one order, as one; of a ``UNION`` each once, by what is told of it."""
+        """Rows of parts, in one order, as one; of a ``UNION`` each once, by what is told of it."""
         last: Any = None
         seen: set[object] = set()
         for one in merge(*parts, key=key):
@@ -722,7 +722,7 @@ class UnionMatches(Matches):
         yield from ()
 
     def as_table(self, name: str, *, apart: bool = False) -> list[Given]:
-        """What makes a table of all rows; see :meth:`Matches.as_table`."""
+        """Maker of a table of all rows; see :meth:`Matches.as_table`."""
         if self.graphs:
             return self._parts[0].as_table(name, apart=apart)  # which refuses
         asked = self._joined()
@@ -801,7 +801,7 @@ class Windows:
             yield from self._told(group, used)
 
     def parts(self, window: Window | None, ask: Callable[[Window | None], T]) -> Iterator[T]:
-        """What is found in a range, or, where that is too much, in each half of it, and so on.
+        """Rows that are found in a range, or, where that is too much, in each half of it, and so on.
 
         Raises
         ------

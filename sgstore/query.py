@@ -96,7 +96,7 @@ class StoreFrame:
         )
 
     def picture(self, channel: str | None = None) -> Image:
-        """What a camera saw, by default the first one; see :meth:`Store.picture`."""
+        """Picture of a camera, by default the first one; see :meth:`Store.picture`."""
         from sgstore.draw import camera_of
 
         return self._store.picture(self.ref, channel or camera_of(self._store, self.ref.trace))
@@ -769,7 +769,7 @@ class Store:
         /,
         **parameters: object,
     ) -> TruthLanes:
-        """Where each part of a pattern holds, over the trace of a frame, for the nodes of a match there.
+        """Intervals of each part of a pattern, over the trace of a frame, for the nodes of a match there.
 
         The frames in which all parts hold are those that match with these nodes; of a sequence, step by step.
 

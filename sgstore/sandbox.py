@@ -266,7 +266,7 @@ class Sandbox:
 
     @property
     def is_ready(self) -> bool:
-        """Whether there is a process that can answer at once."""
+        """Return whether there is a process that can answer at once."""
         child = self._child
         return child is not None and child.poll() is None
 

@@ -81,7 +81,7 @@ class ToolAnswer:
 
 @dataclass(frozen=True)
 class KnownBindings:
-    """What the sandbox has found that a query binds in a frame, for a picture."""
+    """Bindings of a query in a frame, as the sandbox has found them, for a picture."""
 
     found: list[dict[str, int]]
 

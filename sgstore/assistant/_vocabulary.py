@@ -1,4 +1,4 @@
-"""What a query may name, as texts for a prompt."""
+"""Names that a query may use, as texts for a prompt."""
 
 from __future__ import annotations
 

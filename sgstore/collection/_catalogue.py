@@ -51,7 +51,7 @@ _SNAPSHOTS: Final = "catalogue"
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What a collection says of itself, once for all.
+    """Settings of a collection, once for all.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class About:
 
 
 def about(place: Place) -> About:
-    """What a collection says of itself.
+    """Return the settings of a collection.
 
     Raises
     ------
@@ -179,11 +179,11 @@ class Snapshot:
 
     @cached_property
     def catalog(self) -> Catalog:
-        """What all bundles hold together, for the compiler."""
+        """Contents of all bundles together, for the compiler."""
         return self.catalog_of([bundle["bundle"] for bundle in self.bundles])
 
     def catalog_of(self, bundles: Sequence[str]) -> Catalog:
-        """What some bundles hold together; names are those of all."""
+        """Contents of some bundles together; names are those of all."""
         chosen = frozenset(bundles)
         found = zip(self._homes, self._facts, strict=True)
         sets = subset_catalogs()

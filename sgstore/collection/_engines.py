@@ -31,7 +31,7 @@ Outcome = dict[str, Any]
 
 
 class Engine(Protocol):
-    """Who does tasks.
+    """Runner of tasks.
 
     Attributes
     ----------

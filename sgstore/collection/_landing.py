@@ -158,7 +158,7 @@ class _Landing:
             yield reader.read(path, self.folder / str(number))
 
     def _key(self, digest: str) -> str:
-        """What a recording that is read in this way is called among those that have landed."""
+        """Key of a recording that is read in this way, among those that have landed."""
         job = self.job
         road_map = ""
         if job.road_map is not None and job.road_map.is_file():
@@ -344,7 +344,7 @@ def _accepted(waiting: list[_Landed], before: Snapshot, done: Commit) -> list[_L
 
 
 def _names(waiting: Sequence[_Landed], before: Snapshot, done: Commit) -> dict[int, str]:
-    """What each trace is called: in the order of digests, so it does not matter who landed first."""
+    """Name of each trace: in the order of digests, so it does not matter who landed first."""
     taken = {row["name"] for row in before.traces}
     names: dict[int, str] = {}
     for one in waiting:

@@ -141,17 +141,17 @@ class Collection:
 
     @cached_property
     def engine(self) -> Engine:
-        """Who asks the bundles; begun with the first question."""
+        """Engine that asks the bundles; begun with the first question."""
         return engine_named(self._engine_name)
 
     @cached_property
     def catalog(self) -> Catalog:
-        """What all bundles hold together, with the tables of one's own."""
+        """Contents of all bundles together, with the tables of one's own."""
         found = self.snapshot.catalog
         return found if self._tables is None else replace(found, tables=self._table_facts())
 
     def _table_facts(self) -> dict[str, TableFacts]:
-        """What the compiler must know of tables of one's own: how their rows fit the frames of all bundles."""
+        """Facts for the compiler of tables of one's own: how their rows fit the frames of all bundles."""
         told: dict[str, dict[str, Any]] = {}
         for result in self.ask({"kind": "tables"}, self.bundles() or [worker.EMPTY]):
             for name, one in result["tables"].items():
@@ -168,7 +168,7 @@ class Collection:
         return [one["bundle"] for one in ordered]
 
     def traces(self) -> tuple[dict[str, Any], ...]:
-        """What the catalogue says of each trace, by name in natural order (``run2`` before ``run10``)."""
+        """Facts of the catalogue about each trace, by name in natural order (``run2`` before ``run10``)."""
         return self.snapshot.traces
 
     info = traces
@@ -321,7 +321,7 @@ class Collection:
         return {CLASSES_GIVEN: path}
 
     def _counted(self, abstraction: str) -> list[tuple[str, str, str, int]]:
-        """How many frames each class of an abstraction has in all bundles, as the catalogue says."""
+        """Count the frames of each class of an abstraction in all bundles, as the catalogue says."""
         counts: dict[str, int] = {}
         for _, of, name, frames, _ in self.snapshot.facts["class_count"]:
             if of == abstraction:
@@ -361,7 +361,7 @@ class Collection:
 
 
 def _facts_of_table(name: str, told: Mapping[str, Any]) -> TableFacts:
-    """What the compiler must know of a table of one's own, given how its rows fit the frames of all bundles."""
+    """Facts for the compiler of a table of one's own, given how its rows fit the frames of all bundles."""
     refused = None
     if not told["joins"]:
         refused = "no rows that belong to frames"

@@ -33,7 +33,7 @@ EMPTY: Final = ""
 
 @dataclass(frozen=True, slots=True)
 class Whole:
-    """What a part must know of the whole, beside what it holds.
+    """Facts of the whole that a part must know, beside what it holds.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Whole:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """What plain values describe."""
+        """Make it of plain values."""
         return cls(**values)
 
 
@@ -254,7 +254,7 @@ def _sql(
 def _tables(
     _task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], _to: Path
 ) -> dict[str, Any]:
-    """How the rows of tables of users' own fit the frames of one bundle."""
+    """Fit of the rows of tables of users' own to the frames of one bundle."""
     joined, told = file.joined(), dict[str, Any]()
     for name, facts in file.catalog().tables.items():
         rows = joined.get(name)

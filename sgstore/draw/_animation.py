@@ -113,7 +113,7 @@ class Animation(ABC):
 
 
 def animation(to: Path) -> Animation:
-    """What writes an animation, by the ending of its file.
+    """Writer of an animation, by the ending of its file.
 
     Raises
     ------

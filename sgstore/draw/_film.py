@@ -246,7 +246,7 @@ class TextSprites:
 
 
 def _dashes(linestyle: Any, width: float) -> tuple[float, list[float] | None]:
-    """Where a dashed line begins, and its dashes and gaps; pixels of a point each. ``None``: solid."""
+    """Start of a dashed line, and its dashes and gaps; pixels of a point each. ``None``: solid."""
     if linestyle is None or isinstance(linestyle, str):
         return 0.0, None
     start, dashes = linestyle

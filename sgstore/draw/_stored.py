@@ -158,7 +158,7 @@ _PICTURE: Final = re.compile(rb"\xff\xd8\xff|\x89PNG\r\n\x1a\n")
 
 
 class Bindings(Protocol):
-    """What a query binds in a frame: :class:`sgstore.matches.Matches`, or what is known of them already."""
+    """Bindings of a query in a frame: :class:`sgstore.matches.Matches`, or what is known of them already."""
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
         """Node ids of the variables by name, for each match."""

@@ -112,7 +112,7 @@ def _numbers(text: str) -> list[float]:
 
 
 class FrameTransforms:
-    """What each frame of the clips of one recording tells.
+    """Transforms that each frame of the clips of one recording tells.
 
     Parameters
     ----------

@@ -135,7 +135,7 @@ def write_export(
 
 
 def _written(exporter: Exporter, export: Export, folder: Path) -> list[WrittenClip | WrittenFile]:
-    """What an exporter wrote; whatever breaks in it, which may be of another package, is told by its name."""
+    """Files that an exporter wrote; whatever breaks in it, maybe of another package, is told by its name."""
     try:
         written: list[Any] = list(exporter.write(export, folder))
         odd = [one for one in written if not isinstance(one, WrittenClip | WrittenFile)]

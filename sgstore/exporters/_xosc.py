@@ -231,7 +231,7 @@ class Scenario:
                 )
 
     def losses(self) -> list[Loss]:
-        """What the scenario does not have of the clip."""
+        """Parts of the clip that the scenario does not have."""
         told: list[Loss] = []
         if self._unsized:
             reason = f"the size of {_some(self._unsized)} is not known: a usual one is written"

@@ -60,7 +60,7 @@ def _quantile(inner: str, share: float) -> str:
 
 
 def _collected(inner: str, _: float) -> str:
-    """What is collected of no match is an empty list; of different values, each once in their own order."""
+    """A list of values: empty of no match; of different values, each once in their own order."""
     value = inner.removeprefix("DISTINCT ")
     order = PLACE if value == inner else value
     return f"coalesce(list({inner} ORDER BY {order}) FILTER (WHERE {value} IS NOT NULL), [])"

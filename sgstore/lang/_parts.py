@@ -343,7 +343,7 @@ def _chosen(result: Result, select: Select, placed: Placed, pers: tuple[Terms, T
 
 
 def _of_part(result: Result) -> Result:
-    """What a part is asked for, so that all is there that the whole may choose.
+    """Columns that a part is asked for, so that all is there that the whole may choose.
 
     A sample of a part may have rows that the sample of the whole has not: so many rows of it are not enough.
     """
@@ -357,7 +357,7 @@ def _of_part(result: Result) -> Result:
 
 
 def _bindings(query: Query) -> Iterator[Bound]:
-    """What rows of one frame are ordered by: the nodes and edges that a match is told apart by."""
+    """Order of rows of one frame: by the nodes and edges that a match is told apart by."""
     roles = {"named"} if query.result.whole else {"named", "unnamed"}
     nodes = (key for key, node in query.scope.nodes.items() if node.role in roles)
     yield from (NodeValue(key) for key in sorted(nodes))

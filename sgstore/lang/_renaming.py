@@ -24,7 +24,7 @@ _NAMED = (s.NodePattern, s.EdgePattern, s.StepClause, s.Variable)
 def values_given(
     step: s.ScenarioStep, parameters: Mapping[str, str], session: Session
 ) -> list[s.Argument]:
-    """What is given for the parameters of a pattern.
+    """Values given for the parameters of a pattern.
 
     Parameters
     ----------

@@ -575,7 +575,7 @@ class _IntervalStatement:
         return finished(self.writer, select.text(), names)
 
     def _hidden(self, told: dict[str, str]) -> dict[str, str]:
-        """What tells the places of intervals of several stores: their first frames, and whose the nodes are."""
+        """Columns for places of intervals of several stores: their first frames, and whose the nodes are."""
         hidden = {FIRST: '":runs"."first"'}
         for name, chosen in ((OWNER_KEY, self.result.sample), (TOP_OWNER, self.result.top)):
             for owner in self._per(chosen, told)[1:]:
@@ -742,7 +742,7 @@ def _told_apart(select: Select, names: list[str], apart: list[NodeAttribute]) ->
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """How many rows are chosen of each combination of some values.
+    """Number of rows that are chosen of each combination of some values.
 
     Without a frame, or if ``first`` of the keys are those of an order, they are the first ones; else they are
     chosen by a number that depends on the frame alone.

@@ -136,7 +136,7 @@ def _stretches(frame: str, end: WayEnd, catalog: Catalog, *, parts: bool) -> str
 
 
 def _controlled(frame: str, node: str, kinds: frozenset[str]) -> str:
-    """Where the lanes that a light or a sign controls are waited on: as the map says, else at a junction."""
+    """Places to wait on lanes that a light or a sign controls: as the map says, else at a junction."""
     at = """coalesce("p"."start", CASE WHEN "m"."junction" IS NOT NULL THEN 0 ELSE "m"."length" END)"""
     signals = ", ".join(literal(kind) for kind in SIGNALS if kind in kinds)
     return f"""SELECT "c"."dst" AS "lane", {at} AS "first", {at} AS "last"
@@ -149,7 +149,7 @@ def _controlled(frame: str, node: str, kinds: frozenset[str]) -> str:
 
 
 def _kinds_of(end: WayEnd, alias: str, catalog: Catalog) -> list[str]:
-    """What is known of the rows of ``lane_state`` of an entity besides, so that fewer are looked at."""
+    """Conditions on the rows of ``lane_state`` of an entity, so that fewer are looked at."""
     kinds = end.kinds.only(entity_kinds() - _SIGNALS)
     held = catalog.moving | catalog.fixed
     return kind_conditions(kinds, f'"{alias}"."kind"', f'"{alias}"."is_ego"', held)

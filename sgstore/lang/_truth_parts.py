@@ -190,7 +190,7 @@ def _groups(
 
 
 def _ties(atom: _Atom, pins: Mapping[str, int], asked: set[str]) -> set[str]:
-    """What joins an atom to others: nodes that are not given, and edges that conditions speak of."""
+    """Ties of an atom to others: nodes that are not given, and edges that conditions speak of."""
     ties = {f"node {key}" for key in _nodes(atom) if key not in pins}
     if isinstance(atom, b.Edge):
         return ties | ({f"edge {atom.key}"} if atom.named or atom.key in asked else set())

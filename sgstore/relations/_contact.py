@@ -95,7 +95,7 @@ def _touching(bodies: Bodies, a: Rows, b: Rows) -> tuple[Rows, Rows]:
 
 
 def _separation(bodies: Bodies, a: Rows, b: Rows) -> Floats:
-    """How far the sides of one or the other keep two footprints apart; below 0 where they overlap; m.
+    """Distance by which the sides of one or the other keep two footprints apart; below 0 where they overlap; m.
 
     The gap is as large at least. NaN where rounding, or a size that is none, leaves it to the gap.
     """

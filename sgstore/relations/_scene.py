@@ -206,7 +206,7 @@ class BodyPairs:
 
     @cached_property
     def offsets(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """How far b lies ahead of a, and to its left; quick, wrong by less than 1e-6 of the distance; m.
+        """Distance of b ahead of a, and to its left; quick, wrong by less than 1e-6 of the distance; m.
 
         NaN where a's heading is missing, or farther from 0 than :data:`MOST_TURNED`.
         """

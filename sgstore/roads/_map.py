@@ -568,7 +568,7 @@ class RoadMap:
 
     @cached_property
     def places(self) -> MapPlaces:
-        """Where junctions, crosswalks and signals lie along the lanes.
+        """Places of junctions, crosswalks and signals along the lanes.
 
         Of a map without sections there is none, as of :attr:`reach`.
         """

@@ -1,4 +1,4 @@
-"""Where junctions, crosswalks, signals and stop lines lie along the lanes of a map.
+"""Places of junctions, crosswalks, signals and stop lines along the lanes of a map.
 
 A road or a junction lies on its lanes, all along, and so does a lane on itself. A crosswalk lies where it
 covers the centre line of a lane of its storey. A signal lies on the lanes that it applies to, in one place:

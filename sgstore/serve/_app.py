@@ -59,7 +59,7 @@ _NONCE: Final = "{{nonce}}"
 
 
 class Explorer:
-    """What the endpoints of one store share.
+    """State that the endpoints of one store share.
 
     Parameters
     ----------

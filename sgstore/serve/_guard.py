@@ -1,4 +1,4 @@
-"""Who may ask: the owner of a token, from a page of this server, in a browser that shows no other page's code.
+"""Guard of the server: the owner of a token may ask, from a page of this server, in a browser of no other code.
 
 A page of somebody else's could send requests to this machine: by its name for it (DNS rebinding), as a form,
 as a picture. So the host, the origin and what the browser says of the request's site are compared before
@@ -72,7 +72,7 @@ class Guard:
         await (answer or self._app)(scope, receive, sent)
 
     def _refusal(self, scope: Scope) -> Response | None:
-        """What a request is refused with, or let in by; ``None``: it may pass."""
+        """Answer that refuses a request, or lets it in; ``None``: it may pass."""
         headers = Headers(scope=scope)
         if headers.get("host", "") not in self._hosts:
             return PlainTextResponse("wrong host", 403)

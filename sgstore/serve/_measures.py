@@ -50,7 +50,7 @@ def measured(store: Store, what: str, abstraction: str, _: Progress) -> dict[str
 
 
 def measured_clips(store: Store, clips: Clips, abstraction: str, _: Progress) -> dict[str, Any]:
-    """How much clips are, and how much of the store's classes they keep.
+    """Size of clips, and share of the store's classes that they keep.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""What the page reads of a store by trace and frame: columns of states, maps, pictures, graphs, words.
+"""Readings of a store by trace and frame: columns of states, maps, pictures, graphs, words.
 
 Each method takes the fields of a request, which it checks at once, and gives a function that reads.
 """
@@ -138,7 +138,7 @@ class Reads:
         return read
 
     def static(self, fields: Fields) -> Read:
-        """What never moves in a trace, and the names of all entities."""
+        """Things that never move in a trace, and the names of all entities."""
         trace = fields.text("trace")
 
         def read() -> bytes:
@@ -209,7 +209,7 @@ class Reads:
         return read
 
     def picture(self, fields: Fields) -> Read:
-        """What a camera took at a frame, as it stands in the recording."""
+        """Picture of a camera at a frame, as it stands in the recording."""
         trace, seq, channel = fields.text("trace"), fields.whole("seq"), fields.text("channel")
 
         def read() -> tuple[bytes, str]:

@@ -462,7 +462,7 @@ class StoreFile:
             return states_at(connection, frames)
 
     def scenery(self, trace: int | str) -> Columns:
-        """What never moves in a trace, beside its road map, as plain columns."""
+        """Scenery of a trace, which never moves, beside its road map, as plain columns."""
         from sgstore.store._states import scenery
 
         with self.access.reading() as connection:

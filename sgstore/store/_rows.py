@@ -54,7 +54,7 @@ _READS: Final = {"SELECT", "EXPLAIN"}
 
 
 class Tabular:
-    """What gives rows, as tables of other packages and as files."""
+    """Source of rows, as tables of other packages and as files."""
 
     def __iter__(self) -> Iterator[tuple[Any, ...]]:
         raise NotImplementedError

@@ -91,7 +91,7 @@ def states_at(connection: DuckDBPyConnection, frames: Sequence[tuple[int, int]])
 
 
 def scenery(connection: DuckDBPyConnection, trace_id: int) -> Columns:
-    """What never moves in a trace, beside its road map."""
+    """Scenery of a trace, which never moves, beside its road map."""
     found = connection.execute(
         'SELECT node_id AS node, enum_code(kind) AS kind, x, y, heading, "length", width FROM entity'
         " WHERE trace_id = ? AND is_static ORDER BY node_id",

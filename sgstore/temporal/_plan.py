@@ -531,7 +531,7 @@ def needs_text(plan: Plan, catalog: Catalog | None = None) -> list[str]:
 
 
 def ask_text(ask: Ask) -> str:
-    """What an error calls a question: a step by its number, a signal or a condition as it is written."""
+    """Name of a question in an error: a step by its number, a signal or a condition as it is written."""
     if ask.value is not None:
         return value_text(ask.value)
     conditions = " AND ".join(value_text(part) for part in ask.query.scope.where)
