@@ -211,6 +211,14 @@ class StoreFile:
             yield found
 
     @contextmanager
+    def asked(
+        self, step: Callable[[DuckDBPyConnection], T], given: Iterable[Given] = ()
+    ) -> Generator[T]:
+        """What a step of ours makes with the connection, after what is made before."""
+        with self._answered(lambda at, _: rows.interruptible(at, lambda: step(at)), given) as found:
+            yield found
+
+    @contextmanager
     def record_batches(
         self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
     ) -> Generator[ArrowStream | None]:

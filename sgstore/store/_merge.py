@@ -7,6 +7,8 @@ grouped. What does not fit into memory spills to disk.
 from __future__ import annotations
 
 import os
+import secrets
+import shutil
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -15,14 +17,20 @@ import sgstore.store._schema as shape
 from sgstore.errors import StoreError
 from sgstore.quoting import literal, quoted
 from sgstore.records import dataclass
+from sgstore.store._joins import tables_folder
 from sgstore.store._locking import default_memory, spill_folder, translated, without_faults
 from sgstore.store._packing import SEQ_BITS
-from sgstore.store._rows import Batches, ParquetTable
+from sgstore.store._rows import Batches, arrays
 from sgstore.store._staging import scratch
+from sgstore.store._steps import interruptible
 from sgstore.vocabulary import NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Mapping, Sequence
+
+    import numpy as np
+    from duckdb import DuckDBPyConnection
+    from numpy.typing import NDArray
 
     from sgstore.store._file import StoreFile
     from sgstore.store._rows import Given, Parameters
@@ -30,6 +38,9 @@ if TYPE_CHECKING:
 
 _EXACT: Final = {"HUGEINT": "DECIMAL(38,0)", "UHUGEINT": "DECIMAL(38,0)"}
 """Types that Parquet has not, and those that hold the same whole numbers."""
+
+_NOTHING: Final = ""
+"""The type of a column of which no value is known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,18 +72,62 @@ class PartFile:
         return cls(Path(values["path"]), columns, types, values["rows"])
 
 
+_PART: Final = quoted(":part")
+
+
 def write_part(
-    file: StoreFile, sql: str, parameters: Parameters, given: Iterable[Given], to: Path
+    file: StoreFile,
+    statement: tuple[str, Parameters],
+    columns: Sequence[str],
+    given: Iterable[Given],
+    to: Path,
 ) -> PartFile:
-    """Write the rows of a statement of ours on a store to a Parquet file, as they come."""
-    with file.batches(sql, parameters, given=given) as batches:
-        kinds = [_EXACT.get(kind, kind) for kind in batches.types]
-        # Their names may differ in case alone, which Parquet does not tell apart.
-        columns = [(f"c{number}", kind) for number, kind in enumerate(kinds)]
-        with ParquetTable(to, columns) as table:
-            for batch in batches:
-                table.add_rows(batch.values)
-        return PartFile(to, batches.columns, batches.types, table.rows)
+    """Write the rows of a statement of ours on a store to a Parquet file; the database itself writes it.
+
+    Parameters
+    ----------
+    file : StoreFile
+    statement : (str, values)
+        The statement, and what it binds.
+    columns : sequence of str
+        What the columns of its rows are called.
+    given : iterable
+        What is made before, as :meth:`StoreFile.batches` takes it.
+    to : Path
+    """
+    sql, values = statement
+    made = _making(sql, len(columns))
+    table: Any = made, values
+    with file.asked(_written, [*given, table]) as (place, kinds, rows):
+        shutil.move(place, to)
+    return PartFile(to, tuple(columns), kinds, rows)
+
+
+def _making(sql: str, columns: int) -> str:
+    """The statement that makes the table of a part."""
+    # Names of columns may differ in case alone, which neither a table nor Parquet tells apart.
+    names = ", ".join(f"c{number}" for number in range(columns))
+    return f"CREATE OR REPLACE TEMP TABLE {_PART} AS SELECT * FROM (\n{sql}\n) AS t({names})"
+
+
+def _written(connection: DuckDBPyConnection) -> tuple[Path, tuple[str, ...], int]:
+    """Write the table of a part to a file in the one folder that the database may see; its types and rows."""
+    described = connection.execute(f"DESCRIBE {_PART}").fetchall()
+    kinds = {str(row[0]): str(row[1]) for row in described}
+    # A column of which nothing is known is of no type, and a table has none such.
+    whole = [name for name, kind in kinds.items() if kind == "INTEGER"]
+    counted = ", ".join(["count(*)", *(f"count({name})" for name in whole)])
+    rows, *known = connection.execute(f"SELECT {counted} FROM {_PART}").fetchall()[0]
+    for name, number in zip(whole, known, strict=True):
+        kinds[name] = kinds[name] if number else _NOTHING
+    listed = [f"CAST({n} AS {_EXACT[k]}) AS {n}" if k in _EXACT else n for n, k in kinds.items()]
+    tables_folder().mkdir(mode=0o700, parents=True, exist_ok=True)
+    place = tables_folder() / f"part-{secrets.token_hex(8)}.parquet"
+    connection.execute(
+        f"COPY (SELECT {', '.join(listed)} FROM {_PART}) TO {literal(str(place))} (FORMAT parquet)"
+    )
+    connection.execute(f"DROP TABLE {_PART}")
+    return place, tuple(kinds.values()), rows
 
 
 def write_classes(
@@ -94,39 +149,85 @@ def write_classes(
     known = "c.abstraction = $1 AND c.class IS NOT NULL"
     if table:
         sql = f"{of} JOIN {quoted(table)} u ON u.frame_id = c.frame_id WHERE {known}"
-        return write_part(file, sql, [abstraction], (), to)
+        return write_part(file, (sql, [abstraction]), ["class"], (), to)
     sql = (
         f"{of} WHERE {known} AND c.frame_id >> {SEQ_BITS} IN (SELECT unnest(CAST($2 AS BIGINT[])))"
     )
-    return write_part(file, sql, [abstraction, [*traces]], (), to)
+    return write_part(file, (sql, [abstraction, [*traces]]), ["class"], (), to)
+
+
+Parts = dict[str, list[PartFile]]
+"""Table of a statement → its rows; those of a table have the same columns."""
 
 
 @contextmanager
 def merged_parts(
-    parts: Mapping[str, Sequence[PartFile]],
-    words: Mapping[str, Sequence[str]],
-    sql: str,
-    values: Sequence[Any],
-    *,
-    memory: int = 0,
+    parts: Parts, words: Mapping[str, Sequence[str]], sql: str, values: Sequence[Any]
 ) -> Generator[Batches]:
     """The rows of a statement over the answers of parts.
 
     Parameters
     ----------
     parts : mapping of str to sequence of PartFile
-        Table of the statement → its rows; those of a table have the same columns.
+        See :data:`Parts`.
     words : mapping of str to sequence of str
         Enumeration → the values that stores of the collection have beside those of ``schema.sql``.
     sql : str
     values : sequence
         What it binds.
-    memory : int
-        Most memory that it may take; bytes. 0: as a store takes.
     """
-    connection = scratch(
-        spill_folder(), memory=memory or default_memory(), threads=os.cpu_count() or 1
-    )
+    with _tables(parts, words) as connection:
+        yield Batches(connection, sql, _numbered(values))
+
+
+def merged_file(
+    parts: Parts,
+    words: Mapping[str, Sequence[str]],
+    statement: tuple[str, Sequence[Any]],
+    columns: Sequence[str],
+    to: Path,
+) -> PartFile:
+    """Write the rows of a statement over the answers of parts, as a part of a further answer.
+
+    Parameters
+    ----------
+    parts, words
+        As :func:`merged_parts` takes them.
+    statement : (str, values)
+        The statement, and what it binds.
+    columns : sequence of str
+        What the columns of its rows are called.
+    to : Path
+    """
+    sql, values = statement
+    with _tables(parts, words) as connection:
+        made = _making(sql, len(columns))
+
+        def step() -> tuple[Path, tuple[str, ...], int]:
+            connection.execute(made, _numbered(values) or None)
+            return _written(connection)
+
+        place, kinds, rows = interruptible(connection, step)
+    shutil.move(place, to)
+    return PartFile(to, tuple(columns), kinds, rows)
+
+
+def merged_arrays(
+    parts: Parts, words: Mapping[str, Sequence[str]], sql: str, values: Sequence[Any]
+) -> dict[str, NDArray[np.generic]]:
+    """All columns of such a statement, as :func:`merged_parts` takes it; masked where something is NULL."""
+    with _tables(parts, words) as connection:
+        return arrays(connection, sql, _numbered(values))
+
+
+def _numbered(values: Sequence[Any]) -> dict[str, Any]:
+    return {str(n): v for n, v in enumerate(values, 1)}
+
+
+@contextmanager
+def _tables(parts: Parts, words: Mapping[str, Sequence[str]]) -> Generator[DuckDBPyConnection]:
+    """A database of our own in which the answers of parts are tables."""
+    connection = scratch(spill_folder(), memory=default_memory(), threads=os.cpu_count() or 1)
     with connection, translated(Path("collection")):
         without_faults(connection)
         for enum in NAMES:
@@ -135,7 +236,7 @@ def merged_parts(
             connection.execute(f"CREATE TYPE {enum} AS ENUM ({listed})")
         for table, files in parts.items():
             connection.execute(f"CREATE TEMP VIEW {quoted(table)} AS {_rows_of(files)}")
-        yield Batches(connection, sql, {str(n): v for n, v in enumerate(values, 1)})
+        yield connection
 
 
 def _rows_of(files: Sequence[PartFile]) -> str:
@@ -145,12 +246,18 @@ def _rows_of(files: Sequence[PartFile]) -> str:
     first = files[0]
     if any(one.columns != first.columns for one in files):
         raise StoreError("parts of an answer have different columns")
-    listed: list[str] = []
-    for number, name in enumerate(first.columns):
-        kinds = {one.types[number] for one in files}
-        listed.append(f"CAST(c{number} AS {_common(kinds)}) AS {quoted(name)}")
-    places = ", ".join(literal(str(one.path)) for one in files)
-    return f"SELECT {', '.join(listed)} FROM read_parquet([{places}], union_by_name = true)"
+    common = [_common(set(kinds)) for kinds in zip(*(one.types for one in files), strict=True)]
+    alike: dict[tuple[str, ...], list[Path]] = {}
+    for one in files:
+        alike.setdefault(one.types, []).append(one.path)
+    parts: list[str] = []
+    for types, paths in alike.items():
+        values = ("NULL" if t == _NOTHING else f"c{n}" for n, t in enumerate(types))
+        casts = (f"CAST({value} AS {kind})" for value, kind in zip(values, common, strict=True))
+        listed = ", ".join(f"{c} AS {quoted(n)}" for c, n in zip(casts, first.columns, strict=True))
+        places = ", ".join(literal(str(path)) for path in paths)
+        parts.append(f"SELECT {listed} FROM read_parquet([{places}])")
+    return "\nUNION ALL\n".join(parts)
 
 
 _WIDTHS: Final = (
@@ -162,8 +269,8 @@ def _common(kinds: set[str]) -> str:
     """The type that holds the values of some types of one column: a part may know no value of it."""
     enums = {_enum_of(kind) for kind in kinds if kind.startswith("ENUM")}
     if enums:
-        return enums.pop() if len(enums) == 1 and len(kinds - {'"NULL"'}) >= 1 else "VARCHAR"
-    known = kinds - {'"NULL"', "NULL"}
+        return enums.pop() if len(enums) == 1 and len(kinds - {_NOTHING}) >= 1 else "VARCHAR"
+    known = kinds - {_NOTHING}
     if len(known) <= 1:
         return next(iter(known), "INTEGER")
     if known <= set(_WIDTHS):
