@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
-from sgstore.errors import QueryError, StoreError
+from sgstore.errors import StoreError
 from sgstore.lang import CONSTANTS, about_frame, compile_query, union_parts
 from sgstore.matches import UnionMatches
 from sgstore.records import dataclass
@@ -24,7 +24,7 @@ from sgstore.store import IN_NOTEBOOK, FrameRef, StoreFile, UserTables
 from sgstore.vocabulary import normalize_name
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
 
     import networkx as nx
     import numpy as np
@@ -289,25 +289,12 @@ class Store:
         QueryError
             The text is no query, or names what the store does not know; it says where, and what would be right.
         """
-        from sgstore.temporal import TemporalMatches
-
         if not isinstance(query, str):
             from sgstore.lang import Pattern
 
             pattern = query if isinstance(query, Pattern) else Pattern.of(query)
             query, parameters = str(pattern), {**pattern.parameters, **parameters}
-        asked = union_parts(query, parameters)
-        if asked is None:
-            return TemporalMatches(self.file, self.file.catalog, query, parameters)
-        try:
-            parts = [
-                TemporalMatches(self.file, self.file.catalog, part.text, part.values)
-                for part in asked.parts
-            ]
-        except QueryError as error:  # its text has blanks in place of the other parts
-            reason, span = error.reason, error.span
-            raise type(error)(reason, text=query, span=span, hint=error.hint) from None
-        return UnionMatches(query, asked, parts)
+        return matches_of(self.file, self.file.catalog, query, parameters)
 
     def check(
         self,
@@ -369,7 +356,7 @@ class Store:
             A pattern in it is none.
         """
         with self.file.snapshot():
-            asked = UserStatement(self, text)
+            asked = UserStatement(self.find, self.catalog().tables, text)
             found = self.file.user_rows(
                 asked.sql, timeout_s=timeout_s, max_rows=max_rows, given=asked.given
             )
@@ -837,12 +824,34 @@ class Store:
         return FrameView(graph, about, whole, classes, roles)
 
 
+def matches_of(
+    file: StoreFile, catalog: Callable[[], Catalog], text: str, parameters: Mapping[str, object]
+) -> Matches:
+    """Return the matches of a query, or of the parts of a ``UNION``, in a file with a catalog.
+
+    Raises
+    ------
+    QueryError
+        The text is no query, or names what the catalog does not know.
+    """
+    from sgstore.temporal import TemporalMatches
+
+    asked = union_parts(text, parameters)
+    if asked is None:
+        return TemporalMatches(file, catalog, text, parameters)
+    parts = asked.each(partial(TemporalMatches, file, catalog), text)
+    return UnionMatches(text, asked, parts)
+
+
 class UserStatement:
     """A statement of SQL in which patterns are tables.
 
     Parameters
     ----------
-    store : Store
+    find : function
+        Given a query and values of its parameters, returns its matches.
+    tables : collection of str
+        Names that are taken.
     text : str
         It may have calls of ``sgql``.
 
@@ -863,7 +872,7 @@ class UserStatement:
         What may be a mistake in a pattern.
     """
 
-    def __init__(self, store: Store, text: str) -> None:
+    def __init__(self, find: Callable[..., Matches], tables: Collection[str], text: str) -> None:
         self.sql, self.given = text, None
         self.reasons: dict[str, str] = {}
         self.notes: tuple[str, ...] = ()
@@ -871,8 +880,8 @@ class UserStatement:
             return
         from sgstore.lang import pattern_tables
 
-        self.sql, tables = pattern_tables(text, store.catalog().tables)
-        found = [(one.name, store.find(one.text, **dict(one.values))) for one in tables]
+        self.sql, calls = pattern_tables(text, tables)
+        found = [(one.name, find(one.text, **dict(one.values))) for one in calls]
         for _, matches in found:
             self.reasons |= matches.reasons
             self.notes += matches.notes

@@ -43,6 +43,8 @@ class CollectionWriter(AfterWriter):
             return self.settings(check=True) + random_check(self.rng)
         if roll < 0.3:
             return self.settings() + random_sequence(self.rng) + self.ended()
+        if roll < 0.38:
+            return self.union()
         text = self.query()
         if not text.startswith("USING"):
             text = self.settings() + text
@@ -50,6 +52,21 @@ class CollectionWriter(AfterWriter):
         if roll < 0.4:
             return text + self.after()
         return text + (self.values() if roll < 0.75 else self.form())
+
+    def union(self) -> str:
+        """The answers of two patterns as one."""
+        form = self.rng.choice(("", "", "INTERVALS, ", "FRAMES, "))
+        parts: list[str] = []
+        for seed in (self.seed, self.seed + 1_000_000):
+            writer = CollectionWriter(seed)
+            text = writer.query()
+            node = next(iter(writer.nodes), "ego")
+            values = self.rng.choice((f"{node}.kind AS k", f"{node}.kind AS k, COUNT(*) AS n"))
+            limit = self.rng.choice(("", "", " LIMIT 4", " ORDER BY k DESC"))
+            parts.append(
+                f"{text} RETURN {form}{values if not form else f'{node}.kind AS k'}{limit}"
+            )
+        return self.rng.choice((" UNION ", " UNION ALL ")).join(parts)
 
     def settings(self, *, check: bool = False) -> str:
         some = ["", "", "", "UNKNOWN false", "EGO 'hero1'", "DATASET 'trace1*'", "DATASET 'trace7'"]

@@ -24,7 +24,7 @@ from sgstore.records import dataclass
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
-    from sgstore.collection import PartedMatches
+    from sgstore.collection import PartedMatches, PartedRows
     from sgstore.config import Config
     from sgstore.coverage import ChosenFrames, ReportTable
     from sgstore.matches import Matches
@@ -685,7 +685,7 @@ def bytes_of(text: str, option: str) -> int:
 
 
 def say_left_out(
-    matches: Matches | Answer | ChosenFrames | UserStatement | PartedMatches,
+    matches: Matches | Answer | ChosenFrames | UserStatement | PartedMatches | PartedRows,
 ) -> None:
     """Say which traces cannot answer a query, and why, and what may be a mistake in it."""
     of: dict[str, list[str]] = {}

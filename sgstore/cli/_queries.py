@@ -299,6 +299,7 @@ def sql(
         with collection_at(url, ask, engine, tables, partial=partial, safe=safe) as whole:
             rows = whole.sql(query_of(statement, file), each=each)
             ask.write(rows.columns, rows)
+            say_left_out(rows)
             return say_missing(whole)
     if safe:
         with _sandbox(store, ask, max_rows, tables) as box:
@@ -310,7 +311,7 @@ def sql(
 
     opened = ask.opened(store, tables_of(tables))
     with opened.file.snapshot():
-        asked = UserStatement(opened, query_of(statement, file))
+        asked = UserStatement(opened.find, opened.catalog().tables, query_of(statement, file))
         say_left_out(asked)
         if (form := ask.chosen) in BINARY:
             write_binary(

@@ -13,6 +13,8 @@ from ._pack import verify as verify
 from ._questions import Collection as Collection
 from ._questions import PartedChecks as PartedChecks
 from ._questions import PartedMatches as PartedMatches
+from ._questions import PartedRows as PartedRows
+from ._questions import PartedUnion as PartedUnion
 from ._questions import PartialAnswerError as PartialAnswerError
 
 __all__ = [
@@ -22,6 +24,8 @@ __all__ = [
     "Garbage",
     "PartedChecks",
     "PartedMatches",
+    "PartedRows",
+    "PartedUnion",
     "PartialAnswerError",
     "commit",
     "gc",

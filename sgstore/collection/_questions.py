@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import base64
 import json
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from heapq import merge
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -21,7 +22,7 @@ from sgstore.collection import _worker as worker
 from sgstore.collection._engines import engine_named
 from sgstore.collection._pack import refuse_others
 from sgstore.collection._place import place_at
-from sgstore.errors import SqlError, StoreError
+from sgstore.errors import QueryError, SqlError, StoreError
 from sgstore.files import working_folder
 from sgstore.lang import (
     CLASSES_GIVEN,
@@ -34,10 +35,13 @@ from sgstore.lang import (
     compile_checks,
     compile_query,
     for_people,
+    joined_rows,
     parted,
+    pattern_tables,
     traces_of,
+    union_parts,
 )
-from sgstore.matches import Interval, merged, row_type
+from sgstore.matches import Interval, UnionMatches, merged, row_type
 from sgstore.store import (
     SEQ_BITS,
     FrameRef,
@@ -45,6 +49,8 @@ from sgstore.store import (
     StoreFile,
     Tabular,
     UserTables,
+    merged_arrays,
+    merged_file,
     merged_parts,
     write_parquet,
 )
@@ -52,7 +58,7 @@ from sgstore.vocabulary import natural
 from sgstore.world import Clip, tolerance_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 
     import networkx as nx
 
@@ -173,7 +179,9 @@ class Collection:
 
     info = traces
 
-    def find(self, query: str | Pattern | nx.Graph[Any], /, **parameters: object) -> PartedMatches:
+    def find(
+        self, query: str | Pattern | nx.Graph[Any], /, **parameters: object
+    ) -> PartedMatches | PartedUnion:
         """Return the matches of a pattern; see :meth:`sgstore.Store.find`.
 
         Raises
@@ -187,7 +195,11 @@ class Collection:
 
             pattern = query if isinstance(query, Pattern) else Pattern.of(query)
             query, parameters = str(pattern), {**pattern.parameters, **parameters}
-        return PartedMatches(self, query, parameters)
+        asked = union_parts(query, parameters)
+        if asked is None:
+            return PartedMatches(self, query, parameters)
+        parts: list[Any] = asked.each(partial(PartedMatches, self), query)
+        return PartedUnion(query, asked, parts)
 
     def check(
         self,
@@ -385,6 +397,7 @@ class PartedMatches(Tabular):
     """
 
     def __init__(self, whole: Collection, text: str, parameters: Mapping[str, object]) -> None:
+        self._file, self.snapshot = _NoFile(), whole.snapshot
         self._whole, self._text, self._parameters = whole, text, dict(parameters)
         self._limit: int | None = None
         self._ready: Compiled = compile_query(text, whole.catalog, parameters)
@@ -412,6 +425,11 @@ class PartedMatches(Tabular):
         return fewer
 
     @property
+    def of_all(self) -> bool:
+        """Tell whether it speaks of the classes of the frames of all bundles."""
+        return bool(class_questions(self._ready.bound))
+
+    @property
     def reasons(self) -> dict[str, str]:
         """Traces that cannot answer the query, and why: as the catalogue and bundles asked so far tell."""
         found = {**self._ready.reasons, **self._reasons}
@@ -427,6 +445,10 @@ class PartedMatches(Tabular):
         """Notes on likely mistakes: none are looked for in a collection."""
         return ()
 
+    def _rows(self, *, whole: bool) -> Iterator[Any]:
+        del whole  # a bundle is asked as a whole
+        return iter(self)
+
     def __iter__(self) -> Iterator[Any]:
         layout, row = self._ready.layout, row_type(self.columns)
         rows = self._answered("rows")
@@ -435,6 +457,12 @@ class PartedMatches(Tabular):
     def rows(self) -> list[Any]:
         """All rows at once."""
         return list(self)
+
+    def numpy(self) -> dict[str, Any]:
+        """All columns as arrays, masked where something is NULL."""
+        with self._tables("rows", (0, 0)) as tables:
+            text, values = parted(self._ready).statement(self._ready.catalog)
+            return merged_arrays(tables, self.snapshot.words, text, values)
 
     def count(self) -> int:
         """The number of distinct frames."""
@@ -479,15 +507,19 @@ class PartedMatches(Tabular):
     def clips(self, before: float = 0.0, after: float = 0.0) -> Iterator[Clip]:
         """Clips around the frames that match, in log time; see :meth:`sgstore.Matches.clips`."""
         start, end = round(before * 1e9), round(after * 1e9)
-        traces = self._ready.catalog.traces
-        slack = {trace.name: tolerance_ns(trace.period_ns) for trace in traces}
         if self._ready.limited_to_frames is not None:
             around = (Clip(row[1], row[-1] - start, row[-1] + end) for row in self._frames())
             clips = sorted(around, key=lambda clip: (natural(clip.trace), clip.start_ns))
-            yield from merged(clips, slack)
+            yield from merged(clips, self._slack)
             return
         rows = self._answered("clips", (start, end))
-        yield from merged((Clip(*row[:3]) for row in rows), slack)
+        yield from merged((Clip(*row[:3]) for row in rows), self._slack)
+
+    @property
+    def _slack(self) -> dict[str, int]:
+        """The tolerance of times of each trace, by name; ns."""
+        traces = self._ready.catalog.traces
+        return {trace.name: tolerance_ns(trace.period_ns) for trace in traces}
 
     def explain(self) -> str:
         """Explain the query, stage by stage, and how its answers are merged."""
@@ -523,6 +555,24 @@ class PartedMatches(Tabular):
     def _answered(self, form: str, offsets: tuple[int, int] = (0, 0)) -> Iterator[tuple[Any, ...]]:
         """The rows of a form in which the matches are asked for."""
         asked = parted(self._ready, form, *offsets)
+        with self._tables(form, offsets) as tables:
+            text, values = asked.statement(self._ready.catalog)
+            words = self.snapshot.words
+            with merged_parts(tables, words, text, values) as batches:
+                for batch in batches:
+                    yield from batch.values
+
+    def written_apart(self, to: Path) -> PartFile:
+        """Write the rows, with columns that tell nodes of several traces apart, as a part of a union."""
+        asked = parted(self._ready, "apart")
+        with self._tables("apart", (0, 0)) as tables:
+            statement = asked.statement(self._ready.catalog)
+            words = self.snapshot.words
+            return merged_file(tables, words, statement, asked.columns, to)
+
+    @contextmanager
+    def _tables(self, form: str, offsets: tuple[int, int]) -> Generator[dict[str, list[PartFile]]]:
+        """The answers of the bundles, by the table as which the merging statement knows them."""
         with working_folder("parts") as folder:
             question = self._question(form, folder, offsets)
             tables: dict[str, list[PartFile]] = {}
@@ -535,11 +585,55 @@ class PartedMatches(Tabular):
                         name = PARTS if not number else f"{PARTS} {number}"
                         part = _moved(PartFile.from_dict(told), folder)
                         tables.setdefault(name, []).append(part)
-            text, values = asked.statement(self._ready.catalog)
-            words = self._whole.snapshot.words
-            with merged_parts(tables, words, text, values) as batches:
-                for batch in batches:
-                    yield from batch.values
+            yield tables
+
+
+class PartedUnion(UnionMatches):
+    """Matches of several queries as one in a collection: of a ``UNION``, or of ``UNION ALL``."""
+
+    _parts: Sequence[Any]  # PartedMatches
+
+    @property
+    def of_all(self) -> bool:
+        """Tell whether it speaks of the classes of the frames of all bundles."""
+        return any(part.of_all for part in self._parts)
+
+    def _rows(self, *, whole: bool) -> Iterator[Any]:
+        if self.graphs:
+            yield from super()._rows(whole=whole)
+            return
+        row = row_type(self.columns)
+        with self._tables() as asked, merged_parts(*asked) as batches:
+            for batch in batches:
+                yield from map(row._make, batch.values)
+
+    def numpy(self) -> dict[str, Any]:
+        """All columns as arrays, masked where something is NULL."""
+        with self._tables() as asked:
+            return merged_arrays(*asked)
+
+    @contextmanager
+    def _tables(self) -> Generator[tuple[Any, Any, str, list[Any]]]:
+        """The rows of the parts as tables, the words in them, and the statement that joins them."""
+        tables, snapshot = dict[str, list[PartFile]](), self._parts[0].snapshot
+        with working_folder("union") as folder:
+            for number, part in enumerate(self._parts):
+                name = f":part {number}"
+                tables[name] = [part.written_apart(folder / f"{number}.parquet")]
+            select, named = joined_rows(
+                self.columns, [*tables], self._results, distinct=self._distinct
+            )
+            select.limit = self._limit
+            traces = [trace["name"] for trace in snapshot.traces]
+            yield tables, snapshot.words, select.text(), [traces] if named else []
+
+
+class _NoFile:
+    """What stands where matches of a store have its file: a collection does not change while it is asked."""
+
+    @contextmanager
+    def snapshot(self) -> Generator[None]:
+        yield
 
 
 def _moved(part: PartFile, folder: Path) -> PartFile:
@@ -618,10 +712,23 @@ class PartedRows(Tabular):
     def __init__(self, whole: Collection, text: str) -> None:
         self._whole, self._text = whole, text
         self._columns: tuple[str, ...] = ()
+        self.reasons: dict[str, str] = {}
+        self.notes: tuple[str, ...] = ()
+        if "sgql" in text.lower():
+            _, calls = pattern_tables(text, whole.catalog.tables)
+            for one in calls:
+                found = whole.find(one.text, **dict(one.values))
+                if found.of_all:
+                    raise QueryError(
+                        "in sgql(...) a pattern is asked of each bundle, and classes are counted in all",
+                        hint="ask the pattern alone: sgstore find URL 'MATCH …'",
+                    )
+                self.reasons |= found.reasons
 
     def __iter__(self) -> Iterator[tuple[Any, ...]]:
         for result in self._whole.ask({"kind": "sql", "text": self._text}, self._whole.bundles()):
             self._columns = ("bundle", *result["columns"])
+            self.reasons |= result["reasons"]
             with Path(result["lines"]).open(encoding="utf-8") as lines:
                 for line in lines:
                     yield result["bundle"], *json.loads(line)

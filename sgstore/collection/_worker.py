@@ -9,7 +9,9 @@ from __future__ import annotations
 import base64
 import json
 import secrets
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -18,14 +20,18 @@ from sgstore.collection._place import place_at
 from sgstore.errors import StoreError
 from sgstore.files import working_folder
 from sgstore.lang import Compiled, Type, parted
+from sgstore.query import UserStatement, matches_of
 from sgstore.store import PartFile, StoreFile, UserTables, write_classes, write_part
 from sgstore.temporal import CheckRun, TemporalMatches, Verdict
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Generator, Mapping
 
     from sgstore.lang import Catalog
-    from sgstore.matches import Interval
+    from sgstore.matches import Interval, Matches
+
+KEPT: Final = 16
+"""Bundles that a process remembers."""
 
 EMPTY: Final = ""
 """The name of the bundle that has nothing: it is asked where no other one is, to know the columns."""
@@ -97,8 +103,8 @@ class PartMatches(TemporalMatches):
     def _written(self, _compiled: Compiled, statement: Any, folder: Path) -> PartFile:
         to = folder / f"{secrets.token_hex(8)}.parquet"
         asked = self._asked(statement)
-        found = write_part(self._file, asked["sql"], asked["parameters"], asked["given"], to)
-        return replace(found, columns=tuple(statement.columns))
+        sql = asked["sql"], asked["parameters"]
+        return write_part(self._file, sql, statement.columns, asked["given"], to)
 
 
 def answer(task: dict[str, Any]) -> dict[str, Any]:
@@ -135,13 +141,33 @@ def answer(task: dict[str, Any]) -> dict[str, Any]:
         return {"bundle": task["bundle"], **found}
 
 
-def _opened(task: dict[str, Any], held: Path) -> Any:
+@contextmanager
+def _opened(task: dict[str, Any], held: Path) -> Generator[StoreFile]:
     """The bundle, open, with the tables beside it."""
     if task["bundle"] == EMPTY:
         path = held / "empty.sgstore"
         StoreFile.create(path).close()
     else:
         path = bundle_path(place_at(task["url"]), task["bundle"])
+    given = _tables_of(task, held)
+    if given or task["bundle"] == EMPTY:
+        file = StoreFile(path, tables=UserTables(given) if given else None)
+        with file.snapshot():
+            yield file
+        file.close()
+        return
+    with _kept(path).snapshot():
+        yield _kept(path)
+
+
+@lru_cache(maxsize=KEPT)
+def _kept(path: Path) -> StoreFile:
+    """A bundle that was asked lately: its file stays open for a second, and what it holds is remembered."""
+    return StoreFile(path)
+
+
+def _tables_of(task: dict[str, Any], held: Path) -> dict[str, Path]:
+    """The tables beside a bundle, by name, as files."""
     given: dict[str, Path] = {}
     for name, table in task.get("tables", {}).items():
         if table.startswith("base64:"):
@@ -149,23 +175,7 @@ def _opened(task: dict[str, Any], held: Path) -> Any:
             given[name].write_bytes(base64.b64decode(table.removeprefix("base64:")))
         else:
             given[name] = Path(table)
-    return _Open(StoreFile(path, tables=UserTables(given) if given else None))
-
-
-class _Open:
-    """A store that is open for as long as a part is asked of it."""
-
-    def __init__(self, file: StoreFile) -> None:
-        self._file = file
-        self._snapshot = file.snapshot()
-
-    def __enter__(self) -> StoreFile:
-        self._snapshot.__enter__()
-        return self._file
-
-    def __exit__(self, *exception: Any) -> None:
-        self._snapshot.__exit__(*exception)
-        self._file.close()
+    return given
 
 
 def _find(
@@ -238,17 +248,24 @@ def _classes(
 
 
 def _sql(
-    task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
+    task: dict[str, Any], file: StoreFile, catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
     """The rows of a user's statement on one bundle, as lines."""
     path = to / f"{secrets.token_hex(8)}.ndjson"
-    with path.open("w", encoding="utf-8") as lines, file.user_batches(task["text"]) as batches:
+
+    def find(text: str, **values: object) -> Matches:
+        return matches_of(file, catalog, text, values)
+
+    asked = UserStatement(find, catalog().tables, task["text"])
+    rows = file.user_batches(asked.sql, given=asked.given)
+    with path.open("w", encoding="utf-8") as lines, rows as batches:
         columns, types = batches.columns, batches.types
         for batch in batches:
             for row in batch.values:
                 lines.write(json.dumps(row, default=str))
                 lines.write("\n")
-    return {"lines": str(path), "columns": list(columns), "types": list(types)}
+    about = {"columns": list(columns), "types": list(types), "reasons": dict(asked.reasons)}
+    return {"lines": str(path), **about}
 
 
 def _tables(

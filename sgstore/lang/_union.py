@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import fields, is_dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from sgstore.errors import QueryError, TextSpan
 from sgstore.lang import syntax as s
@@ -21,9 +21,11 @@ from sgstore.records import dataclass
 from sgstore.vocabulary import normalize_name
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from sgstore.lang.ir import Result
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +53,20 @@ class UnionParts:
 
     parts: tuple[UnionPart, ...]
     distinct: bool
+
+    def each(self, find: Callable[[str, Mapping[str, Any]], T], text: str) -> list[T]:
+        """The answers to all parts, given what answers one, and the whole text.
+
+        Raises
+        ------
+        QueryError
+            A part is no query, or names what is not known.
+        """
+        try:
+            return [find(part.text, part.values) for part in self.parts]
+        except QueryError as error:  # its text has blanks in place of the other parts
+            reason, span = error.reason, error.span
+            raise type(error)(reason, text=text, span=span, hint=error.hint) from None
 
 
 _UNION: Final = re.compile(r"\bUNION\b", re.IGNORECASE)

@@ -14,6 +14,8 @@ from ._catalog import subset_catalogs as subset_catalogs
 from ._landed import split_segment as split_segment
 from ._landed import whole_segment as whole_segment
 from ._merge import PartFile as PartFile
+from ._merge import merged_arrays as merged_arrays
+from ._merge import merged_file as merged_file
 from ._merge import merged_parts as merged_parts
 from ._merge import write_classes as write_classes
 from ._merge import write_part as write_part
@@ -111,6 +113,8 @@ __all__ = [
     "lengths_of_messages",
     "marks",
     "maps_of_traces",
+    "merged_arrays",
+    "merged_file",
     "merged_parts",
     "messages_of",
     "names_of_traces",
