@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from sgstore.draw import draw_stored
 from sgstore.errors import ExportError, MissingExtraError, TraceError
-from sgstore.exporters import Export, WrittenClip, write_export
+from sgstore.exporters import Export, WrittenClip, parse_mounts, write_export
 from sgstore.ingest import ingest
 from sgstore.query import Store
 
@@ -52,21 +52,32 @@ Each holds somewhere in the sample; ``samples/town/README.md`` says when and who
 
 STORE: Final = "demo.sgstore"
 
-RECORDING: Final = Path(__file__).parent / "sample" / "town.mcap"
+_SAMPLE: Final = Path(__file__).parent / "sample"
+RECORDING: Final = _SAMPLE / "town.mcap"
 """The recording in a checkout. A wheel is without it: it would be an eighth of all that is installed."""
+SMALL: Final = _SAMPLE / "small" / "town.mcap"
+"""The same drive without the lidar and with a picture a second, which a wheel brings."""
+
+MOUNTS: Final = ("ego/lidar=0,0,1.75", "ego/camera/front=0.45,0,1.42,-90,0,-90")
+"""Where the sensors sit on the ego."""
 
 
-def run_demo(folder: str | Path, say: Say, recording: str | Path = RECORDING) -> None:
+def bundled() -> Path:
+    """The sample recording that is here: the whole one in a checkout, else the small one."""
+    return RECORDING if RECORDING.is_file() else SMALL
+
+
+def run_demo(folder: str | Path, say: Say, recording: str | Path | None = None) -> None:
     """Run the demonstration, and tell what happens.
 
     Parameters
     ----------
     folder : str or Path
         Made if it does not exist; what an earlier run left there is made anew.
-    recording : str or Path
-        The sample recording.
     say : function
         Takes each line.
+    recording : str or Path, optional
+        The sample recording; by default the one of the package.
 
     Raises
     ------
@@ -75,12 +86,10 @@ def run_demo(folder: str | Path, say: Say, recording: str | Path = RECORDING) ->
     SgstoreError
         Anything that the library refuses to do.
     """
-    folder, recording = Path(folder), Path(recording)
+    folder, recording = Path(folder), Path(recording or bundled())
     if not recording.is_file():
         raise TraceError(
-            "the sample recording is no part of the installed package; take sgstore/sample/town.mcap from the "
-            "project's repository: sgstore demo --recording town.mcap",
-            path=recording,
+            "no such recording; without --recording it is the package's", path=recording
         )
     _prepare(folder)
     _ingest(folder / STORE, recording, say)
@@ -103,7 +112,7 @@ def _prepare(folder: Path) -> None:
 
 def _ingest(store: Path, sample: Path, say: Say) -> None:
     say("A drive of 75 s through a small town, as a simulator recorded it: ground truth at 10 Hz,")
-    say(f"a camera, a lidar, and the road map, in {sample.stat().st_size / 1e6:.1f} MB of MCAP.")
+    say(f"sensors, and the road map, in {sample.stat().st_size / 1e6:.1f} MB of MCAP.")
     say("")
     say(f"$ sgstore ingest {store} town.mcap")
     outcome = ingest(store, [sample])[0]
@@ -153,7 +162,14 @@ def _export(store: Store, folder: Path, say: Say) -> Path:
     _, _, pattern = QUESTIONS[0]
     to = folder / "clips"
     clips = list(store.find(pattern).clips(before=2.0, after=2.0))
-    export = Export(store, tuple(clips), provenance={"query": pattern})
+    export = Export(
+        store,
+        tuple(clips),
+        with_graph=True,
+        mounts=parse_mounts(MOUNTS),
+        rebase_context=True,
+        provenance={"query": pattern},
+    )
     written = [one for one in write_export(export, to) if isinstance(one, WrittenClip)]
     say("")
     say(
@@ -163,7 +179,7 @@ def _export(store: Store, folder: Path, say: Say) -> Path:
     for clip in written:
         seconds = (clip.end_ns - clip.start_ns) / 1e9
         messages = sum(channel.messages for channel in clip.messages)
-        say(f"  {clip.file}: {seconds:.1f} s, {messages} messages, camera and lidar among them")
+        say(f"  {clip.file}: {seconds:.1f} s, {messages} messages, those of sensors among them")
     return written[0].file
 
 
@@ -184,4 +200,5 @@ def _say_what_next(folder: Path, clip: Path, pictures: list[Path | None], say: S
     say("")
     if any(pictures):
         say(f"The pictures are in {folder}/.")
-    say(f"{clip} opens in Foxglove or Lichtblick, and in sgstore again.")
+    say(f"{clip} opens in Foxglove or Lichtblick, and in sgstore again;")
+    say(f"{clip.with_name('layout.json')} is a layout for both.")

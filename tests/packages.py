@@ -21,9 +21,7 @@ from typing import Any
 
 REPOSITORY = Path(__file__).parents[1]
 RECORDING = Path("sample") / "town.mcap"
-"""In the package of a checkout only: a wheel is without it (``sgstore/demo.py`` says why)."""
-
-NOT_SHIPPED = ("__pycache__", RECORDING.parent.name)
+"""In the package of a checkout only: a wheel has a small one (``sgstore/demo.py`` says why)."""
 
 SHORT = (
     "test_cli_errors.py",
@@ -63,8 +61,9 @@ VARIES = {"seconds", "ingested_at", "file", "path", "uri", "sgstore", "duckdb", 
 def shipped() -> set[str]:
     """The files of the package in this checkout that a wheel must hold."""
     package = REPOSITORY / "sgstore"
-    files = (path.relative_to(REPOSITORY) for path in package.rglob("*") if path.is_file())
-    return {file.as_posix() for file in files if not set(NOT_SHIPPED) & set(file.parts)}
+    files = {path.relative_to(REPOSITORY) for path in package.rglob("*") if path.is_file()}
+    left_out = {"sgstore" / RECORDING}
+    return {file.as_posix() for file in files - left_out if "__pycache__" not in file.parts}
 
 
 def build(folder: Path, *, isolated: bool) -> Path:
@@ -79,9 +78,9 @@ def build(folder: Path, *, isolated: bool) -> Path:
     """
     with tempfile.TemporaryDirectory() as name:
         copy = Path(name) / "sgstore"
-        copy.mkdir()
-        for file in ("pyproject.toml", "README.md", "LICENSE"):
-            shutil.copy(REPOSITORY / file, copy)
+        (copy / "docs").mkdir(parents=True)
+        for file in ("pyproject.toml", "LICENSE", "NOTICE", "docs/description.md"):
+            shutil.copy(REPOSITORY / file, copy / file)
         shutil.copytree(
             REPOSITORY / "sgstore", copy / "sgstore", ignore=shutil.ignore_patterns("__pycache__")
         )
@@ -136,7 +135,7 @@ def lowest() -> list[str]:
 
 
 def try_wheel(folder: Path) -> None:
-    """Run the short tests from an installed wheel, in a folder without the package.
+    """Run the demonstration and the short tests from an installed wheel, in a folder without the package.
 
     Raises
     ------
@@ -153,7 +152,8 @@ def try_wheel(folder: Path) -> None:
     shown = subprocess.run(where, check=True, capture_output=True, text=True, cwd=folder / "copy")
     package = Path(shown.stdout.strip())
     assert package.is_relative_to(folder / "env"), package
-    (package / RECORDING).parent.mkdir()
+    demo = [str(programs / "sgstore"), "demo", "demonstration"]
+    subprocess.run(demo, check=True, cwd=folder, stdout=subprocess.DEVNULL)
     shutil.copy(REPOSITORY / "sgstore" / RECORDING, package / RECORDING)
     for name in ("tests", "docs", "bench", "samples"):
         ignored = shutil.ignore_patterns("__pycache__")

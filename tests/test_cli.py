@@ -60,16 +60,17 @@ def test_the_demo_leaves_a_store_pictures_and_a_clip(folder: Path) -> None:
     assert [p.stem for p in pictures] == ["crossing-at-red", "cut-in", "jaywalking"]
     assert all(p.read_bytes().startswith(PNG) for p in pictures)
     assert sorted(p.name for p in (folder / "clips").iterdir()) == [
+        "layout.json",
         "manifest.json",
         "town_001.mcap",
     ]
 
 
-def test_the_demo_says_where_its_recording_is_to_be_had(tmp_path: Path, sgstore: Any) -> None:
+def test_the_demo_says_that_a_recording_is_not_there(tmp_path: Path, sgstore: Any) -> None:
     code, _, err = sgstore("demo", tmp_path / "demo", "--recording", tmp_path / "town.mcap")
 
     assert code == 1
-    assert "sgstore/sample/town.mcap from the project's repository" in err
+    assert "no such recording" in err
     assert not (tmp_path / "demo").exists()
 
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import ast
 import re
+import shutil
+import subprocess
 import sys
+import tarfile
 import zipfile
 from typing import TYPE_CHECKING
 
@@ -44,8 +47,34 @@ def test_the_wheel_holds_what_the_checkout_holds(tmp_path: Path) -> None:
 
     with zipfile.ZipFile(wheel) as archive:
         held = {name for name in archive.namelist() if name.startswith("sgstore/")}
+        (about,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        metadata = archive.read(about).decode()
 
     assert held == packages.shipped()
+    # An index shows the description where nothing lies beside it.
+    assert "sgstore demo" in metadata
+    assert not re.search(r"\]\((?!https?://)", metadata)
+
+
+def test_a_source_distribution_can_run_its_tests(tmp_path: Path) -> None:
+    tracked = subprocess.run(
+        ["git", "ls-files"], cwd=packages.REPOSITORY, capture_output=True, text=True, check=False
+    )
+    if tracked.returncode:
+        pytest.skip("no checkout of git: there is nothing to compare with")
+    copy = tmp_path / "copy"
+    for name in tracked.stdout.splitlines():
+        if (packages.REPOSITORY / name).is_file():
+            (copy / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(packages.REPOSITORY / name, copy / name)
+    made = "from setuptools.build_meta import build_sdist; print(build_sdist('dist'))"
+    subprocess.run([sys.executable, "-c", made], cwd=copy, capture_output=True, check=True)
+    (file,) = (copy / "dist").iterdir()
+    with tarfile.open(file) as archive:
+        held = {name.partition("/")[2] for name in archive.getnames()}
+
+    left_out = {*tracked.stdout.splitlines()} - held
+    assert left_out == {".gitignore", ".dockerignore"}
 
 
 @pytest.mark.parametrize("needed", NEEDED)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from sgstore.roads import RoadMap
 
 SAMPLE = Path(str(files("sgstore"))) / "sample" / "town.mcap"
+SMALL = SAMPLE.parent / "small" / "town.mcap"
 TOWN = Path(__file__).parents[1] / "samples" / "town"
 IMAGE, CLOUD, CALIBRATION = (
     "/ego/camera/front/image",
@@ -548,3 +549,26 @@ def test_the_map_in_the_recording_is_the_one_beside_the_script(sample: Sample) -
     written = sample.messages["ground_truth_map"][0].open_drive_xml_content
 
     assert written == (TOWN / "town.xodr").read_text(encoding="utf-8")
+
+
+# The small one, which a wheel brings ------------------------------------------------------------------
+
+
+def test_the_small_sample_is_the_town_without_lidar_and_with_a_picture_a_second(
+    tmp_path: Path,
+) -> None:
+    def held(path: Path) -> list[tuple[str, int, int, int, bytes]]:
+        with path.open("rb") as stream:
+            return [
+                (channel.topic, m.log_time, m.publish_time, m.sequence, m.data)
+                for _, channel, m in make_reader(stream, validate_crcs=True).iter_messages()
+            ]
+
+    whole, small = held(SAMPLE), held(SMALL)
+    pictures = [one for one in small if one[0] == IMAGE]
+    others = [one for one in whole if one[0] not in {IMAGE, CLOUD}]
+
+    assert [one for one in small if one[0] != IMAGE] == others
+    assert set(pictures) <= set(whole)
+    assert [one[1] // 1_000_000_000 for one in pictures] == list(range(75))
+    assert SMALL.stat().st_size < 1.5e6

@@ -342,11 +342,11 @@ def demo(
         Path, Argument(metavar="DIR", help="Folder for its store, pictures and clips.")
     ] = Path("sgstore-demo"),
     recording: Annotated[
-        Path | None, Option("--recording", help="The sample recording, where the package lacks it.")
+        Path | None, Option("--recording", help="The sample recording; by default the package's.")
     ] = None,
 ) -> int:
     """Run the main job on the bundled recording: ingest, find, show, export."""
-    from sgstore.demo import RECORDING, run_demo
+    from sgstore.demo import run_demo
 
-    run_demo(folder, typer.echo, recording or RECORDING)
+    run_demo(folder, typer.echo, recording)
     return 0
