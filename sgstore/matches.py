@@ -85,12 +85,9 @@ LOOKED_AT: Final = 2_000
 ROWS: Final = 1_000_000
 """Rows that a window should not exceed by much: it grows, or shrinks, as those before it had few or many."""
 
-
 BLOCK: Final = 50_000
 """Matches over several frames that the database is given at a time."""
-
 T = TypeVar("T")
-
 
 if TYPE_CHECKING:
 
@@ -147,12 +144,15 @@ class Matches(Tabular):
         ``t`` (seconds since the trace began), then for each variable its node id, and its name under
         ``….name``.
     notes : tuple of str
-        What may be a mistake: a text that is compared with a name, say, of which the store has none, and which
-        is the nearest. Asked of the store when it is read.
+        What may be a mistake, such as a name that nothing in the store has. Asked of the store when it is read.
     graphs : bool
         Whether each row ends in a graph, as ``RETURN SUBGRAPHS`` asks: its ``nodes`` and its ``edges``, lists
         of dicts in node-link form.
+    of_match : bool
+        Whether one value is returned, and that is of each match as a whole: ``MIN(x) OVER match``.
     """
+
+    of_match = False
 
     def __init__(
         self,

@@ -176,13 +176,14 @@ class Writer:
         return f"{using}MATCH {self.block(DEPTH)}{self.returned()}"
 
     def sequence(self) -> str:
-        text = f"MATCH {self.block(1)}{self.rng.choice(HOLDS)} AS s0"
+        text, parts = f"MATCH {self.block(1)}{self.rng.choice(HOLDS)} AS s0", ["match", "s0"]
         for number in range(1, self.rng.randint(2, 3)):
             nodes = ", ".join(f"({name})" for name in self.names) or "(e:Ego)"
             absent = self.rng.random() < 0.15
             text += f" {self.rng.choice(LINKS)} {'NOT ' * absent}MATCH {nodes}"
             text += f" WHERE {self.condition(1)}"
             text += "" if absent else f"{self.rng.choice(HOLDS)} AS s{number}"
+            parts += [] if absent else [f"s{number}", f"s0..s{number}"]
         ends = (
             "",
             "",
@@ -190,7 +191,9 @@ class Writer:
             " RETURN INTERVALS",
             " RETURN CLIPS(-1s, +1s)",
         )
-        return text + self.rng.choice((*ends, " RETURN FRAMES LIMIT 5", " RETURN t(s0), INTERVALS"))
+        over = f" RETURN {self.over(parts)}, {self.rng.choice(('t(s0)', 'INTERVALS'))}"
+        ends = (*ends, over, " RETURN FRAMES LIMIT 5", " RETURN t(s0), INTERVALS")
+        return text + self.rng.choice(ends)
 
     def check(self) -> str:
         self.names = self.rng.choice(([], ["v"]))
@@ -198,7 +201,17 @@ class Writer:
         self.names = [*self.names, "ego"]
         reset = f" RESET WHEN {self.test(0)}" if self.rng.random() < 0.2 else ""
         margin = self.rng.choice(("", " ROBUSTNESS"))
-        return f"CHECK c: {head}{self.timed(2)}{reset}{margin}"
+        returned = f" RETURN {self.over(['match'])}" if self.rng.random() < 0.3 else ""
+        return f"CHECK c: {head}{self.timed(2)}{reset}{margin}{returned}"
+
+    def over(self, parts: list[str]) -> str:
+        """A value over a match, or over a part of it."""
+        names = self.names or ["ego"]
+        a, b = self.rng.choice(names), self.rng.choice(names)
+        operands = f"{a}.speed", f"dist({a}, {b})", f"delta({a}.x, 1s)", f"{a}.speed + {b}.x"
+        word = self.rng.choice(("MIN", "MAX", "AVG", "SUM", "FIRST", "LAST", "ARGMIN", "ARGMAX"))
+        more = ", frame.seq" if word[:3] == "ARG" and self.rng.random() < 0.5 else ""
+        return f"{word}({self.rng.choice(operands)}{more}) OVER {self.rng.choice(parts)} AS o"
 
     def block(self, depth: int) -> str:
         paths = [self.path(depth) for _ in range(self.rng.choice((1, 1, 2)))]

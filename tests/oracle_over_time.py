@@ -13,6 +13,7 @@ import sys
 import tempfile
 from collections import Counter
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,16 +23,19 @@ from oracle_worlds import random_world
 
 import sgstore
 from sgstore.errors import TextSpan
+from sgstore.graph import SceneGraph
 from sgstore.lang import parse
 from sgstore.lang import syntax as s
 from sgstore.store import StoreFile
+from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from oracle_worlds import Trace, World
+    from oracle_worlds import Frame, Trace, World
 
     from sgstore.query import Store
+    from sgstore.temporal import MonitorEvent
 
 Binding = dict[str, int]
 GAP = 2.5
@@ -401,6 +405,56 @@ class Told:
                 if policy == "first":
                     break
 
+    def over(self, e: s.OverExpression, span: tuple[int, int], binding: Binding) -> Any:
+        """A value over some frames, both ends included."""
+        assert isinstance(e.call, s.Call)
+        word, (operand, *more) = e.call.name.upper(), e.call.arguments
+        frames = list(range(span[0], span[1] + 1))
+        if word in {"FIRST", "LAST"}:
+            return self.value(operand, frames[0 if word == "FIRST" else -1], binding)
+        told = [(self.value(operand, i, binding), i) for i in frames]
+        known = [(value, i) for value, i in told if value is not None]
+        if not known:
+            return None
+        values = [value for value, _ in known]
+        if word in {"SUM", "AVG"}:
+            return math.fsum(values) / (len(values) if word == "AVG" else 1)
+        best = (min if word.endswith("MIN") else max)(values)
+        if not word.startswith("ARG"):
+            return best
+        at = next(i for value, i in known if value == best)
+        return self.value(more[0], at, binding) if more else self.seconds(at)
+
+    def beside(self, e: Any, span: Any, i: int, binding: Binding) -> Any:
+        """A value over some frames, or one of a frame less such a value."""
+        if isinstance(e, s.OverExpression):
+            return self.over(e, span(e), binding)
+        ((_, over),) = e.rest
+        return arithmetic(
+            "-", self.value(e.first, i, binding), self.over(over, span(over), binding)
+        )
+
+    def seconds(self, i: int) -> float:
+        return (self.times[i] - self.times[0]) / 1e9
+
+    def spans(
+        self, sequence: s.SequenceClause, binding: Binding, frames: list[int], end: int
+    ) -> dict[tuple[str, str], tuple[int, int]]:
+        """The frames of a match, by the names of the steps that a part of it begins and ends with."""
+        steps = [step for step in sequence.steps if not step.absent]
+        known = set().union(*map(names_of, steps))
+        found = {("", ""): (frames[0], end)}
+        for n, one in enumerate(steps):
+            own = {i for i, b in self.holds(one, known) if agrees(dict(b), binding)}
+            run = self.run(frames[n], own)
+            found[one.name, ""] = run[0], run[-1]
+            found |= {
+                (one.name, later.name): (frames[n], frames[m])
+                for m, later in enumerate(steps)
+                if m > n
+            }
+        return found
+
     def bindings(self, held: list[set[Any]]) -> list[Binding]:
         """All assignments of the variables of some steps that agree."""
         found: list[Binding] = [{}]
@@ -654,6 +708,181 @@ def compare_condition(world: World, store: Store, rng: random.Random, where: str
     return sum(expected.values())
 
 
+OPERANDS = ("e.speed", "e.x", "frame.t", "delta(e.x, 0.2s)", "since_true(e.speed > 2)")
+PAIR_OPERANDS = (
+    "v.speed",
+    "dist(e, v)",
+    "e.speed - v.speed",
+    "avg_over(v.x, 0.2s)",
+    "age(v)",
+    "prev(v.speed)",
+)
+OVER = ("MIN", "MAX", "AVG", "SUM", "FIRST", "LAST", "ARGMIN", "ARGMAX")
+
+
+def over_values(rng: random.Random, names: list[str], *, pair: bool) -> list[str]:
+    """Values over a match whose steps have these names."""
+    found: list[str] = []
+    for _ in range(4):
+        operands = OPERANDS + (PAIR_OPERANDS * 2 if pair else ())
+        word, operand = rng.choice(OVER), rng.choice(operands)
+        more = f", {rng.choice(operands)}" if word[:3] == "ARG" and rng.random() < 0.5 else ""
+        part = rng.choice(("match", *names))
+        if len(names) > 1 and rng.random() < 0.3:
+            part = "..".join(sorted(rng.sample(names, 2)))
+        found.append(f"{word}({operand}{more}) OVER {part}")
+    found.append(f"{rng.choice(('e.x', 'prev(e.x)'))} - {rng.choice(OVER[:4])}(e.x) OVER match")
+    return found
+
+
+def compare_over_sequence(world: World, store: Store, rng: random.Random) -> int:
+    """Ask values over the matches of a sequence both ways; how many there are."""
+    text = random_sequence(rng)
+    policy = rng.choice(("all", "first", "longest"))
+    (plain,) = parse(text)
+    assert isinstance(plain, s.MatchClause)
+    steps = [one for one in plain.sequence.steps if isinstance(one, s.StepClause) and one.name]
+    names = [str(step.name) for step in steps]
+    asked = over_values(rng, names, pair="(v" in text)
+    returns = ", ".join(f"{value} AS y{n}" for n, value in enumerate(asked))
+    query = f"USING UNKNOWN false, MATCHES {policy} {text} RETURN trace.name, t(s0), {returns}"
+    found = Counter(rounded_row(row) for row in store.find(query))
+    (statement,) = parse(query)
+    assert isinstance(statement, s.MatchClause)
+    assert statement.returns is not None
+    values = [item.value for item in statement.returns.items[2:]]
+    expected: Counter[Any] = Counter()
+    for trace in world.traces:
+        told = Told(trace, periods(store)[trace.name])
+        for binding, frames, end in told.sequences(statement.sequence, policy):
+            spans = told.spans(statement.sequence, binding, frames, end)
+            parts = partial(lambda e, spans: spans[part_of(e)], spans=spans)
+            row = [told.beside(one, parts, frames[-1], binding) for one in values]
+            expected[rounded_row((trace.name, told.seconds(frames[0]), *row))] += 1
+    assert found == expected, (query, found - expected, expected - found)
+    seen = Counter(row for trace in world.traces for row in watched(trace, query, periods(store)))
+    assert seen == expected, (query, seen - expected, expected - seen)
+    return sum(expected.values())
+
+
+def watched(trace: Trace, text: str, period: dict[str, int]) -> Iterator[tuple[Any, ...]]:
+    """The values of what is found in a trace frame by frame."""
+    events: list[MonitorEvent] = []
+    told = {"on_event": events.append, "trace": trace.name}
+    monitor = Monitor(text, period_s=period[trace.name] / 1e9, **told)
+    for frame in trace.frames:
+        monitor.look([graph_of(frame)])
+    monitor.finish()
+    return (rounded_row((trace.name, *event.values.values())) for event in events)
+
+
+def graph_of(frame: Frame) -> SceneGraph:
+    edges = [
+        (src, relation, dst, {k: v for k, v in data.items() if k != "relation"})
+        for src, dst, relation, data in frame.graph.edges(keys=True, data=True)
+    ]
+    about = frame.frame_id, frame.trace.name, frame.seq, frame.time_ns, frame.ego
+    return SceneGraph(*about, dict(frame.graph.nodes(data=True)), edges)
+
+
+def part_of(e: Any) -> tuple[str, str]:
+    return (e.start.name if e.start else "", e.end.name if e.end else "")
+
+
+def rounded_row(row: Any) -> tuple[Any, ...]:
+    return tuple(round(v, 5) + 0.0 if isinstance(v, int | float) else v for v in row)
+
+
+def compare_over_pattern(world: World, store: Store, rng: random.Random) -> int:
+    """Ask values over the runs of a pattern's matches both ways; how many rows there are."""
+    where = condition(rng, pair=True, depth=rng.randint(0, 1), temporal=rng.random() < 0.3)
+    asked = over_values(rng, [], pair=True)
+    text = f"USING UNKNOWN false MATCH (e:Ego), (v:Entity) WHERE {where} RETURN trace.name, frame.seq, e, v, "
+    text += ", ".join(f"{value} AS y{n}" for n, value in enumerate(asked))
+    found = Counter(rounded_row(row) for row in store.find(text))
+    (statement,) = parse(text)
+    assert isinstance(statement, s.MatchClause)
+    assert statement.returns is not None
+    values = [item.value for item in statement.returns.items[4:]]
+    expected: Counter[Any] = Counter()
+    runs: Counter[Any] = Counter()
+    for trace in world.traces:
+        told = Told(trace, periods(store)[trace.name])
+        step = replace(statement.sequence.steps[0], hold=None)
+        held = told.holds(step, {"e", "v"})
+        for i, nodes in held:
+            binding = dict(nodes)
+            run = told.run(i, {j for j, other in held if other == nodes})
+            parts = partial(lambda _, ends: ends, ends=(run[0], run[-1]))
+            row = [told.beside(one, parts, i, binding) for one in values]
+            seq = trace.frames[i].seq
+            expected[rounded_row((trace.name, seq, binding["e"], binding["v"], *row))] += 1
+            runs[rounded_row((trace.name, *row))] += i == run[0]
+    assert found == expected, (text, found - expected, expected - found)
+    seen = Counter(row for trace in world.traces for row in watched(trace, text, periods(store)))
+    assert seen == +runs, (text, seen - runs, runs - seen)
+    return sum(expected.values())
+
+
+def compare_over_check(world: World, store: Store, rng: random.Random) -> int:
+    """Ask values over the violations of a check both ways; how many there are."""
+    check = random_check(rng)
+    pair = "(v:Entity)" in check
+    if rng.random() < 0.7:
+        reset = condition(rng, pair, rng.randint(0, 1), temporal=False)
+        check += " RESET WHEN " + re.sub(r"\be\b", "ego", reset)
+    asked = [re.sub(r"\be\b", "ego", one) for one in over_values(rng, [], pair=pair)]
+    asked += [rng.choice(("ego.speed", "prev(ego.x)", "frame.t"))]
+    returns = ", ".join(f"{value} AS y{n}" for n, value in enumerate(asked))
+    text = f"USING UNKNOWN false {check} RETURN {returns}"
+    (statement,) = parse(text)
+    assert isinstance(statement, s.CheckClause)
+    values = [item.value for item in statement.returns]
+    many = 0
+    for verdict in store.check(text):
+        (trace,) = (one for one in world.traces if one.name == verdict.trace)
+        told = Told(trace, periods(store)[trace.name])
+        place = {frame.seq: number for number, frame in enumerate(trace.frames)}
+        known = [(one, one.violations) for one in verdict.witnesses]
+        alone = [] if pair else [(None, verdict.violations)]
+        for witness, violations in known or alone:
+            binding = {"ego": trace.ego, **(dict(witness.nodes) if witness else {})}
+            for one in violations:
+                span = place[one.start_seq], place[one.end_seq]
+                parts = partial(lambda _, ends: ends, ends=span)
+                row = [told.beside(e, parts, span[0], binding) for e in values[:-1]]
+                row.append(told.value(values[-1], span[0], binding))
+                found = (one.values[f"y{n}"] for n in range(len(values)))
+                wanted = rounded_row(row)
+                assert rounded_row(found) == wanted, (text, trace.name, one, wanted)
+                many += 1
+        seen = violations_watched(trace, text, periods(store))
+        stored = Counter((*i, v) for _, found in known for i, v in spans_of(found, trace))
+        if known:
+            assert seen == stored, (text, trace.name, seen - stored, stored - seen)
+    return many
+
+
+def violations_watched(trace: Trace, text: str, period: dict[str, int]) -> Counter[Any]:
+    """The violations of a check, with what is returned of them, frame by frame."""
+    monitor = Monitor(text, period_s=period[trace.name] / 1e9, trace=trace.name)
+    for frame in trace.frames:
+        monitor.look([graph_of(frame)])
+    (verdict,) = monitor.finish()
+    found = [span for one in verdict.witnesses for span in one.violations]
+    return Counter(
+        (i.start_seq, i.end_seq, rounded_row(v for k, v in i.values.items() if k[0] == "y"))
+        for i in found
+    )
+
+
+def spans_of(found: Any, trace: Trace) -> Iterator[tuple[tuple[int, int], Any]]:
+    place = {frame.seq: number for number, frame in enumerate(trace.frames)}
+    for i in found:
+        values = rounded_row(v for k, v in i.values.items() if k[0] == "y")
+        yield (place[i.start_seq], place[i.end_seq]), values
+
+
 EDGES = (
     ("(e:Ego)-[d:near|visible]->(v:Entity)", ("type(d)",)),
     ("(e:Ego)-[d:near|visible|isIn]-(v)", ("type(d)",)),
@@ -811,6 +1040,9 @@ def run(seeds: int, questions: int, folder: Path) -> tuple[int, int, int]:
             found[0] += compare_sequence(world, store, random_sequence(rng), policy)
             found[1] += compare_condition(world, store, rng)
             found[2] += compare_check(world, store, random_check(rng))
+            found[0] += compare_over_sequence(world, store, rng)
+            found[1] += compare_over_pattern(world, store, rng)
+            found[2] += compare_over_check(world, store, rng)
     return found[0], found[1], found[2]
 
 

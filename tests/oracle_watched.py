@@ -24,7 +24,7 @@ from sgstore.sgg import SceneGraphGenerator
 from sgstore.temporal import Monitor, opened
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from sgstore.graph import SceneGraph
     from sgstore.matches import Interval
@@ -47,6 +47,22 @@ CHECK stops: ALWAYS (ego.speed > 1 IMPLIES EVENTUALLY[0s, 3s] ego.speed < 1) AND
 USING END pending CHECK due: EVENTUALLY ego.speed > 40;
 USING END weak CHECK forgiven: EVENTUALLY ego.speed > 40
 """
+
+VALUES = (
+    "MATCH (e:Ego) WHERE e.speed > 5 AS a THEN MATCH (e) WHERE e.speed < 1 AS b RETURN t(b) - t(a) AS s,"
+    " MIN(e.accel) OVER match, ARGMAX(e.speed) OVER a..b, AVG(e.speed) OVER a, e.speed - MAX(e.speed) OVER b",
+    "MATCH (e:Ego), (v:Vehicle) WHERE dist(e, v) < 12 RETURN MIN(dist(e, v)) OVER match,"
+    " FIRST(v.speed) OVER match, ARGMIN(dist(e, v), v.kind) OVER match, SUM(delta(v.x, 1s)) OVER match",
+    "MATCH (e:Ego), (v:Vehicle) WHERE dist(e, v) < 15 FOR >= 1s AS a"
+    " THEN WITHIN 3s MATCH (v) WHERE v.speed < 3 FOR >= 0.5s AS b"
+    " RETURN MIN(ttc(e, v)) OVER match, LAST(dist(e, v)) OVER match, MAX(v.speed) OVER a, MIN(v.speed) OVER b,"
+    " LAST(frame.seq) OVER b",
+    "MATCH (e:Ego) WHERE e.speed < 1 AS a THEN NOT MATCH (e) WHERE e.speed > 8"
+    " THEN MATCH (p:Person) WHERE p.speed > 1 AND EVENTUALLY[0s, 1s] p.speed < 1 AS b"
+    " RETURN MIN(dist(e, p)) OVER match, FIRST(dist(e, p)) OVER a..b, AVG(coalesce(prev(p.speed), 0)) OVER b",
+    "USING MATCHES longest MATCH (e:Ego) WHERE e.speed < 3 AS a UNTIL MATCH (e) WHERE e.speed > 2 AS b"
+    " RETURN MAX(run_length(e.speed < 3)) OVER a, t(a) + MIN(e.speed) OVER b",
+)
 
 MARGINS = """
 CHECK apart: FORALL (v:Vehicle) ALWAYS NOT dist(ego, v) < 8 ROBUSTNESS;
@@ -176,6 +192,24 @@ class Drive:
             often.append(len(intervals))
         return often
 
+    def compare_values(self, texts: Sequence[str]) -> int:
+        """Values over matches, watched and stored; how many matches there are."""
+        _, events, _ = self.watched(";\n".join(texts))
+        many = 0
+        for number, text in enumerate(texts, start=1):
+            name = "pattern" if len(texts) == 1 else f"pattern {number}"
+            told = (event.values for event in events if event.name == name)
+            seen = Counter(_rounded(one.values()) for one in told)
+            found = self.store.find(text)
+            if " AS a" in text:
+                stored = Counter(map(_rounded, found))
+                assert seen == stored, (self.name, text, seen - stored, stored - seen)
+            else:
+                runs = {_rounded(one.values.values()) for one in found.intervals()}
+                assert set(seen) == runs, (self.name, text, set(seen) ^ runs)
+            many += sum(seen.values())
+        return many
+
     def compare_edges(self, questions: Sequence[tuple[str, list[str]]]) -> int:
         """Patterns with conditions on an edge variable, told where a store has them true; how many runs.
 
@@ -209,6 +243,10 @@ class Drive:
                 assert wanted == seen, (self.name, pattern, one, wanted - seen, seen - wanted)
                 runs += len(begun)
         return runs
+
+
+def _rounded(values: Iterable[Any]) -> tuple[Any, ...]:
+    return tuple(round(v, 5) + 0.0 if isinstance(v, int | float) else v for v in values)
 
 
 def _who(values: Any, names: set[str], idents: dict[int, str]) -> tuple[tuple[str, Any], ...]:
@@ -253,7 +291,9 @@ def compare(recording: Path, folder: Path) -> tuple[int, int, int]:
     drive = Drive.of(recording, folder)
     violations = sum(drive.compare_checks(text) for text in (CHECKS, library_checks()))
     violations += drive.compare_checks(CHECKS, sgsm_compat=True)
+    drive.compare_margins(MARGINS)
     matches = sum(drive.compare_matches([*SEQUENCES, *library_matches()]))
+    matches += drive.compare_values(VALUES)
     return len(drive.graphs), violations, matches
 
 

@@ -425,6 +425,26 @@ def test_a_label_may_look_ahead_beyond_its_clip(store: Store) -> None:
     assert 0 < sum(now) < len(now)
 
 
+def test_a_label_may_be_a_value_over_each_match(store: Store) -> None:
+    text = "MATCH (e:Ego) WHERE e.speed > 8 AS a THEN MATCH (e) WHERE e.speed < 8 RETURN MAX(e.speed) OVER a"
+    fast = "MATCH (e:Ego) WHERE e.speed > 8 RETURN frame.seq, MAX(e.speed) OVER match AS top"
+    clip = Export(store, (Clip("town", 0, 60 * S),))
+
+    labels = labelled(clip, {"top": fast.replace("frame.seq, ", ""), "then": text}).labels
+
+    assert labels is not None
+    top = dict(map(tuple, store.find(fast)))
+    seqs = (labels.frame_id >> 6) * 60 + (labels.frame_id & 63)
+    first = [seq - seqs[0] for seq in seqs.tolist()]
+    assert labels.values["top"].tolist() == [top.get(seq) for seq in first]
+    (one, *_) = store.find(text.replace(" RETURN", " RETURN INTERVALS,"))
+    told = {seq for seq, value in zip(first, labels.values["then"].tolist(), strict=True) if value}
+    assert {*range(one.start_seq, one.end_seq + 1)} <= told
+    near = "MATCH (e:Ego), (v:Vehicle) WHERE dist(e, v) < 40 RETURN MIN(dist(e, v)) OVER match"
+    with pytest.raises(ExportError, match="matches overlap"):
+        labelled(clip, {"d": near})
+
+
 @pytest.mark.parametrize(
     ("text", "error"),
     [

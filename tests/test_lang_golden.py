@@ -14,7 +14,7 @@ import pytest
 from oracle_worlds import SCHEMA
 
 from sgstore.errors import QueryError
-from sgstore.lang import Catalog, TraceFacts, compile_query
+from sgstore.lang import Catalog, TraceFacts, bind_checks, compile_query, parse
 
 FOLDER = Path(__file__).parent / "golden"
 FILES = sorted(FOLDER.glob("*.txt"))
@@ -71,6 +71,10 @@ def test_queries_give_what_the_file_says(path: Path, empty: duckdb.DuckDBPyConne
 
 
 def outcome(query: str, empty: duckdb.DuckDBPyConnection) -> str:
+    if query.startswith("CHECK bound:"):
+        with pytest.raises(QueryError) as refused:
+            bind_checks(query, parse(query), lambda _: CATALOG, {})
+        return f"error\n{refused.value}"
     try:
         statement = compile_query(query, CATALOG).rows()
     except QueryError as error:

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from oracle_monitor import try_states
 from oracle_over_time import edge_questions
-from oracle_watched import CHECKS, MARGINS, SEQUENCES, Drive, library_checks
+from oracle_watched import CHECKS, MARGINS, SEQUENCES, VALUES, Drive, library_checks
 from thorough import LONG
 
 import sgstore.temporal._sequences as joins
@@ -72,6 +72,10 @@ def test_a_recording_watched_has_the_verdicts_that_it_has_in_a_store(
 
 def test_a_recording_watched_meets_checks_by_as_much_as_in_a_store(town: Drive) -> None:
     assert town.compare_margins(MARGINS) >= 6
+
+
+def test_values_over_matches_are_those_that_they_have_in_a_store(town: Drive) -> None:
+    assert town.compare_values(VALUES) > 20
 
 
 def test_by_how_much_a_check_is_met_so_far_is_known_at_any_time() -> None:

@@ -16,6 +16,9 @@ from oracle_over_time import (
     compare_check,
     compare_condition,
     compare_edges,
+    compare_over_check,
+    compare_over_pattern,
+    compare_over_sequence,
     compare_sequence,
     edge_questions,
     random_check,
@@ -74,6 +77,21 @@ def test_conditions_over_time_are_what_their_definition_says(asked: tuple[World,
     found = [compare_condition(*asked, rng) for _ in range(12)]
 
     assert sum(found) > 10
+
+
+def test_values_over_matches_are_what_their_definition_says(asked: tuple[World, Store]) -> None:
+    """Of sequences, of patterns and of violations; over a store, frame by frame, and as they are defined."""
+    rng = random.Random(9)
+
+    found = [
+        [
+            compare(*asked, rng)
+            for compare in (compare_over_sequence, compare_over_pattern, compare_over_check)
+        ]
+        for _ in range(3)
+    ]
+
+    assert all(sum(one) > 3 for one in zip(*found, strict=True))
 
 
 LOOSE = "MATCH (a), (b), (c) AS s0 THEN MATCH (b), (a), (c) AS s1 RETURN trace.name, a, b, c"

@@ -124,22 +124,22 @@ def _why_not(
 
 
 def _check(store: Store, limit: int, text: str, parameters: Mapping[str, Any]) -> Reply:
-    from sgstore.temporal import verdict_columns, verdict_rows
+    from sgstore.temporal import columns_returned, verdict_columns, verdict_rows
 
     asked, values = _named(text, parameters, check=True)
     run = store.check(asked, **values)
-    margin = run.quantitative
+    told: dict[str, Any] = {"margin": run.quantitative, "returned": columns_returned(run.returned)}
     tally: Counter[str] = Counter()
     rows, unknown, truncated = list[tuple[Any, ...]](), dict[str, str](), False
     for verdict in run:
         tally[verdict.verdict] += 1
         if verdict.reason:
             unknown[verdict.trace] = verdict.reason
-        own = list(islice(verdict_rows(verdict, margin=margin), limit + 1 - len(rows)))
+        own = list(islice(verdict_rows(verdict, **told), limit + 1 - len(rows)))
         rows += own
     truncated = len(rows) > limit
     listed = {
-        "columns": verdict_columns(margin=margin),
+        "columns": verdict_columns(**told),
         "rows": rows[:limit],
         "truncated": truncated,
     }

@@ -44,7 +44,7 @@ from sgstore.cli._places import collection_at, say_missing, url_of
 from sgstore.files import without_controls, write_bytes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from sgstore.collection import PartedChecks
     from sgstore.matches import Interval
@@ -164,7 +164,7 @@ def _reported(
     junit: Path | None,
 ) -> int:
     """Print verdicts, or how the checks are understood; the exit code."""
-    from sgstore.temporal import verdict_columns, verdict_rows
+    from sgstore.temporal import columns_returned, verdict_columns, verdict_rows
 
     if explain:
         typer.echo(run.explain())
@@ -180,15 +180,20 @@ def _reported(
             tally[verdict.verdict] = tally.get(verdict.verdict, 0) + 1
             yield verdict
 
-    quantitative = run.quantitative
+    quantitative, returned = run.quantitative, run.returned
     if ask.for_people:
-        told = (row for one in counted() for row in verdict_rows(one, margin=quantitative))
-        ask.write(verdict_columns(margin=quantitative), told)
+        shown: dict[str, Any] = {"margin": quantitative, "returned": columns_returned(returned)}
+        ask.write(
+            verdict_columns(**shown),
+            (row for one in counted() for row in verdict_rows(one, **shown)),
+        )
         say(", ".join(f"{count} {word}" for word, count in tally.items()))
     else:
         more = ("robustness",) if quantitative else ()
         told = (
-            (*_document(one), _margin_document(one))[: len(_DOCUMENT) + len(more)]
+            (*_document(one, returned[one.check]), _margin_document(one))[
+                : len(_DOCUMENT) + len(more)
+            ]
             for one in counted()
         )
         ask.write((*_DOCUMENT, *more), told)
@@ -210,15 +215,15 @@ _DOCUMENT: Final = (
 """Columns of verdicts as a program reads them."""
 
 
-def _document(verdict: Verdict) -> tuple[Any, ...]:
+def _document(verdict: Verdict, returned: Sequence[str]) -> tuple[Any, ...]:
     """A verdict as a program reads it."""
-    spans = [_span(one) for one in verdict.violations]
+    spans = [_span(one, returned) for one in verdict.violations]
     witnesses = [
         {
             "nodes": dict(one.nodes),
             "names": dict(one.names),
             "holds": one.holds,
-            "violations": [_span(span) for span in one.violations],
+            "violations": [_span(span, returned) for span in one.violations],
         }
         for one in verdict.witnesses
     ]
@@ -235,9 +240,12 @@ def _margin_document(verdict: Verdict) -> dict[str, Any] | None:
     return {**asdict(found), "value": value}
 
 
-def _span(interval: Interval) -> dict[str, Any]:
+def _span(interval: Interval, returned: Sequence[str]) -> dict[str, Any]:
     names = ("start_seq", "end_seq", "start_ns", "end_ns", "start", "end", "frames")
-    return {name: getattr(interval, name) for name in names}
+    about = {name: getattr(interval, name) for name in names}
+    if returned:
+        about["values"] = {name: interval.values.get(name) for name in returned}
+    return about
 
 
 # The verb that watches: checks and patterns over a recording as if it were live, or a running simulator ----
@@ -321,12 +329,17 @@ def _for_people(event: MonitorEvent) -> None:
         about = f"after {event.end.t - event.start.t:.3f} s"
     if event.at_end:
         about = "at the end"
-    parts = (f"{event.told.t:9.3f} s", event.kind.ljust(10), event.name, who, about)
+    from sgstore.temporal import cell_of
+
+    values = ", ".join(f"{name} = {cell_of(value)}" for name, value in event.values.items())
+    parts = (f"{event.told.t:9.3f} s", event.kind.ljust(10), event.name, who, about, values)
     _line("  ".join(part for part in parts if part))
 
 
 def _as_json(event: MonitorEvent) -> None:
     about = asdict(event)
+    if not event.values:
+        del about["values"]
     _line(json_text({"event": about.pop("kind"), **about}))
 
 

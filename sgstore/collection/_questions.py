@@ -666,6 +666,13 @@ class PartedChecks:
         return any(one.check.robustness for one in self._checks)
 
     @property
+    def returned(self) -> dict[str, tuple[str, ...]]:
+        """Names of the values that each check returns of its violations."""
+        from sgstore.temporal import returned_by
+
+        return returned_by(one.check for one in self._checks)
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """Notes on likely mistakes: none are looked for in a collection."""
         return ()

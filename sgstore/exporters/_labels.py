@@ -4,8 +4,9 @@ Labels from queries: a value for each frame, by name.
 
 A label is an expression of the language about a frame (``ego.speed * 3.6``, ``EXISTS
 {(ego)-[:near]->(:Person)}``), or a whole query, which is true in the frames that it finds and false in the
-others. What is not known stays so: a label has no value in a frame without an ego if it speaks of the ego, nor
-in traces that cannot answer.
+others; one that returns a value over each match (``MIN(gap(e, v)) OVER match``) gives that in the frames of
+the match. What is not known stays so: a label has no value in a frame without an ego if it speaks of the ego,
+nor in traces that cannot answer.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import ExportError, QueryError, TextSpan
-from sgstore.store import SEQ_BITS, trace_of
+from sgstore.store import SEQ_BITS, frame_ids, trace_of
 from sgstore.world import tolerance_ns
 
 if TYPE_CHECKING:
@@ -124,6 +125,8 @@ def _asked(
     values = np.full(len(wanted), None, object)
     if _QUERY.match(text):
         matches = store.find(text, **parameters)
+        if matches.of_match:
+            return _over_matches(store, name, matches, wanted)
         left_out = {store.file.trace(trace).trace_id for trace in matches.left_out}
         values[~np.isin(trace_of(wanted), list(left_out))] = False
         found = np.fromiter((frame.frame_id for frame in matches.frames()), np.int64)
@@ -133,6 +136,26 @@ def _asked(
         if len(np.unique(row)) < len(row):
             raise ExportError(f"the label {name!r} has several values in one frame: {text}")
         values[row] = answer
+    return values
+
+
+def _over_matches(
+    store: Store, name: str, matches: Matches, wanted: Ints
+) -> np.ndarray[Any, np.dtype[np.object_]]:
+    """A value of each match in its frames; nothing in the others."""
+    values = np.full(len(wanted), None, object)
+    taken = np.zeros(len(wanted), np.bool_)
+    traces = {trace.name: trace.trace_id for trace in store.info()}
+    for one in matches.intervals():
+        (value,) = one.values.values()
+        ends = frame_ids(traces[one.trace], np.array([one.start_seq, one.end_seq]))
+        low, high = np.searchsorted(wanted, ends[0]), np.searchsorted(wanted, ends[1], "right")
+        differs = taken[low:high] & (values[low:high] != value)
+        if differs.any():
+            raise ExportError(
+                f"the label {name!r} has several values in one frame: matches overlap"
+            )
+        values[low:high], taken[low:high] = value, True
     return values
 
 

@@ -7,17 +7,19 @@ list, and the others NULL.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from sgstore.lang import ir as b
 from sgstore.lang import syntax as s
 from sgstore.lang._catalog import Type
-from sgstore.lang._symbols import SymbolTable
 from sgstore.records import dataclass
 from sgstore.vocabulary import normalize_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from sgstore.lang._symbols import SymbolTable
 
 
 PLACE: Final = '":rows".":place"'
@@ -106,7 +108,7 @@ def aggregate(e: s.Call, names: SymbolTable) -> b.Aggregate:
         )
         reason = f"{e.name}() takes {wanted} argument{'s' * (wanted > 1)}, found {len(e.arguments)}"
         session.refuse(reason, e.span, hint)
-    inner = SymbolTable(session, names.scope, names.meanings, names.parent, aggregated=True)
+    inner = replace(names, aggregates=False, aggregated=True, aliases={})
     if function.of == frozenset({Type.number}):
         operand = inner.number(e.arguments[0])
     else:

@@ -13,6 +13,7 @@ from sgstore.lang import ir as b
 from sgstore.lang import ir as o
 from sgstore.lang import syntax as s
 from sgstore.lang._bind_expressions import BINDERS, edge_attribute, node_attribute, parameter
+from sgstore.lang._bind_match_values import over_match
 from sgstore.lang._bind_temporal import StepScope, bind_sequence, settled, tense, timespan
 from sgstore.lang._catalog import TRACE_ATTRIBUTES, Catalog, Type
 from sgstore.lang._functions import FUNCTIONS, call
@@ -315,6 +316,7 @@ _BINDERS: Final[Binders] = {
     s.BlockExpression: _block,
     s.Call: call,
     s.Duration: timespan,
+    s.OverExpression: over_match,
     s.Temporal: tense,
 }
 """The binder of every kind of expression."""
@@ -513,7 +515,7 @@ _FORMS: Final[dict[str, b.Form]] = {
 def _result(returns: s.Returns | None, names: SymbolTable) -> b.Result:
     if returns is None:
         return b.Result()
-    inner = SymbolTable(names.session, names.scope, names.meanings, names.parent, aggregates=True)
+    inner = replace(names, aggregates=True, over=True)
     item = _special(returns, names.session)
     form = item.form if item is not None else "value"
     result = b.Result(
@@ -785,6 +787,7 @@ def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog)
             written.span,
             "leave out USING END weak, or ROBUSTNESS; bound the formula: EVENTUALLY[0s, 5s] …",
         )
+    returns = _returned(written, names)
     refuse_strange(session, catalog)
     return o.BoundCheck(
         name,
@@ -799,7 +802,24 @@ def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog)
         settings.end or "strong",
         settings.gaps or "break",
         written.robustness,
+        returns,
     )
+
+
+def _returned(written: WrittenCheck, names: SymbolTable) -> tuple[b.ReturnColumn, ...]:
+    """The values that are told of each violation."""
+    inner = replace(names, over=True)
+    found = tuple(_column(item, inner) for item in written.returns)
+    taken = [node.name for one in written.quantifiers for node in one.nodes]
+    called = [column.name for column in found]
+    for item, column in zip(written.returns, found, strict=True):
+        if [*taken, *called].count(column.name) > 1:
+            reason = f"two results are called '{column.name}'"
+            names.session.refuse(reason, item.span, "name them with AS")
+        if column.value.type is Type.node:
+            hint = "its name, v.name, or a number: v.speed"
+            names.session.refuse("a violation has values, not nodes", item.span, hint)
+    return found
 
 
 def _quantifier(

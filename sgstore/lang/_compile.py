@@ -49,6 +49,7 @@ from sgstore.lang.ir import (
     NodeAttribute,
     NodeValue,
     Operation,
+    OverMatch,
     PairNumber,
     Query,
     Result,
@@ -421,7 +422,7 @@ def value_text(value: Bound, indent: str = "") -> str:  # noqa: PLR0911 - a case
             return _operation(value, indent)
         case BlockValue():
             return _block(value, indent)
-        case Tense() | SignalCall() | StepTime():
+        case Tense() | SignalCall() | StepTime() | OverMatch():
             return _over_time(value, indent)
         case Aggregate(word=word, operand=operand, distinct=distinct, share=share):
             inner = "*" if operand is None else value_text(operand, indent)
@@ -433,7 +434,7 @@ def value_text(value: Bound, indent: str = "") -> str:  # noqa: PLR0911 - a case
             return _leaf(value)
 
 
-def _over_time(value: Tense | SignalCall | StepTime, indent: str) -> str:
+def _over_time(value: Tense | SignalCall | StepTime | OverMatch, indent: str) -> str:
     match value:
         case Tense(word=word, operands=operands):
             bound = _bound(value)
@@ -448,6 +449,16 @@ def _over_time(value: Tense | SignalCall | StepTime, indent: str) -> str:
             return f"{word}({value_text(operand, indent)}{by}){counted}"
         case StepTime(step=step):
             return f"t(step {step + 1})"
+        case OverMatch(word=word, operand=operand, at=at):
+            told = ", ".join(value_text(one, indent) for one in (operand, at) if one is not None)
+            return f"{word.upper()}({told}) OVER {_part(value)}"
+
+
+def _part(value: OverMatch) -> str:
+    if value.start is None or value.end is None:
+        return "match"
+    same = value.start == value.end
+    return f"step {value.start + 1}" + ("" if same else f"..{value.end + 1}")
 
 
 def _bound(tense: Tense) -> str:

@@ -270,7 +270,9 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
             return lambda _: chosen
         case b.Operation(word=word, operands=operands):
             return OPERATORS[word].one([evaluator(operand, blocks) for operand in operands])
-        case b.Aggregate() | b.GroupKey() | b.Tense() | b.SignalCall() | b.StepTime():
+        case (
+            b.Aggregate() | b.GroupKey() | b.Tense() | b.SignalCall() | b.StepTime() | b.OverMatch()
+        ):
             raise TypeError(f"{expression} has no value of its own")
 
 

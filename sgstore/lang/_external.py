@@ -38,6 +38,7 @@ from sgstore.lang.ir import (
     Kinds,
     NodeAttribute,
     NodeValue,
+    OverMatch,
     Result,
     ReturnColumn,
     Scope,
@@ -305,7 +306,7 @@ def with_places(query: Query) -> tuple[Query, dict[Bound, FrameAttribute]]:
 
     def placed(value: Bound) -> Bound:
         match value:
-            case Tense() | SignalCall() | StepTime():
+            case Tense() | SignalCall() | StepTime() | OverMatch():
                 if value not in places:
                     name = f":value {len(places)}"
                     attribute = Attribute(name, value.type, {}, "", DisplayUnit.whole)

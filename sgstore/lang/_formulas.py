@@ -21,6 +21,7 @@ from sgstore.lang.ir import (
     NodeAttribute,
     NodeValue,
     Operation,
+    OverMatch,
     PairNumber,
     SignalCall,
     StepTime,
@@ -414,7 +415,7 @@ def expression_text(expression: Bound, leaf: Callable[[Leaf], str], values: Boun
             return sql_of(expression, inner)
         case NodeAttribute(attribute=attribute) if attribute.values:
             return f"CAST({leaf(expression)} AS VARCHAR)"
-        case Choices() | LabelTest() | Tense() | SignalCall() | StepTime():
+        case Choices() | LabelTest() | Tense() | SignalCall() | StepTime() | OverMatch():
             raise TypeError(f"{expression} is no column")
         case _:
             return leaf(expression)
@@ -473,7 +474,9 @@ def _membership(
 def leaves(expression: Bound) -> Iterable[Leaf]:
     """The columns that an expression is made of."""
     match expression:
-        case Value() | Choices() | LabelTest() | Tense() | SignalCall() | StepTime() | GroupKey():
+        case Value() | Choices() | LabelTest() | GroupKey() | Tense() | SignalCall():
+            return
+        case StepTime() | OverMatch():
             return
         case Operation(operands=operands):
             for operand in operands:

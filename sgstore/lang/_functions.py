@@ -67,8 +67,15 @@ def call(e: s.Call, names: SymbolTable) -> b.Bound:
         return _predicate(e, names)
     if name in _TEMPORAL:
         return course(e, names)
-    if names.aggregates and is_aggregate(e):
-        return aggregate(e, names)
+    if not names.aggregated and is_aggregate(e):
+        if names.aggregates:
+            return aggregate(e, names)
+        if names.over:
+            names.session.refuse(
+                f"a CHECK returns values of each violation, and {e.name}() is of all rows",
+                e.span,
+                f"during it: {e.name}(x) OVER match" if name in b.OF_MATCH else None,
+            )
     if name in _FUNCTIONS:
         return _FUNCTIONS[name](e, names)
     if name in AGGREGATES:

@@ -408,7 +408,7 @@ def _built(rule: Rule, children: list[Any], span: TextSpan, text: str) -> Any:
 
 _OPERATORS: Final = frozenset(
     {"COMPARE", "SIGN", "STAR", "SLASH", "PERCENT", "AND", "OR", "XOR", "IMPLIES", "IS", "IN"}
-    | {"STARTS", "ENDS", "CONTAINS", "EQUAL", "UNTIL_OP", "UNTIL_LINK", "NOT"}
+    | {"STARTS", "ENDS", "CONTAINS", "EQUAL", "UNTIL_OP", "UNTIL_LINK", "NOT", "OVER"}
 )
 _EDGES: Final = frozenset({"BARE_RIGHT", "BARE_LEFT", "BARE_ANY", "_OPEN", "_OPEN_LEFT"})
 _LATER: Final = frozenset(

@@ -224,6 +224,8 @@ class SymbolTable:
         Whether ``COUNT(*)`` and the like may stand here.
     aggregated : bool
         Whether what stands here is inside of one.
+    over : bool
+        Whether values over a match may stand here.
     aliases : mapping of str to Bound
         What ``RETURN`` calls its values, where these may be spoken of; a name of one is no variable there.
     """
@@ -234,6 +236,7 @@ class SymbolTable:
     parent: SymbolTable | None = None
     aggregates: bool = False
     aggregated: bool = False
+    over: bool = False
     aliases: Mapping[str, Bound] = field(default_factory=dict[str, "Bound"])
 
     def block(self) -> SymbolTable:

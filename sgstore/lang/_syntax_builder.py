@@ -146,6 +146,16 @@ def _count_values(span: TextSpan, children: Children) -> s.Call:
     )
 
 
+def _over_match(span: TextSpan, children: Children) -> s.OverExpression:
+    return s.OverExpression(children[0], None, None, span)
+
+
+def _over_steps(span: TextSpan, children: Children) -> s.OverExpression:
+    value, *names = children
+    start, end = (name and s.Variable(name.text, name.span) for name in names)
+    return s.OverExpression(value, start, end, span)
+
+
 # Conditions ---------------------------------------------------------------------------------------
 
 
@@ -437,10 +447,17 @@ def _union(span: TextSpan, children: Children) -> s.UnionClause:
 
 
 def _check(span: TextSpan, children: Children) -> s.CheckClause:
-    settings, name, *quantifiers, formula, reset, robustness = children
-    called = name and name.text
+    settings, name, *quantifiers, formula, reset, robustness, returns = children
+    called, quantified = name and name.text, tuple(quantifiers)
+    distinct, items, having, at = returns or (False, (), None, span)
+    if distinct or having:
+        word = "DISTINCT" if distinct else "HAVING"
+        raise BuildError(f"violations are told one by one, so {word} has no meaning", at)
+    if any(item.form != "value" for item in items):
+        reason = "a CHECK returns values of its violations"
+        raise BuildError(reason, at, "RETURN MIN(gap(ego, v)) OVER match AS closest")
     asked = robustness is not None
-    return s.CheckClause(settings or (), called, tuple(quantifiers), formula, reset, asked, span)
+    return s.CheckClause(settings or (), called, quantified, formula, reset, asked, items, span)
 
 
 def _quantifier(span: TextSpan, children: Children) -> s.QuantifierClause:
@@ -609,6 +626,8 @@ BUILDERS: Final[dict[str, Callable[[TextSpan, Children], Any]]] = {
     "sign": _sign,
     "attribute": _attribute,
     "attribute_in": _attribute_in,
+    "over_match": _over_match,
+    "over_steps": _over_steps,
     "timespan": _duration,
     "parameter": _parameter,
     "variable": _variable,

@@ -337,6 +337,39 @@ class StepTime:
     type: Type = Type.number
 
 
+OF_MATCH: Final = ("min", "max", "avg", "sum", "first", "last", "argmin", "argmax")
+"""Functions of the values during a match."""
+
+PLACES: Final = frozenset({"argmin", "argmax"})
+"""Those of them that tell of a frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class OverMatch:
+    """A value made of those that an expression has in the frames of a match, or of a part of it.
+
+    Attributes
+    ----------
+    word : str
+        One of :data:`OF_MATCH`.
+    operand : Bound
+        A value at a frame.
+    start, end : int or None
+        Numbers of the steps in whose frames the part begins and ends; the same: the run of frames in which the
+        step holds. ``None``: the match.
+    at : Bound or None
+        Of ``argmin`` and ``argmax``: the value that is told of the frame.
+    type : Type
+    """
+
+    word: str
+    operand: Bound
+    start: int | None
+    end: int | None
+    at: Bound | None = None
+    type: Type = Type.number
+
+
 Bound = (
     Value
     | Choices
@@ -355,6 +388,7 @@ Bound = (
     | Tense
     | SignalCall
     | StepTime
+    | OverMatch
 )
 
 
@@ -585,6 +619,8 @@ def operands_of(expression: Bound) -> tuple[Bound, ...]:
             return operands
         case Aggregate(operand=operand) | SignalCall(operand=operand) if operand is not None:
             return (operand,)
+        case OverMatch(operand=operand, at=at):
+            return (operand,) if at is None else (operand, at)
         case _:
             return ()
 
@@ -596,6 +632,8 @@ def with_operands(expression: Bound, change: Callable[[Bound], Bound]) -> Bound:
             return replace(expression, operands=tuple(map(change, operands)))
         case Aggregate(operand=operand) | SignalCall(operand=operand) if operand is not None:
             return replace(expression, operand=change(operand))
+        case OverMatch(operand=operand, at=at):
+            return replace(expression, operand=change(operand), at=at and change(at))
         case _:
             return expression
 
@@ -616,7 +654,9 @@ def conjuncts(expression: Bound) -> list[Bound]:
 
 def is_temporal(expression: Bound) -> bool:
     """Tell whether an expression looks at more than one frame."""
-    return any(isinstance(part, Tense | SignalCall | StepTime) for part in walk(expression))
+    return any(
+        isinstance(part, Tense | SignalCall | StepTime | OverMatch) for part in walk(expression)
+    )
 
 
 def is_angle(value: Bound) -> bool:
@@ -805,6 +845,8 @@ class BoundCheck:
         known of what happened in it.
     robustness : bool
         Whether it is asked by how much the formula is true, or false.
+    returns : tuple of ReturnColumn
+        Values of each violation.
     """
 
     name: str
@@ -819,3 +861,4 @@ class BoundCheck:
     end: str = "strong"
     gaps: str = "break"
     robustness: bool = False
+    returns: tuple[ReturnColumn, ...] = ()

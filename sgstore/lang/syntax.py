@@ -192,6 +192,16 @@ class Temporal:
     bound: tuple[Duration | Parameter, Duration | Parameter | None] | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class OverExpression:
+    """``call OVER match``, ``call OVER start``, or ``call OVER start..end``: of a match, or of its steps."""
+
+    call: Expression
+    start: Variable | None
+    end: Variable | None
+    span: TextSpan
+
+
 Expression = (
     Constant
     | Duration
@@ -210,6 +220,7 @@ Expression = (
     | BlockExpression
     | Case
     | Temporal
+    | OverExpression
 )
 
 
@@ -501,7 +512,7 @@ class QuantifierClause:
 
 @dataclass(frozen=True, slots=True)
 class CheckClause:
-    """``USING … CHECK name: quantifiers formula RESET WHEN condition ROBUSTNESS``."""
+    """``USING … CHECK name: quantifiers formula RESET WHEN condition ROBUSTNESS RETURN items``."""
 
     settings: tuple[Setting, ...]
     name: str | None
@@ -509,6 +520,7 @@ class CheckClause:
     formula: Expression
     reset: Expression | None
     robustness: bool
+    returns: tuple[Item, ...]
     span: TextSpan
 
 

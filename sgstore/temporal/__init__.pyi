@@ -2,7 +2,10 @@
 
 from ._checks import CheckRun as CheckRun
 from ._checks import Verdict as Verdict
+from ._checks import cell_of as cell_of
+from ._checks import columns_returned as columns_returned
 from ._checks import margin_cells as margin_cells
+from ._checks import returned_by as returned_by
 from ._checks import Witness as Witness
 from ._checks import unknown_notes as unknown_notes
 from ._checks import verdict_columns as verdict_columns
@@ -27,7 +30,10 @@ __all__ = [
     "Verdict",
     "Witness",
     "evaluate",
+    "cell_of",
+    "columns_returned",
     "margin_cells",
+    "returned_by",
     "opened",
     "unknown_notes",
     "verdict_columns",

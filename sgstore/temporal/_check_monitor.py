@@ -8,7 +8,8 @@ bindings of most checks take one look into a table a frame.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -37,7 +38,9 @@ from sgstore.temporal._formula import (
     looks_ahead,
     propositions,
 )
-from sgstore.temporal._plan import plan_of_check
+from sgstore.temporal._match_values import AT_FRAME, ReturnedValues
+from sgstore.temporal._match_values_monitor import MatchValues
+from sgstore.temporal._plan import plan_of_check, plan_of_returned
 from sgstore.temporal._robustness_monitor import RobustnessMonitor
 from sgstore.temporal._sequence_monitor import FrameTime, MonitorEvent
 from sgstore.temporal._valuation import BindingTable, Partial, Valuation
@@ -56,7 +59,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.lang.ir import BoundCheck, BoundQuantifier
+    from sgstore.lang.ir import BoundCheck, BoundQuantifier, OverMatch
     from sgstore.temporal._robustness import Robustness
     from sgstore.temporal._valuation import Key, Memory, QueryCache, StreamClock
     from sgstore.world import Bools
@@ -411,6 +414,11 @@ class CheckMonitor:
         self._domains = {key: questions.met(node.kinds) for key, node in nodes}
         self._kinds = {node.kinds for _, node in nodes}
         self._margins = RobustnessMonitor(check, questions, pulse) if check.robustness else None
+        self._returned = ReturnedValues(check.returns, "first")
+        about, bridge = (questions, pulse), check.gaps == "bridge"
+        plan = partial(plan_of_returned, check)
+        self._values = MatchValues(self._returned.parts, plan, *about, bridge=bridge)
+        self._ended: dict[tuple[Partial, Span], dict[str, Any]] = {}
         self._told: dict[Key, tuple[int, int]] = {}
         self._immediate = all(q.word == "FORALL" for q in check.quantifiers)
 
@@ -425,7 +433,7 @@ class CheckMonitor:
         """A frame has come, and the questions were asked of it: what is known from it on."""
         if self._margins is not None:
             self._margins.step()
-        known = self._known
+        known, check = self._known, self._check
         found = {row: entry for row, entry in known.held.items() if entry.final}
         left = (row for row in known.held if row not in found) if found else known.held
         letters, memories = self._letters.read(left, self._remembered)
@@ -445,11 +453,44 @@ class CheckMonitor:
                 if automaton.final(entry.state, entry.counted):
                     entry = replace(entry, memory=(), final=True)
             found[row] = entry
+        grown = [(row, len(known.of(row).over)) for row in changed] if check.returns else []
         known.keep(found, _same)
+        if check.returns:
+            self._return(grown)
         self._last = here
         if not self._immediate:
             return []
         return list(self._events(here, changed))
+
+    def _return(self, grown: list[tuple[Partial, int]]) -> None:
+        """Work out what is returned of violations that ended with this frame, given how many had before."""
+        self._values.step()
+        for row, before in grown:
+            entry = self._known.of(row)
+            for span in entry.over[before:]:
+                for key in (row, *self._covered(row, entry)):
+                    self._ended[key, span] = self._values_of(key, span)
+        held = self._known.held.values()
+        since = (entry.since.seq for entry in held if entry.since is not None)
+        self._values.forget((self._pulse.tick.number, *since))
+
+    def _values_of(self, key: Partial, span: Span) -> dict[str, Any]:
+        """What is returned of a violation."""
+        binding = dict(zip(self._variables, key, strict=True))
+        start, end = (one.seq for one in span)
+
+        def part(value: OverMatch) -> Any:
+            last = start if value.start == AT_FRAME else end
+            return self._values.value(value, binding, (start, last))
+
+        return self._returned.told(part)
+
+    def _violation(self, key: Partial, span: Span) -> dict[str, Any]:
+        """What is returned of a violation of a binding, also of one that has ended."""
+        if not self._check.returns or span not in self._known.of(key).over:
+            return self._values_of(key, span)
+        wider = ((row, span) for row in self._known.lattice.wider(key))
+        return next(self._ended[row] for row in wider if row in self._ended)
 
     def _as_sgsm(
         self, entry: _CheckEntry, step: ObligationStep, here: FrameTime, memory: Memory
@@ -488,7 +529,9 @@ class CheckMonitor:
                     if number >= begun:
                         yield self._event("violated", here, key, start, start)
                     if end is not None:
-                        yield self._event("kept again", here, key, start, end)
+                        event = self._event("kept again", here, key, start, end)
+                        values = self._violation(key, (start, end))
+                        yield replace(event, values=values)
 
     def _covered(self, row: Partial, entry: _CheckEntry) -> Iterator[Key]:
         """The bindings of entities that were met of which no more is known than this."""
@@ -583,7 +626,11 @@ class CheckMonitor:
             verdict = STATUS[self._folded_codes(levels, entries)]
 
         def violations(row: int, names: Mapping[str, str]) -> tuple[Interval, ...]:
-            return tuple(_interval(trace, span, names) for span in spans[row])
+            key = tuple(bindings[row].tolist())
+            return tuple(
+                _interval(trace, span, {**names, **self._violation(key, span)})
+                for span in spans[row]
+            )
 
         found = verdict_of(
             self._check,
@@ -647,7 +694,7 @@ def _spans(entry: _CheckEntry, last: FrameTime, *, weak: bool) -> list[Span]:
     return found
 
 
-def _interval(trace: str, span: Span, names: Mapping[str, str]) -> Interval:
+def _interval(trace: str, span: Span, values: Mapping[str, Any]) -> Interval:
     start, end = span
     times = start.time_ns, end.time_ns, start.t, end.t
-    return Interval(trace, start.seq, end.seq, *times, end.seq - start.seq + 1, dict(names))
+    return Interval(trace, start.seq, end.seq, *times, end.seq - start.seq + 1, dict(values))

@@ -23,9 +23,10 @@ from sgstore.lang import (
 from sgstore.matches import Interval, notes_in
 from sgstore.store import IN_NOTEBOOK
 from sgstore.temporal._formula import Formula, formula_text, tolerant
+from sgstore.temporal._match_values import AT_FRAME, ReturnedValues, Stretches
 from sgstore.temporal._matches import lacking
 from sgstore.temporal._offline import PlanValues, TraceReader, refuse_many, traces
-from sgstore.temporal._plan import plan_of_check, plan_text
+from sgstore.temporal._plan import needs_text, plan_of_check, plan_of_returned, plan_text
 from sgstore.temporal._robustness import (
     MarginTable,
     Robustness,
@@ -48,7 +49,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang import Catalog, CheckInCatalog
-    from sgstore.lang.ir import BoundCheck, BoundQuantifier
+    from sgstore.lang.ir import BoundCheck, BoundQuantifier, OverMatch
     from sgstore.store import StoreFile
     from sgstore.world import Bools, Floats, Ints
 
@@ -297,23 +298,34 @@ _COLUMNS: Final = ("check", "trace", "verdict", "who", "from", "start", "end", "
 _MARGIN_COLUMNS: Final = ("robustness", "decided by", "in")
 
 
-def verdict_columns(*, margin: bool = False) -> tuple[str, ...]:
-    """Columns of verdicts for people; with those of ``ROBUSTNESS``, if a check has it."""
-    return (*_COLUMNS, *_MARGIN_COLUMNS) if margin else _COLUMNS
+def verdict_columns(*, margin: bool = False, returned: Sequence[str] = ()) -> tuple[str, ...]:
+    """Columns of verdicts for people.
+
+    Parameters
+    ----------
+    margin : bool
+        Whether a check has ``ROBUSTNESS``.
+    returned : sequence of str
+        What checks return of violations.
+    """
+    return (*_COLUMNS, *returned, *(_MARGIN_COLUMNS if margin else ()))
 
 
-def verdict_rows(verdict: Verdict, *, margin: bool = False) -> Iterator[tuple[Any, ...]]:
+def verdict_rows(
+    verdict: Verdict, *, margin: bool = False, returned: Sequence[str] = ()
+) -> Iterator[tuple[Any, ...]]:
     """A verdict for people, as rows of :func:`verdict_columns`: one, or one for each violation."""
     head = verdict.check, verdict.trace, verdict.verdict
     tail = margin_cells(verdict) if margin else ()
+    nothing = [("",) * (4 + len(returned))]
     told = False
     for witness in verdict.witnesses:
         who = ", ".join(witness.names.values())
-        for row in _times(witness.violations) or [("", "", "", "")]:
+        for row in _times(witness.violations, returned) or nothing:
             told = True
             yield (*head, who, *row, *tail)
     if not told:
-        for row in _times(verdict.violations) or [("", "", "", "")]:
+        for row in _times(verdict.violations, returned) or nothing:
             yield (*head, "", *row, *tail)
 
 
@@ -328,11 +340,34 @@ def margin_cells(verdict: Verdict) -> tuple[str, str, str]:
     return f"{found.value:.4g}", decided, frame
 
 
-def _times(violations: tuple[Interval, ...]) -> list[tuple[Any, ...]]:
+def _times(violations: tuple[Interval, ...], returned: Sequence[str]) -> list[tuple[Any, ...]]:
     return [
-        (f"{i.trace}#{i.start_seq}", round(i.start, 3), round(i.end, 3), i.frames)
+        (
+            f"{i.trace}#{i.start_seq}",
+            round(i.start, 3),
+            round(i.end, 3),
+            i.frames,
+            *(cell_of(i.values.get(name, "")) for name in returned),
+        )
         for i in violations
     ]
+
+
+def returned_by(checks: Iterable[BoundCheck]) -> dict[str, tuple[str, ...]]:
+    """Names of the values that each of some checks returns of its violations."""
+    return {check.name: tuple(column.name for column in check.returns) for check in checks}
+
+
+def columns_returned(returned: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
+    """Names of the values that some checks return, each once."""
+    return tuple(dict.fromkeys(name for names in returned.values() for name in names))
+
+
+def cell_of(value: Any) -> str:
+    """A value that was returned, as a person reads it."""
+    if value is None:
+        return "unknown"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def verdict_of(
@@ -429,13 +464,12 @@ class CheckRun:
         words = Counter(one.verdict for one in found)
         caption = ", ".join(f"{number} {word}" for word, number in words.items()) or "no trace"
         margin = self.quantitative
-        every = (row for one in found for row in verdict_rows(one, margin=margin))
+        told: dict[str, Any] = {"margin": margin, "returned": columns_returned(self.returned)}
+        every = (row for one in found for row in verdict_rows(one, **told))
         rows = list(islice(every, IN_NOTEBOOK + 1))
         notes = unknown_notes((one.check, one.trace, one.reason) for one in found)
         notes += [f"the first {IN_NOTEBOOK} rows"] if len(rows) > IN_NOTEBOOK else []
-        return html_table(
-            verdict_columns(margin=margin), rows[:IN_NOTEBOOK], caption, "; ".join(notes)
-        )
+        return html_table(verdict_columns(**told), rows[:IN_NOTEBOOK], caption, "; ".join(notes))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -446,6 +480,11 @@ class CheckRun:
     def quantitative(self) -> bool:
         """Tell whether it is asked of some check by how much it is met."""
         return any(one.check.robustness for one in self._checks)
+
+    @property
+    def returned(self) -> dict[str, tuple[str, ...]]:
+        """Names of the values that each check returns of its violations."""
+        return returned_by(one.check for one in self._checks)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -480,6 +519,12 @@ class _Check:
         self._compat, self._want_status = compat, status
         self._plan, self._formula, self._reset, self._guards = plan_of_check(check)
         self._whole, self._variables = self._plan.whole, self._plan.bound
+        self._returned = ReturnedValues(check.returns, "first")
+        self._values = plan_of_returned(check)
+        for part in self._returned.parts:
+            self._values.test(part.operand)
+            if part.at is not None:
+                self._values.test(part.at)
         self._quantity = self._plan.quantity(check.formula) if check.robustness else None
         self._people: dict[int, dict[str, dict[int, str]]] = {}
 
@@ -489,7 +534,8 @@ class _Check:
         head += [f"{q.word} {', '.join(q.nodes)}" for q in self._check.quantifiers]
         plan = plan_text(self._plan, self._formula, self._reset, self._catalog)
         quantity = [] if self._quantity is None else [f"robustness {formula_text(self._quantity)}"]
-        return "\n".join([*head, plan, *quantity])
+        returned = needs_text(self._values, self._catalog)
+        return "\n".join([*head, plan, *quantity, *returned])
 
     def verdicts(self) -> Iterator[Verdict]:
         """The verdict of each trace, by name of the trace."""
@@ -497,7 +543,8 @@ class _Check:
         self._read_people()
         lacks = lacking(self._file, self._catalog, of_check(self._check))
         catalog = replace(self._catalog, unknowing=frozenset(lacks))
-        told = traces(self._file, catalog, self._whole, self._plan.asks, gaps=gaps)
+        asks = self._plan.asks | self._values.asks
+        told = traces(self._file, catalog, self._whole, asks, gaps=gaps)
         known = (self._verdict(trace) for trace in told if len(trace))
         unknown = self._unknown(catalog, lacks)
         yield from merge(known, unknown, key=lambda verdict: natural(verdict.trace))
@@ -678,14 +725,40 @@ class _Check:
         if self._check.end == "pending" and status is not None:
             verdict = STATUS[int(status[-1])]
 
+        bindings = innermost(levels)
+
         def violations(row: int, names: Mapping[str, str]) -> tuple[Interval, ...]:
-            return tuple(_interval(trace, one, names) for one in told[row][0])
+            spans = told[row][0]
+            values = self._values_of(trace, bindings[row : row + 1], spans)
+            return tuple(
+                _interval(trace, one, {**names, **more})
+                for one, more in zip(spans, values, strict=True)
+            )
 
         kept = status if self._want_status else None
         names = self._people.get(trace.trace_id, {})
         last = _interval(trace, (len(trace) - 1, len(trace) - 1, True), {})
         found = Verdict(self._check.name, trace.name, verdict, status=kept)
         return verdict_of(self._check, found, levels, truths, names, violations, last)
+
+    def _values_of(
+        self, trace: TraceReader, binding: Keys, spans: Sequence[Violation]
+    ) -> list[dict[str, Any]]:
+        """What is returned of the violations of a binding."""
+        if not self._returned.parts:
+            return [self._returned.told(lambda _: None) for _ in spans]
+        values = PlanValues(self._values, trace, self._variables, binding)
+        first, last, _ = np.array(spans, np.int64).reshape(-1, 3).T
+        told: dict[OverMatch, Any] = {}
+        for part in self._returned.parts:
+            end = first if part.start == AT_FRAME else last
+            stretches = Stretches(np.zeros_like(first), first, end)
+            at = None if part.at is None else values.test(self._values.test(part.at))
+            column = values.test(self._values.test(part.operand))
+            told[part] = stretches.told(part.word, column, at).tolist()
+        return [
+            self._returned.told(lambda part, row=row: told[part][row]) for row in range(len(spans))
+        ]
 
     def _joined(
         self, levels: list[Level], told: list[_BindingVerdict], frames: int
@@ -704,9 +777,9 @@ def _runs(flags: Bools) -> Iterator[Violation]:
         yield start, end - 1, False
 
 
-def _interval(trace: TraceReader, of: Violation, names: Mapping[str, str]) -> Interval:
+def _interval(trace: TraceReader, of: Violation, values: Mapping[str, Any]) -> Interval:
     start, end, _ = of
     (first, last), (begin, stop) = trace.numbers[[start, end]], trace.times[[start, end]]
     seqs_ns = int(first), int(last), int(begin), int(stop)
     seconds = trace.seconds(start), trace.seconds(end)
-    return Interval(trace.name, *seqs_ns, *seconds, end - start + 1, dict(names))
+    return Interval(trace.name, *seqs_ns, *seconds, end - start + 1, dict(values))

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from sgstore.lang import MOTION, TOLD_WEATHER, of_query, traces_with, with_places
+from sgstore.lang.ir import OverMatch, walk
 from sgstore.matches import Matches
 
 if TYPE_CHECKING:
@@ -63,6 +64,12 @@ class TemporalMatches(Matches):
     A match of a sequence is told once: its frame is that in which its last step is found, its interval goes
     from the frame of its first step to that one (to the end of its run, if the last step has a duration).
     """
+
+    @property
+    def of_match(self) -> bool:  # type: ignore[override]
+        """Tell whether one value is returned, and that is of each match as a whole."""
+        values = self._ready.query.result.columns if len(self.columns) == 1 else ()
+        return any(isinstance(part, OverMatch) for one in values for part in walk(one.value))
 
     @contextmanager
     def _compiled(self) -> Generator[Compiled]:

@@ -352,11 +352,12 @@ def read(
 def _narrowed(ask: Ask, traces: Collection[TraceReader]) -> Ask | None:
     """A question about no more nodes than the steps before it leave; ``None``: they leave none."""
     ids: dict[str, Ints] = {}
+    narrow = ask.loose or ask.value is not None
     for before in ask.after:
         keys = [trace.relations[before.name].keys for trace in traces]
         if not sum(map(len, keys)):
             return None
-        for node in set(before.variables) & set(ask.variables) if ask.loose else ():
+        for node in set(before.variables) & set(ask.variables) if narrow else ():
             held = np.unique(np.concatenate([k[:, before.variables.index(node)] for k in keys]))
             ids[node] = np.intersect1d(ids[node], held) if node in ids else held
     few = {node: held.tolist() for node, held in ids.items() if len(held) <= NODES_NAMED}

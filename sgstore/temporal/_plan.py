@@ -148,6 +148,8 @@ class Plan:
         Keys of the nodes that a binding speaks of.
     absent : frozenset of str
         Those of which conditions are true where they are absent.
+    prefix : str
+        How names begin, so that those of several plans differ.
 
     Attributes
     ----------
@@ -161,6 +163,7 @@ class Plan:
     whole: b.Query
     bound: tuple[str, ...]
     absent: frozenset[str] = frozenset()
+    prefix: str = ""
     atoms: dict[str, Ask] = field(default_factory=dict[str, Ask])
     signals: dict[str, Ask] = field(default_factory=dict[str, Ask])
     tests: dict[str, Test] = field(default_factory=dict[str, Test])
@@ -287,7 +290,7 @@ class Plan:
         key = unnumbered_text(expression) + f" of {sorted(things)}"
         name = self._names.get(key)
         if name is None:
-            name = self._names[key] = f"a{len(self.atoms) + 1}"
+            name = self._names[key] = f"{self.prefix}a{len(self.atoms) + 1}"
             where = () if expression == TRUE else tuple(b.conjuncts(_two_valued(expression)))
             self.atoms[name] = Ask(name, self._query(things, where), self._variables(things))
         return self._lapsing(name, frozenset() if expression == TRUE else things)
@@ -302,7 +305,7 @@ class Plan:
         key = "=" + unnumbered_text(expression)
         name = self._names.get(key)
         if name is None:
-            name = self._names[key] = f"t{len(self.tests) + 1}"
+            name = self._names[key] = f"{self.prefix}t{len(self.tests) + 1}"
             test = Test(name, expression, self._variables(self._things(expression)))
             self.tests[name] = test
             self._measure(expression, test)
@@ -334,7 +337,7 @@ class Plan:
         key = ":" + unnumbered_text(value) + f" of {sorted(things)}"
         name = self._names.get(key)
         if name is None:
-            name = self._names[key] = f"s{len(self.signals) + 1}"
+            name = self._names[key] = f"{self.prefix}s{len(self.signals) + 1}"
             query = self._query(things, ())
             self.signals[name] = Ask(name, query, self._variables(things), value, edges)
         return self.signals[name]
@@ -386,6 +389,11 @@ def plan_of_margins(check: BoundCheck) -> tuple[Plan, f.Formula]:
     """Return what a check is met by: the plan, and the formula over margins."""
     plan = _empty_plan(check)
     return plan, plan.quantity(check.formula)
+
+
+def plan_of_returned(check: BoundCheck) -> Plan:
+    """Return a plan, without questions yet, for the values that a check returns."""
+    return replace(_empty_plan(check), prefix="returned ")
 
 
 def _empty_plan(check: BoundCheck) -> Plan:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import TextSpan
-from sgstore.lang.ir import BoundStep, Query, StepLink
+from sgstore.lang.ir import BoundStep, OverMatch, Query, ReturnColumn, StepLink, StepTime, walk
 from sgstore.temporal._formula import And, Formula, Past, Progression, ProgressionFrame, Term
+from sgstore.temporal._match_values import AT_FRAME, ReturnedValues
+from sgstore.temporal._match_values_monitor import MatchValues
 from sgstore.temporal._plan import asks_of_steps, plan_of_steps
 from sgstore.temporal._valuation import BindingTable, Partial, Valuation
 
@@ -62,6 +65,8 @@ class MonitorEvent:
         Of a sequence: the frame of each step that happens.
     at_end : bool
         Whether only the end of the trace made it a violation.
+    values : mapping of str to value
+        What is returned of a match, or of a violation that has ended: values over it, and times of its steps.
     """
 
     kind: str
@@ -73,6 +78,7 @@ class MonitorEvent:
     names: Mapping[str, str]
     steps: tuple[FrameTime, ...] = ()
     at_end: bool = False
+    values: Mapping[str, Any] = field(default_factory=dict[str, "Any"])
 
 
 # Where a step of a sequence holds, frame by frame: its pattern, its other conditions, its duration ----
@@ -121,6 +127,11 @@ class StepFrame:
     gap: bool
     run: Run
 
+    @property
+    def ends(self) -> tuple[int, ...]:
+        """Numbers of the frame, and of the first and the last one of its run, as far as that is known."""
+        return (self.number, self.run.number, *([self.run.last] if self.run.over else []))
+
 
 class StepState:
     """A step and one binding.
@@ -168,6 +179,14 @@ class StepState:
         if self._waiting:
             return self._waiting[0].number
         return self._queue[0][0] if self._queue else NEVER
+
+    def frames(self) -> Iterator[int]:
+        """Numbers of the frames that are a place, may become one, or are an end of a run of such frames."""
+        for place in (*self.places, *self._waiting):
+            yield from place.ends
+        if self._run is not None:
+            yield self._run.number
+        yield from (number for number, _, _ in self._queue)
 
     def ask(self, holds: Needs, *, gap: bool) -> None:
         """The next frame, and what its conditions still need."""
@@ -282,6 +301,11 @@ class SequenceMonitor:
         self._names: dict[int, str] = {}
         self._ended = False
         self._happen = [n for n, step in enumerate(self._steps) if not step.absent]
+        self._returned = ReturnedValues(_returned(query), "last")
+        plan, bridge = partial(plan_of_steps, query, self._steps), query.gaps == "bridge"
+        parts = self._returned.parts
+        self._values = MatchValues(parts, plan, questions, pulse, bridge=bridge)
+        self._pending: list[tuple[Binding, tuple[StepFrame, ...]]] = []
 
     # Frame by frame
 
@@ -299,6 +323,7 @@ class SequenceMonitor:
             for key, one in held.items():
                 one.ask(now.get(key, False), gap=gap)
             self._decide(number)
+        self._values.step()
         return self._found(here)
 
     def _now(self, number: int) -> dict[Key, Needs]:
@@ -333,9 +358,39 @@ class SequenceMonitor:
         found: list[MonitorEvent] = []
         if all(self._held[number] for number in self._happen):
             for binding in self._bindings({}, self._happen):
-                found += self._matches(binding, here)
+                for ways in self._matches(binding):
+                    self._pending.append((binding, ways))
+        for binding, ways in list(self._pending):
+            if self._ended or all(ways[n].run.over for n in self._lasting):
+                self._pending.remove((binding, ways))
+                found.append(self._event(binding, ways, here))
         self._forget()
+        if self._returned.parts:
+            self._values.forget(self._frames())
         return found
+
+    @cached_property
+    def _lasting(self) -> frozenset[int]:
+        """Places among the steps that happen, of those whose runs must be over before a match can be told."""
+        parts = self._returned.parts
+        found = {
+            self._happen.index(p.start)
+            for p in parts
+            if p.start == p.end and p.start in self._happen
+        }
+        held = self._steps[self._happen[-1]].hold is not None or len(self._steps) == 1
+        if held and any(part.start is None for part in parts):
+            found.add(len(self._happen) - 1)
+        return frozenset(found)
+
+    def _frames(self) -> Iterator[int]:
+        """Numbers of the frames at which a part of a match may begin or end."""
+        for number in self._happen:
+            for one in self._held[number].values():
+                yield from one.frames()
+        for _, ways in self._pending:
+            for place in ways:
+                yield from place.ends
 
     def _bindings(self, binding: Binding, steps: list[int]) -> Iterator[Binding]:
         """Bindings of all steps together, each of which has places."""
@@ -361,7 +416,7 @@ class SequenceMonitor:
             if all(key[place] == node for place, node in known)
         ]
 
-    def _matches(self, binding: Binding, here: FrameTime) -> Iterator[MonitorEvent]:
+    def _matches(self, binding: Binding) -> Iterator[tuple[StepFrame, ...]]:
         held = self._of(0, binding)
         key = tuple(binding[name] for name in sorted(binding))
         waiting: int | None = None
@@ -376,7 +431,7 @@ class SequenceMonitor:
                 self._told[key] = run
                 if self._query.policy == "first":
                     self._over.add(key)
-                yield self._event(binding, ways, here)
+                yield ways
 
     def _of(self, number: int, binding: Binding) -> StepState | None:
         return self._held[number].get(tuple(binding[name] for name in self._columns[number]))
@@ -471,7 +526,30 @@ class SequenceMonitor:
         steps = tuple(self._moment(place) for place in ways)
         nodes = {name: node for name, node in binding.items() if name in self._named}
         names = {name: self._names.get(node, str(node)) for name, node in nodes.items()}
-        return MonitorEvent("found", self.name, here, steps[0], steps[-1], nodes, names, steps)
+
+        def part(value: OverMatch) -> Any:
+            return self._values.value(value, binding, self._span(value, ways))
+
+        def seconds(step: int) -> float:
+            return steps[self._happen.index(step)].t
+
+        values = self._returned.told(part, seconds)
+        about = here, steps[0], steps[-1], nodes, names, steps
+        return MonitorEvent("found", self.name, *about, values=values)
+
+    def _span(self, part: OverMatch, ways: tuple[StepFrame, ...]) -> tuple[int, int]:
+        """The first and the last frame of a part of a match."""
+        if part.start == AT_FRAME:
+            return ways[-1].number, ways[-1].number
+        if part.start is None or part.end is None:
+            last, whole = ways[-1], len(self._steps) == 1
+            held = whole or self._steps[self._happen[-1]].hold is not None
+            first = last.run.number if whole else ways[0].number
+            return first, last.run.last if held else last.number
+        one, other = (ways[self._happen.index(step)] for step in (part.start, part.end))
+        if part.start == part.end:
+            return one.run.number, one.run.last
+        return one.number, other.number
 
     def _moment(self, place: StepFrame) -> FrameTime:
         return FrameTime(place.number, place.time, (place.time - self._pulse.start) / 1e9)
@@ -550,6 +628,17 @@ class SequenceMonitor:
             for one in held.values():
                 one.finish()
         return self._found(here)
+
+
+def _returned(query: Query) -> list[ReturnColumn]:
+    """The columns that speak of matches over several frames; what is counted of all of them is told by none."""
+    if query.result.aggregated:
+        return []
+    return [
+        column
+        for column in query.result.columns
+        if any(isinstance(part, OverMatch | StepTime) for part in walk(column.value))
+    ]
 
 
 def _named(query: Query) -> tuple[str, ...]:

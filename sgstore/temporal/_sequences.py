@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.lang import ExternalRelation, Window, relation, value_text
-from sgstore.lang.ir import Bound, Query, SignalCall, StepTime, Tense
+from sgstore.lang import Column, ExternalRelation, Window, relation, value_text
+from sgstore.lang.ir import Bound, OverMatch, Query, SignalCall, StepTime, Tense
 from sgstore.matches import TooMuchError
 from sgstore.records import dataclass
 from sgstore.store import BUCKET_BITS
 from sgstore.temporal._formula import formula_text
+from sgstore.temporal._match_values import Stretches, picked
 from sgstore.temporal._offline import (
     PlanValues,
     TimedRelation,
@@ -35,7 +37,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.lang import Catalog, Column
+    from sgstore.lang import Catalog
     from sgstore.lang.ir import BoundHold, Length
     from sgstore.store import StoreFile
     from sgstore.temporal._formula import Formula
@@ -106,6 +108,14 @@ class BindingLine:
         last = np.append(self._starts(places)[1:], True)
         ends = np.where(last, np.arange(len(places)), len(places))
         return places[np.minimum.accumulate(ends[::-1])[::-1]]
+
+    def run_starts(self, places: Ints) -> Ints:
+        """(R,) the first place of the run that each of some ascending places is in."""
+        if not len(places):
+            return places
+        return places[
+            np.maximum.accumulate(np.where(self._starts(places), np.arange(len(places)), 0))
+        ]
 
     def runs(self, places: Ints) -> Ints:
         """(R,) the number of the run that each of some ascending places is in."""
@@ -361,6 +371,7 @@ class Finder:
         self._file, self._query, self._catalog = file, query, catalog
         self._plan = plan_of_steps(query, query.steps)
         self._when = [tuple(map(self._plan.formula, step.when)) for step in query.steps]
+        self._first = frozenset(self._plan.asks)  # what must be known before there are matches
         self._kept = tuple(sorted(query.scope.nodes))
         self._steps = asks_of_steps(query, query.steps, self._kept)
         self._edges = tuple(edge.key for edge in query.scope.edges)
@@ -378,11 +389,8 @@ class Finder:
             high = ((window.high - 1) >> BUCKET_BITS) + 1
             low = window.low >> BUCKET_BITS << BUCKET_BITS
             window = Window(low, high << BUCKET_BITS, window.traces)
-        for place in places:
-            if not isinstance(place, StepTime):
-                self._planned(place)  # what it asks of single frames becomes part of the plan
         ordered = sorted(self._steps, key=lambda ask: len(ask.after))
-        asks = self._plan.asks | {ask.name: ask for ask in ordered}
+        asks = self._asks_of(places, ordered)
         about = self._file, self._catalog, self._query, asks
         found = traces(*about, gaps=self._query.gaps, within=window)
         parts: list[_Part] = []
@@ -403,6 +411,17 @@ class Finder:
         many = len(places) + self._spans * 2
         values = [[item for part in parts for item in part[3][n]] for n in range(many)]
         return ExternalRelation(first, last, nodes, edges, values)
+
+    def _asks_of(self, places: tuple[Bound, ...], steps: Sequence[Ask]) -> dict[str, Ask]:
+        """All that is asked of single frames; of what is only returned, no more than steps leave."""
+        for place in places:
+            for value in _worked_out(place):
+                self._planned(value)
+        happen = tuple(ask for n, ask in enumerate(self._steps) if not self._query.steps[n].absent)
+        asked = self._plan.asks.items()
+        first = {name: ask for name, ask in asked if name in self._first}
+        later = {name: replace(ask, after=happen) for name, ask in asked if name not in first}
+        return first | {ask.name: ask for ask in steps} | later
 
     def _planned(self, place: Bound) -> Formula | Test:
         """The formula, or the test, whose value is asked for at a place."""
@@ -426,10 +445,10 @@ class Finder:
             if not ask.everywhere:
                 lines += sql_text(relation(ask.query, self._catalog, None, (), {*ask.columns}))
         for place in places:
-            if not isinstance(place, StepTime):
-                asked = self._planned(place)
+            for value in _worked_out(place):
+                asked = self._planned(value)
                 name = asked.name if isinstance(asked, Test) else formula_text(asked)
-                lines.append(f"returned {value_text(place)} = {name}")
+                lines.append(f"returned {value_text(value)} = {name}")
         return "\n".join([*lines, *needs_text(self._plan, self._catalog)])
 
     @property
@@ -492,11 +511,21 @@ class Finder:
         names = self._named(0)
         owners = np.repeat(np.arange(len(relation.keys)), np.diff(relation.starts))
         told = [np.zeros(len(owners), object) for _ in places]
+        line = BindingLine(trace.clock)
+        at_row = owners * line.stride + relation.frames
+        first = np.searchsorted(at_row, line.run_starts(at_row))
+        last = np.searchsorted(at_row, line.run_ends(at_row))
         for low, high, rows in _chunks(relation.starts, trace.together):
             at = owners[rows] - low, relation.frames[rows]
-            values = self._values(trace, names, relation.keys[low:high], places)
-            for number, column in enumerate(values):
-                told[number][rows] = _picked(column, at)
+            values = PlanValues(self._plan, trace, names, relation.keys[low:high])
+            for number, place in enumerate(places):
+                if not isinstance(place, OverMatch):
+                    told[number][rows] = picked(self._value(place, values), *at)
+                    continue
+                runs, member = np.unique(first[rows], return_inverse=True)
+                ends = relation.frames[last[runs]]
+                stretches = Stretches(owners[runs] - low, relation.frames[runs], ends)
+                told[number][rows] = self._over(place, values, stretches)[member]
         ids = trace.frame_ids[relation.frames]
         new = np.ones(len(ids), np.bool_)
         new[1:] = (np.diff(ids) != 1) | (np.diff(owners) != 0)
@@ -536,7 +565,11 @@ class Finder:
             runs = line.run_ends(at[-1])
             ends = line.frame(runs[np.searchsorted(at[-1], told[:, -1])])
         keys = self._ordered(part.variables, part.bindings[owners])
-        values = self._at_matches(trace, part, owners, frames, places)
+        spans: dict[Bound, tuple[Ints, Ints]] = {}
+        for place in places:
+            if isinstance(place, OverMatch):
+                spans[place] = self._span(line, place, by_step, told, ends)
+        values = self._at_matches(trace, part, owners, frames, places, spans)
         values += [trace.frame_ids[frames[:, 0]].tolist(), trace.frame_ids[ends].tolist()]
         last = trace.frame_ids[frames[:, -1]]
         yield last, last, keys, values
@@ -557,6 +590,20 @@ class Finder:
             number += 1
         return legs
 
+    def _span(
+        self, line: BindingLine, place: OverMatch, at: dict[int, Ints], told: Ints, ends: Ints
+    ) -> tuple[Ints, Ints]:
+        """(M,) and (M,) the first and the last frame of the part of each match that a value is about."""
+        if place.start is None or place.end is None:
+            return line.frame(told[:, 0]), ends
+        happen = list(at)
+        here = told[:, happen.index(place.start)]
+        if place.start != place.end:
+            return line.frame(here), line.frame(told[:, happen.index(place.end)])
+        step = at[place.start]
+        row = np.searchsorted(step, here)
+        return line.frame(line.run_starts(step)[row]), line.frame(line.run_ends(step)[row])
+
     def _at_matches(
         self,
         trace: TraceReader,
@@ -564,36 +611,41 @@ class Finder:
         owners: Ints,
         frames: Ints,
         places: tuple[Bound, ...],
+        spans: dict[Bound, tuple[Ints, Ints]],
     ) -> list[list[Any]]:
         happen = [n for n, step in enumerate(self._query.steps) if not step.absent]
         asked = tuple(place for place in places if not isinstance(place, StepTime))
-        picked: dict[Bound, list[Any]] = {place: [] for place in asked}
+        found: dict[Bound, list[Any]] = {place: [] for place in asked}
         size = trace.together
         for low in range(0, len(owners) if asked else 0, size):
-            some = owners[low : low + size]
-            at = np.arange(len(some)), frames[low : low + size, -1]
-            values = self._values(trace, part.variables, part.bindings[some], asked)
-            for place, column in zip(asked, values, strict=True):
-                picked[place] += _picked(column, at).tolist()
+            rows = slice(low, low + size)
+            here = np.arange(len(owners[rows]))
+            bindings = part.bindings[owners[rows]]
+            values = PlanValues(self._plan, trace, part.variables, bindings)
+            for place in asked:
+                if isinstance(place, OverMatch):
+                    stretches = Stretches(here, *(end[rows] for end in spans[place]))
+                    value = self._over(place, values, stretches)
+                else:
+                    value = picked(self._value(place, values), here, frames[rows, -1])
+                found[place] += value.tolist()
         for place in places:
             if isinstance(place, StepTime):
                 times = trace.times[frames[:, happen.index(place.step)]] - trace.start
-                picked[place] = (times / 1e9).tolist()
-        return [picked[place] for place in places]
+                found[place] = (times / 1e9).tolist()
+        return [found[place] for place in places]
 
     # Values
 
-    def _values(
-        self,
-        trace: TraceReader,
-        names: tuple[str, ...],
-        bindings: Keys,
-        places: tuple[Bound, ...],
-    ) -> Iterator[Any]:
-        """Values over time of some bindings: (B, F) flags, or columns."""
-        values = PlanValues(self._plan, trace, names, bindings)
-        for asked in map(self._planned, places):
-            yield values.test(asked) if isinstance(asked, Test) else values.formula(asked)
+    def _value(self, place: Bound, values: PlanValues) -> Column:
+        """A value over time of some bindings: (B, F)."""
+        asked = self._planned(place)
+        return values.test(asked) if isinstance(asked, Test) else Column(values.formula(asked))
+
+    def _over(self, place: OverMatch, values: PlanValues, stretches: Stretches) -> Any:
+        """(M,) a value over stretches of frames, as Python has it."""
+        at = None if place.at is None else self._value(place.at, values)
+        return stretches.told(place.word, self._value(place.operand, values), at)
 
     def _ordered(self, names: tuple[str, ...], keys: Keys) -> Keys:
         """Bindings with the columns in the order of the query's nodes and edges."""
@@ -607,21 +659,12 @@ def _chunks(starts: Ints, size: int) -> Iterator[tuple[int, int, slice]]:
         yield low, high, slice(int(starts[low]), int(starts[high]))
 
 
-def _picked(column: Column | Any, at: tuple[Any, Any]) -> Any:
-    """The values at some places as Python has them; ``None`` where they are unknown."""
-    if isinstance(column, np.ndarray):
-        return np.broadcast_to(column, (len(column), column.shape[1]))[_row(column, at)].astype(
-            object
-        )
-    shape = np.broadcast_shapes(column.values.shape, np.shape(column.known))
-    values, known = np.broadcast_to(column.values, shape), np.broadcast_to(column.known, shape)
-    place = _row(values, at)
-    told = values[place].astype(object)
-    told[~known[place]] = None
-    return told
-
-
-def _row(values: Any, at: tuple[Any, Any]) -> tuple[Any, Any]:
-    """Places in an array that may be the same for all bindings, or for all frames."""
-    rows = at[0] if values.shape[0] > 1 else np.zeros_like(at[0])
-    return rows, (at[1] if values.shape[1] > 1 else np.zeros_like(at[1]))
+def _worked_out(place: Bound) -> tuple[Bound, ...]:
+    """The values of frames that are needed for what is returned of a match."""
+    match place:
+        case StepTime():
+            return ()
+        case OverMatch(operand=operand, at=at):
+            return (operand,) if at is None else (operand, at)
+        case _:
+            return (place,)

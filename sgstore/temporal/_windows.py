@@ -177,11 +177,11 @@ def next_window(
         gone += 1
     summed = word in {"sum_over", "avg_over"}
     if summed:
-        total -= sum(_exact(point[2]) for point in points[:gone])
+        total -= sum(exact(point[2]) for point in points[:gone])
     points = points[gone:]
     if value is not None and (math.isfinite(value) or not summed):
         if summed:
-            total += _exact(value)
+            total += exact(value)
         else:  # what is no less, or no greater, and older is never told again
             sign = 1 if word == "max_over" else -1
             kept = len(points)
@@ -199,14 +199,19 @@ def window_value(word: str, window: Window | None) -> float | None:
     points, total = window
     if word in {"min_over", "max_over"}:
         return points[0][2]
-    try:
-        found = total / (1 << _UNIT)
-    except OverflowError:
-        found = math.copysign(math.inf, total)
+    found = rounded(total)
     return found / len(points) if word == "avg_over" else found
 
 
-def _exact(value: float) -> int:
+def exact(value: float) -> int:
     """A number in units of the smallest one."""
     part, whole = float(value).as_integer_ratio()
     return part << (_UNIT - whole.bit_length() + 1)
+
+
+def rounded(total: int) -> float:
+    """A number that is told in units of the smallest one."""
+    try:
+        return total / (1 << _UNIT)
+    except OverflowError:
+        return math.copysign(math.inf, total)

@@ -1,0 +1,262 @@
+"""Numbers over the frames of a match: the least, the greatest, the average, the first, and when it was so.
+
+Over columns a match is a row of bindings and the frames from one to another; frame by frame a :class:`Fold` is
+what is known of such a stretch, and two that follow one another are joined.
+
+Values that are not known do not count, except that the first and the last are those of the first and the last
+frame, known or not. Sums are rounded once, so that it makes no difference how they are put together.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.lang import expression
+from sgstore.lang import ir as b
+from sgstore.temporal._windows import exact, rounded
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from sgstore.lang import Column
+    from sgstore.world import Bools, Ints
+
+    Objects = NDArray[np.object_]
+
+
+class ReturnedValues:
+    """Values that are returned of a match, made of values over it and of times of its steps.
+
+    Parameters
+    ----------
+    columns : sequence of ReturnColumn
+    word : str
+        What stands for a value of one frame: ``first`` of the match, or ``last``.
+
+    Attributes
+    ----------
+    parts : tuple of OverMatch
+        What they are made of, each once. Those of one frame are of the steps :data:`AT_FRAME`.
+    """
+
+    def __init__(self, columns: Sequence[b.ReturnColumn], word: str) -> None:
+        self._word = word
+        self._columns = [(column.name, self._of_match(column.value)) for column in columns]
+        found = (part for _, value in self._columns for part in b.walk(value))
+        self.parts = tuple(dict.fromkeys(part for part in found if isinstance(part, b.OverMatch)))
+
+    def _of_match(self, value: b.Bound) -> b.Bound:
+        if isinstance(value, b.OverMatch | b.StepTime | b.Value | b.Choices):
+            return value
+        if any(isinstance(part, b.OverMatch | b.StepTime) for part in b.walk(value)):
+            return b.with_operands(value, self._of_match)
+        return b.OverMatch(self._word, value, AT_FRAME, AT_FRAME, None, value.type)
+
+    def told(
+        self, part: Callable[[b.OverMatch], Any], seconds: Callable[[int], float] | None = None
+    ) -> dict[str, Any]:
+        """The values by the names of their columns.
+
+        Parameters
+        ----------
+        part : function
+            The value of a part.
+        seconds : function, optional
+            The time of a step.
+        """
+
+        def known(value: b.Bound) -> b.Bound:
+            if isinstance(value, b.OverMatch):
+                return b.Value(part(value), value.type)
+            if isinstance(value, b.StepTime) and seconds is not None:
+                return b.Value(seconds(value.step), value.type)
+            return b.with_operands(value, known)
+
+        nothing: Any = None  # constants are asked of no frame
+        return {
+            name: expression(known(value), injective=False)(nothing)
+            for name, value in self._columns
+        }
+
+
+AT_FRAME: Final = -1
+"""In place of the number of a step: the one frame that a value is of."""
+
+
+# Over columns -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Stretches:
+    """Stretches of frames, each of some binding.
+
+    Attributes
+    ----------
+    rows : (M,) int64
+        The row of the binding of each in a column of values.
+    first, last : (M,) int64
+        The frames; no stretch is empty.
+    """
+
+    rows: Ints
+    first: Ints
+    last: Ints
+
+    def told(self, word: str, column: Column, at: Column | None = None) -> Objects:
+        """(M,) the number that each stretch makes of a value; ``None``: nothing is known.
+
+        Parameters
+        ----------
+        word : str
+            One of :data:`sgstore.lang.ir.OF_MATCH`.
+        column : Column
+            (B, F), or of length 1 in an axis.
+        at : Column, optional
+            Of ``argmin`` and ``argmax``: what is told of the frame that they find.
+        """
+        if not len(self.rows):
+            return np.zeros(0, np.object_)
+        if word in {"first", "last"}:
+            frames = self.first if word == "first" else self.last
+            return picked(column, self.rows, frames)
+        counts = self.last - self.first + 1
+        starts = np.cumsum(counts) - counts
+        frames = np.arange(int(counts.sum())) - np.repeat(starts - self.first, counts)
+        values, known = _numbers(column, np.repeat(self.rows, counts), frames)
+        if word in {"avg", "sum"}:
+            return _summed(word, values, known & np.isfinite(values), starts)
+        sign = 1.0 if word in {"min", "argmin"} else -1.0
+        values = np.where(known, sign * values, np.inf)
+        some = np.logical_or.reduceat(known, starts)
+        best = np.minimum.reduceat(values, starts)
+        if at is None:
+            found = (sign * best).astype(object)
+        else:
+            hit = known & (values == np.repeat(best, counts))
+            places = np.where(hit, frames, np.iinfo(np.int64).max)
+            place = np.minimum.reduceat(places, starts)
+            found = picked(at, self.rows, np.where(some, place, self.first))
+        found[~some] = None
+        return found
+
+
+def picked(column: Column, rows: Ints, frames: Ints) -> Objects:
+    """Values at some places as Python has them; ``None`` where they are unknown.
+
+    Parameters
+    ----------
+    column : Column
+        (B, F), or of length 1 in an axis.
+    rows, frames : (M,) int64
+    """
+    values, known = _at(column, rows, frames)
+    found = values.astype(object)
+    found[~known] = None
+    return found
+
+
+def _numbers(column: Column, rows: Ints, frames: Ints) -> tuple[Any, Bools]:
+    values, known = _at(column, rows, frames)
+    numbers = np.asarray(values, np.float64)
+    return numbers, known & ~np.isnan(numbers)
+
+
+def _at(column: Column, rows: Ints, frames: Ints) -> tuple[Any, Bools]:
+    """Values at some places, and whether they are known; a column may be the same for all rows, or frames."""
+
+    def some(array: Any) -> Any:
+        array = np.atleast_2d(array)
+        row = rows if array.shape[0] > 1 else np.zeros_like(rows)
+        return array[row, frames if array.shape[1] > 1 else np.zeros_like(frames)]
+
+    return some(column.values), some(column.known)
+
+
+def _summed(word: str, values: Any, known: Bools, starts: Ints) -> Objects:
+    ends = np.append(starts[1:], len(values)).tolist()
+    found = np.full(len(starts), None, object)
+    for number, (start, end) in enumerate(zip(starts.tolist(), ends, strict=True)):
+        some = values[start:end][known[start:end]].tolist()
+        if some:
+            found[number] = math.fsum(some) / (len(some) if word == "avg" else 1)
+    return found
+
+
+# Frame by frame -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Fold:
+    """Knowledge of a value over frames that follow one another.
+
+    Attributes
+    ----------
+    start, end : int
+        Numbers of its frames; in others between them, and beside them, it was not known.
+    first, last : object
+        The value in the first and in the last of them.
+    best : float
+        The least value; of ``max`` and ``argmax`` the greatest one with its sign changed.
+    at : object
+        What is told of the first frame in which it was so.
+    total : int
+        The sum, in units of the smallest number there is.
+    count : int
+        How many values are in it.
+    """
+
+    start: int
+    end: int
+    first: Any
+    last: Any
+    best: float = math.inf
+    at: Any = None
+    total: int = 0
+    count: int = 0
+
+    @classmethod
+    def of(cls, word: str, frame: int, value: Any, at: Any) -> Fold | None:
+        """From one frame; ``None``: the value is not known there, or does not count."""
+        if value is None:
+            return None
+        if word in {"first", "last"}:
+            return cls(frame, frame, value, value)
+        if word in {"avg", "sum"}:
+            if not math.isfinite(value):
+                return None
+            return cls(frame, frame, value, value, total=exact(value), count=1)
+        if math.isnan(value):
+            return None
+        best = value if word in {"min", "argmin"} else -value
+        return cls(frame, frame, value, value, best, at)
+
+    def joined(self, later: Fold) -> Fold:
+        """With one of later frames; of equal values the earlier one is told of."""
+        better = self if self.best <= later.best else later
+        total, count = self.total + later.total, self.count + later.count
+        return Fold(
+            self.start, later.end, self.first, later.last, better.best, better.at, total, count
+        )
+
+    def told(self, word: str, start: int, end: int) -> Any:
+        """The number that the frames from one to another make of the value; see :meth:`Stretches.told`."""
+        match word:
+            case "first":
+                return self.first if self.start == start else None
+            case "last":
+                return self.last if self.end == end else None
+            case "min":
+                return self.best
+            case "max":
+                return -self.best
+            case "argmin" | "argmax":
+                return self.at
+            case _:
+                total = rounded(self.total)
+                return total / self.count if word == "avg" else total

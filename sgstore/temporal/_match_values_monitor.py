@@ -1,0 +1,169 @@
+"""Values over matches, frame by frame.
+
+Of each value that a match may be asked for, the frames since the first one that is still needed are kept as few
+stretches: those between frames at which a match may begin or end are joined, so what is kept grows with the
+matches that are open, and not with the time that they have been.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from dataclasses import replace
+from functools import reduce
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sgstore.temporal._match_values import Fold
+from sgstore.temporal._valuation import BindingTable, Valuation
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
+    from sgstore.lang import Column
+    from sgstore.lang import ir as b
+    from sgstore.temporal._plan import Plan
+    from sgstore.temporal._valuation import Memory, QueryCache, StreamClock
+
+    Entry = tuple[Memory, tuple[Fold, ...]]
+
+Span = tuple[int, int]
+"""Numbers of the first and the last frame of a part of a match."""
+
+
+class _Course:
+    """One value, as long as matches may be asked for it."""
+
+    def __init__(
+        self,
+        value: b.OverMatch,
+        plan: Plan,
+        questions: QueryCache,
+        pulse: StreamClock,
+        *,
+        bridge: bool,
+    ) -> None:
+        self._word, self._pulse = value.word, pulse
+        self._test = plan.test(value.operand).name
+        self._at = None if value.at is None else plan.test(value.at).name
+        self._variables = tuple(sorted({n for ask in plan.asks.values() for n in ask.variables}))
+        self._valuation = Valuation(plan, self._variables, questions, pulse, bridge=bridge)
+        begun: Entry = self._valuation.begun, ()
+        self._known: BindingTable[Entry] = BindingTable(self._valuation.lattice, begun)
+
+    def step(self) -> None:
+        """A frame has come, and the questions were asked of it."""
+        known, word, number = self._known, self._word, self._pulse.tick.number
+        letters, memories = self._valuation.read(known.held, lambda row: known.of(row)[0])
+        values = self._told(self._test, len(letters))
+        at = self._told(self._at, len(letters)) if self._at is not None else values
+        found: dict[Any, Entry] = {}
+        for row, value, there in zip(letters, values, at, strict=True):
+            _, folds = known.of(row)
+            new = Fold.of(word, number, value, there)
+            found[row] = memories[row], folds if new is None else (*folds, new)
+        known.held = found
+
+    def _told(self, test: str, rows: int) -> list[Any]:
+        column: Column = self._valuation.columns[test]
+        known = np.broadcast_to(np.atleast_2d(column.known)[:, 0], rows).tolist()
+        values = np.broadcast_to(column.values[:, 0], rows).tolist()
+        return [value if there else None for value, there in zip(values, known, strict=True)]
+
+    def value(self, binding: Mapping[str, int | None], span: Span) -> Any:
+        """The value of a binding over some frames."""
+        start, end = span
+        _, folds = self._known.of(tuple(binding.get(name) for name in self._variables))
+        inside = [fold for fold in folds if start <= fold.start and fold.end <= end]
+        return reduce(Fold.joined, inside).told(self._word, start, end) if inside else None
+
+    def forget(self, kept: Sequence[int]) -> None:
+        """Let go of what nothing is asked of any more; ``kept``: where it may begin or end, ascending."""
+        held = {
+            row: (memory, _merged(folds, kept)) for row, (memory, folds) in self._known.held.items()
+        }
+        self._known.keep(held, lambda one, other: one == other)
+
+
+def _merged(folds: tuple[Fold, ...], kept: Sequence[int]) -> tuple[Fold, ...]:
+    if not kept or not folds:
+        return ()
+    found: list[Fold] = []
+    for fold in folds[bisect_left(folds, kept[0], key=lambda one: one.start) :]:
+        apart = not found or bisect_left(kept, found[-1].start) < bisect_right(kept, fold.end)
+        if apart:
+            found.append(fold)
+        else:
+            found[-1] = found[-1].joined(fold)
+    return tuple(found)
+
+
+class MatchValues:
+    """Values over matches, while a trace comes.
+
+    Parameters
+    ----------
+    parts : iterable of OverMatch
+    plan : function
+        Makes a plan without questions, for the nodes and edges of the matches.
+    questions : QueryCache
+        What is asked of each frame; those of the values become part of them.
+    pulse : StreamClock
+        Told of each frame before this is.
+    bridge : bool
+        Whether gaps do not matter.
+
+    Raises
+    ------
+    QueryError
+        A value depends on later frames.
+    """
+
+    def __init__(
+        self,
+        parts: Iterable[b.OverMatch],
+        plan: Callable[[], Plan],
+        questions: QueryCache,
+        pulse: StreamClock,
+        *,
+        bridge: bool,
+    ) -> None:
+        self._courses: dict[b.OverMatch, _Course] = {}
+        for course in map(_anywhere, parts):
+            if course not in self._courses:
+                made = _Course(course, plan(), questions, pulse, bridge=bridge)
+                self._courses[course] = made
+
+    def step(self) -> None:
+        """A frame has come, and the questions were asked of it."""
+        for course in self._courses.values():
+            course.step()
+
+    def forget(self, kept: Iterable[int]) -> None:
+        """Let go of what no match needs any more.
+
+        Parameters
+        ----------
+        kept : iterable of int
+            Numbers of the frames at which a part of a match may begin or end.
+        """
+        ordered = sorted(set(kept))
+        for course in self._courses.values():
+            course.forget(ordered)
+
+    def value(self, part: b.OverMatch, binding: Mapping[str, int | None], span: Span) -> Any:
+        """The value of a part of a match; ``None``: it is not known.
+
+        Parameters
+        ----------
+        part : OverMatch
+        binding : mapping of str to int or None
+            ``None``: any node that was never told of.
+        span : (int, int)
+            Numbers of its first and its last frame.
+        """
+        return self._courses[_anywhere(part)].value(binding, span)
+
+
+def _anywhere(value: b.OverMatch) -> b.OverMatch:
+    return replace(value, start=None, end=None)
