@@ -56,7 +56,7 @@ TESTS = {
     "segments": "ingest ingest_many",
     "selection": "selection selection_* prioritize",
     "sgg": "sgg sgg_* crowds",
-    "serve": "serve explorer sandbox_pool",
+    "serve": "serve report explorer sandbox_pool",
     "step": "online",
     "store": "store store_* doors events",
     "temporal": "temporal monitor over_time robustness windows tolerance",

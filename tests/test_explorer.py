@@ -17,6 +17,7 @@ import pytest
 
 from sgstore.ingest import ingest
 from sgstore.query import Store
+from sgstore.serve import report
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -297,6 +298,23 @@ def test_every_width_and_both_schemes_fit(page: Any, scheme: str) -> None:
         assert box["width"] > 300
         assert box["height"] > 250
         seen(page, f"scene-{width}-{scheme}")
+
+
+def test_a_report_plays_from_a_file_without_a_network(
+    visit: Callable[..., Any], town_store: Path, tmp_path: Path
+) -> None:
+    report(Store(town_store), f"{NEAR} WHERE e.speed > 3", tmp_path / "r.html", pictures=True)
+    page = visit((tmp_path / "r.html").as_uri(), offline=True)
+    open_first(page)
+    expect(page.locator(".timeline .lane[data-holds=true]")).to_have_count(2)
+    was = time_shown(page).inner_text()
+    page.keyboard.press(" ")
+    expect(time_shown(page)).not_to_have_text(was)
+    page.keyboard.press(" ")
+    expect(page.locator(".camera .none")).to_have_count(0)
+    seen(page, "report")
+    if AXE.exists():
+        assert faults(page) == []
 
 
 def faults(page: Any) -> list[str]:

@@ -1,6 +1,6 @@
 """What the explorer's page has of other packages, in pinned versions, and the types of its own modules.
 
-``python tests/vendor.py`` makes the one file of the page that is not ours, with its licences. ``--check``
+``python tests/vendor.py`` makes the two files of the page that are not ours, with licences. ``--check``
 compares it with what is there and has the page's modules checked by ``tsc``, strictly. npm is that of the
 machine, or else the one that Python's type checker brought along; what it installs stays in ``build/page``.
 """
@@ -22,10 +22,12 @@ HERE: Final = ROOT / "tests" / "vendor"
 PAGE: Final = ROOT / "sgstore" / "serve" / "page"
 BUILD: Final = ROOT / "build" / "page"
 LISTS: Final = ("package.json", "package-lock.json")
+PARTS: Final = ("core.js", "codemirror.js")
+"""Entries of what is bundled; a report holds the first alone."""
 
 BUNDLED: Final = (
     *("--bundle", "--format=esm", "--minify", "--legal-comments=none", "--target=es2022"),
-    *("--outfile=vendor.js", "--log-level=warning"),
+    *("--outdir=made", "--log-level=warning"),
 )
 TYPES: Final = {
     "compilerOptions": {
@@ -68,9 +70,11 @@ def run(environment: dict[str, str], *command: str) -> None:
 
 def made(environment: dict[str, str]) -> dict[str, bytes]:
     """The files of the page that are made, by name."""
-    shutil.copy(HERE / "entry.js", BUILD / "entry.js")
-    run(environment, "node_modules/.bin/esbuild", "entry.js", *BUNDLED)
-    return {"vendor.js": (BUILD / "vendor.js").read_bytes(), "LICENSES.txt": licences()}
+    for name in PARTS:
+        shutil.copy(HERE / name, BUILD / name)
+    run(environment, "node_modules/.bin/esbuild", *PARTS, *BUNDLED)
+    files = {name: (BUILD / "made" / name).read_bytes() for name in PARTS}
+    return {**files, "LICENSES.txt": licences()}
 
 
 def licences() -> bytes:
@@ -93,7 +97,8 @@ def has_types(environment: dict[str, str]) -> bool:
     shutil.rmtree(tried, ignore_errors=True)
     shutil.copytree(PAGE / "js", tried / "js")
     (tried / "vendor").mkdir()
-    shutil.copy(HERE / "entry.js", tried / "vendor" / "vendor.d.ts")
+    for name in PARTS:
+        shutil.copy(HERE / name, (tried / "vendor" / name).with_suffix(".d.ts"))
     (tried / "tsconfig.json").write_text(json.dumps(TYPES))
     command = ["node_modules/.bin/tsc", "-p", "typed"]
     return subprocess.run(command, cwd=BUILD, env=environment, check=False).returncode == 0

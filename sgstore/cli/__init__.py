@@ -35,7 +35,7 @@ VERBS: Final = {
     "checks": ("check", "monitor", "timeline"),
     "coverage": ("coverage", "select", "prioritize", "diff", "lock"),
     "exports": ("show", "export"),
-    "serve": ("serve",),
+    "serve": ("serve", "report"),
     "assistant": ("mcp",),
     "collections": ("collection",),
 }

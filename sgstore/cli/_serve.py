@@ -1,4 +1,4 @@
-"""The verb that serves the explorer."""
+"""Verbs of the explorer: serve, report."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Final
 import typer
 from typer import Option
 
-from sgstore.cli._options import StorePath, app
+from sgstore.cli._options import QueryLimits, Question, StorePath, app, seconds_of
 from sgstore.cli._output import say
 
 PANEL: Final = "Pictures and exports"
@@ -54,4 +54,48 @@ def serve(
         browse=browse,
         on_start=tell,
     )
+    return 0
+
+
+@app.command(rich_help_panel=PANEL)
+def report(
+    store: StorePath,
+    question: Question,
+    output: Annotated[
+        Path, Option("--output", "-o", help="The page: FILE.html.", show_default="report.html")
+    ] = Path("report.html"),
+    limit: Annotated[
+        int, Option("--limit", min=1, help="Most matches, or violations, in the page.")
+    ] = 100,
+    around: Annotated[
+        str, Option("--around", metavar="TIME", help="Time before and after each match.")
+    ] = "2s",
+    pictures: Annotated[
+        bool,
+        Option("--pictures/--no-pictures", help="A camera picture for each second of a match."),
+    ] = False,
+    *,
+    bounds: QueryLimits,
+) -> int:
+    """Write the matches of a query as one page, to be watched without a server and without a network.
+
+    Of checks it shows the violations.
+    """
+    from sgstore.serve import report as write
+
+    if not question:
+        raise typer.BadParameter("give a QUERY, -f FILE or -p NAME")
+    text, values = question.asked()
+    many, more = write(
+        bounds.opened(store),
+        text,
+        output,
+        parameters=values,
+        most=limit,
+        around_s=seconds_of(around, "--around"),
+        pictures=pictures,
+    )
+    if more:
+        say(f"there are more matches: the first {many} are in the page (--limit)")
+    typer.echo(output)
     return 0

@@ -4,6 +4,7 @@ from ._app import Explorer as Explorer
 from ._app import application as application
 from ._notes import Note as Note
 from ._notes import NotesFile as NotesFile
+from ._report import report as report
 from ._serve import serve as serve
 
-__all__ = ["Explorer", "Note", "NotesFile", "application", "serve"]
+__all__ = ["Explorer", "Note", "NotesFile", "application", "report", "serve"]

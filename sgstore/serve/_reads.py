@@ -139,23 +139,22 @@ class Reads:
 
     def static(self, fields: Fields) -> Read:
         """Things that never move in a trace, and the names of all entities."""
-        trace = fields.text("trace")
+        return partial(self.still, fields.text("trace"))
 
-        def read() -> bytes:
-            of = self._trace(trace).trace_id
-            with self._store.file.snapshot():
-                names = self._store.file.entity_names(of)
-                columns = self._store.file.scenery(of)
-            return packed({"trace": trace, "names": names}, columns)
-
-        return read
+    def still(self, trace: str) -> bytes:
+        """Things that never move in a trace, and the names of all entities, as bytes."""
+        of = self._trace(trace).trace_id
+        with self._store.file.snapshot():
+            names = self._store.file.entity_names(of)
+            columns = self._store.file.scenery(of)
+        return packed({"trace": trace, "names": names}, columns)
 
     def map(self, fields: Fields) -> Read:
         """Outlines of the road map of a trace; without points where it has none."""
-        trace = fields.text("trace")
-        return partial(self._map, trace)
+        return partial(self.outlines, fields.text("trace"))
 
-    def _map(self, trace: str) -> bytes:
+    def outlines(self, trace: str) -> bytes:
+        """Outlines of the road map of a trace; without points where it has none."""
         self._trace(trace)
         key = self._store.file.places()[trace][2]
         with self._reading:  # one map at a time: two who ask for one do not read it twice
@@ -176,7 +175,7 @@ class Reads:
         """Read the maps before they are asked for."""
         for trace in self._traces()[0]:
             with suppress(SgstoreError):
-                self._map(trace)
+                self.outlines(trace)
 
     def series(self, fields: Fields) -> Read:
         """An attribute over time."""
@@ -211,14 +210,20 @@ class Reads:
     def picture(self, fields: Fields) -> Read:
         """Picture of a camera at a frame, as it stands in the recording."""
         trace, seq, channel = fields.text("trace"), fields.whole("seq"), fields.text("channel")
+        return partial(self.picture_at, trace, seq, channel)
 
-        def read() -> tuple[bytes, str]:
-            media = self._store.file.carried(self.frame_id(trace, seq), channel)
-            if media.form not in _PICTURES:
-                raise ExportError(f"{channel}: the message holds {media.form}, no picture")
-            return media.data, _PICTURES[media.form]
+    def picture_at(self, trace: str, seq: int, channel: str) -> tuple[bytes, str]:
+        """Picture of a camera at a frame, and its type.
 
-        return read
+        Raises
+        ------
+        ExportError
+            The message holds no picture that a browser shows.
+        """
+        media = self._store.file.carried(self.frame_id(trace, seq), channel)
+        if media.form not in _PICTURES:
+            raise ExportError(f"{channel}: the message holds {media.form}, no picture")
+        return media.data, _PICTURES[media.form]
 
     def words(self, _: Fields) -> Read:
         """Words of the language, for completion."""

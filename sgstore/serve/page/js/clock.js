@@ -1,9 +1,9 @@
 // @ts-check
 // One clock over all that is open: the frame, whether it plays, and what the server says of it.
-import { computed, effect, signal } from "../vendor/vendor.js";
+import { computed, effect, signal } from "../vendor/core.js";
 import * as api from "./api.js";
 import { nameOf } from "./data.js";
-import { answer, matches, open, openMatch, parametersOf, playing, rate, reasonOf, say, seq, text, traces, writeAddress } from "./state.js";
+import { answer, matches, offline, open, openMatch, parametersOf, playing, rate, reasonOf, say, seq, store, text, traces, writeAddress } from "./state.js";
 
 /** Lanes of truth of what is open: answers of the server. */
 export const lanes = signal(/** @type {any} */ (null));
@@ -15,6 +15,13 @@ export const series = signal(/** @type {any} */ (null));
 
 export const frame = computed(() => Math.round(seq.value));
 export const asked = computed(() => answer.value.query || text.value.trim());
+
+/** First and last frame that can be shown: of the trace; in a report of what it holds around the match. */
+const bounds = computed(/** @returns {[number, number]} */ () => {
+  const about = traces.value.get(open.value?.trace || ""), match = open.value?.match;
+  const end = Math.max((about?.frames || 1) - 1, 0), around = Math.floor((store.value?.around || 0) / (about?.period || 0.1));
+  return offline.value && match ? [Math.max(match.first - around, 0), Math.min(match.last + around, end)] : [0, end];
+});
 
 /** Which parts hold now, by lane. @param {number} at */
 export const holdsAt = (at) => (lanes.value?.lanes || []).map((/** @type {any} */ lane) => (lane.unknown.length ? null
@@ -55,9 +62,8 @@ export async function askWhy() {
 
 /** The frame asked for by keys and buttons, inside the trace. @param {number} to */
 export function goTo(to) {
-  const about = traces.value.get(open.value?.trace || "");
-  if (!about) return;
-  seq.value = Math.max(0, Math.min(about.frames - 1, to));
+  const [first, last] = bounds.value;
+  seq.value = Math.max(first, Math.min(last, to));
 }
 
 export function copyLink() {
@@ -71,7 +77,7 @@ function step(now) {
   const about = traces.value.get(open.value?.trace || "");
   if (playing.value && about) {
     const next = seq.value + ((now - last) / 1000) * rate.value / (about.period || 0.1);
-    if (next >= about.frames - 1) { seq.value = about.frames - 1; playing.value = false; } else seq.value = next;
+    if (next >= bounds.value[1]) { seq.value = bounds.value[1]; playing.value = false; } else seq.value = next;
   }
   last = now;
   if (playing.value) requestAnimationFrame(step);

@@ -1,6 +1,6 @@
 // @ts-check
 // Columns of states, maps and pictures as the page needs them: asked for once, kept while they are near.
-import { signal } from "../vendor/vendor.js";
+import { signal } from "../vendor/core.js";
 import * as api from "./api.js";
 import { store, traces } from "./state.js";
 

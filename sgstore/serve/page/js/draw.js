@@ -26,6 +26,8 @@ const KINDS = {
   barrier: "#a9a39b", building: "#d2cfc9", vegetation: "#c6d4ba", unknown: "#8f8a94",
 };
 /** @type {Record<string, string>} */
+const DARK_KINDS = { ...KINDS, building: "#3d434c", vegetation: "#33432f", prop: "#5f5b56", pole: "#5f5b56", barrier: "#5f5b56" };
+/** @type {Record<string, string>} */
 const LIGHTS = { red: "#e5383b", red_yellow: "#ff8c1a", yellow: "#ffb703", green: "#2ec4a0", flashing: "#ffe08a", off: "#5a626f" };
 const SCENERY = new Set(["building", "vegetation", "prop", "pole", "barrier"]);
 
@@ -38,7 +40,7 @@ export function inks() {
   const isDark = theme ? theme === "dark" : dark;
   return {
     dark: isDark, ink: of("--ink"), faint: of("--faint"), ego: of("--ego"), hold: of("--hold"), fail: of("--fail"),
-    mark: of("--mark"), ground: of("--map-ground"), raised: of("--raised"), lanes: isDark ? DARK_LANES : LANES,
+    mark: of("--mark"), ground: of("--map-ground"), raised: of("--raised"), lanes: isDark ? DARK_LANES : LANES, kinds: isDark ? DARK_KINDS : KINDS,
     line: isDark ? "#59636f" : "#ffffff",
   };
 }
@@ -90,11 +92,11 @@ function paintMap(ctx, trace, look, ratio, ink, marked, lit, small) {
     const [x0, y0, x1, y1] = ring.box;
     if (x1 < x - reach || x0 > x + reach || y1 < y - reach || y0 > y + reach) continue;
     if (ring.closed) {
-      ctx.fillStyle = ink.lanes[ring.word] || (KINDS[ring.word] ? `${KINDS[ring.word]}38` : ink.lanes.none || "#888");
+      ctx.fillStyle = ink.lanes[ring.word] || (ink.kinds[ring.word] ? `${ink.kinds[ring.word]}38` : ink.lanes.none || "#888");
       ctx.fill(ring.path);
       if (!small && ring.word === "driving") ctx.stroke(ring.path);
     } else if (!small) {
-      ctx.strokeStyle = KINDS[ring.word] || ink.faint;
+      ctx.strokeStyle = ink.kinds[ring.word] || ink.faint;
       ctx.stroke(ring.path);
       ctx.strokeStyle = ink.line;
     }
@@ -121,7 +123,7 @@ function paintEntity(ctx, c, i, scale, ink, what) {
   ctx.save();
   ctx.translate(c.x[i], c.y[i]);
   ctx.rotate(heading);
-  ctx.fillStyle = ego ? ink.ego : KINDS[kind] || KINDS.unknown || "#888";
+  ctx.fillStyle = ego ? ink.ego : ink.kinds[kind] || ink.kinds.unknown || "#888";
   if (kind === "traffic_light") ctx.fillStyle = LIGHTS[lightOf(c.light?.[i] ?? 0)] || ink.faint;
   if (SCENERY.has(kind)) ctx.globalAlpha = 0.55;
   ctx.beginPath();

@@ -2,10 +2,11 @@
 // The editor of queries: colours, completion, errors under carets, a slider for the number under the cursor.
 import {
   autocompletion, bracketMatching, closeBrackets, closeBracketsKeymap, completionKeymap, defaultKeymap, drawSelection,
-  EditorState, EditorView, highlightSpecialChars, HighlightStyle, history, historyKeymap, htm, h, keymap, placeholder,
-  setDiagnostics, signal, StreamLanguage, syntaxHighlighting, tags, useEffect, useRef,
-} from "../vendor/vendor.js";
-import { answer, find, text, words } from "./state.js";
+  EditorState, EditorView, highlightSpecialChars, HighlightStyle, history, historyKeymap, keymap, placeholder, setDiagnostics,
+  StreamLanguage, syntaxHighlighting, tags,
+} from "../vendor/codemirror.js";
+import { h, htm, signal, useEffect, useRef } from "../vendor/core.js";
+import { answer, editing, find, text, words } from "./state.js";
 
 const html = htm.bind(h);
 const nonce = document.querySelector("meta[name=csp-nonce]")?.getAttribute("content") || "";
@@ -121,6 +122,9 @@ export function setQuery(query) {
     editor.dispatch({ changes: { from: 0, to: editor.state.doc.length, insert: query }, selection: { anchor: query.length } });
   }
 }
+
+editing.replace = replacePart;
+editing.set = setQuery;
 
 export const focusEditor = () => editor?.focus();
 

@@ -1,9 +1,9 @@
 // @ts-check
 // The matches as small pictures, grouped by trace; only what is in sight is there.
-import { h, htm, useEffect, useLayoutEffect, useRef, useState } from "../vendor/vendor.js";
+import { h, htm, useEffect, useLayoutEffect, useRef, useState } from "../vendor/core.js";
 import { arrived, mapOf, stillOf, thumbOf, wantThumbs } from "./data.js";
 import { fitted, lookAt, paintScene } from "./draw.js";
-import { keyOf, matches, notes, open, openMatch, paints, tick, ticked, traces } from "./state.js";
+import { keyOf, matches, notes, offline, open, openMatch, paints, tick, ticked, traces } from "./state.js";
 
 const html = htm.bind(h);
 const GAP = 12, HEAD = 32;
@@ -56,8 +56,8 @@ function Tile({ match, x, y, wide, high }) {
       data-index=${match.index} onClick=${() => openMatch(match)}>
     <canvas ref=${canvas} aria-hidden="true"></canvas>
     <div class="about">
-      <input type="checkbox" checked=${on} aria-label=${`Select ${match.trace} ${match.start.toFixed(1)} s`}
-        onClick=${(/** @type {any} */ event) => { event.stopPropagation(); tick(match); }} />
+      ${offline.value ? null : html`<input type="checkbox" checked=${on} aria-label=${`Select ${match.trace} ${match.start.toFixed(1)} s`}
+        onClick=${(/** @type {any} */ event) => { event.stopPropagation(); tick(match); }} />`}
       <button class="quiet small" aria-label=${`Open ${match.trace}, ${match.start.toFixed(1)}–${match.end.toFixed(1)} s`}>${match.start.toFixed(1)}–${match.end.toFixed(1)} s</button>
       ${tags.map((n) => html`<span class="tag">${n[2]}</span>`)}<span class="who" title=${who}>${who}</span>
     </div></div>`;

@@ -1,6 +1,6 @@
 // @ts-check
 // Keys of the scene: what they do, and the list of them.
-import { h, htm } from "../vendor/vendor.js";
+import { h, htm } from "../vendor/core.js";
 import { camera, frame, goTo, matchEnd, nextMatch, panel } from "./clock.js";
 import { dialog, open, playing, tick, traces, writeAddress } from "./state.js";
 

@@ -1,18 +1,19 @@
 // @ts-check
 // The page: its head, the search, what was found, and the view that is open; keys.
-import { effect, h, htm, render, untracked, useEffect } from "../vendor/vendor.js";
+import { effect, h, htm, render, untracked, useEffect } from "../vendor/core.js";
 import * as api from "./api.js";
 import { askWhy, copyLink, frame } from "./clock.js";
 import { Editor, focusEditor, NumberSlider, setQuery } from "./editor.js";
 import { Gallery } from "./gallery.js";
 import { Keys, keys } from "./keys.js";
 import { Scene } from "./scene.js";
-import { Compare, Coverage, countLibrary, Selection, Start, Verdicts } from "./sheets.js";
+import { Compare, Coverage, countLibrary, Selection, Start } from "./sheets.js";
 import {
-  answer, cancel, dialog, find, history, library, namesIn, notes, open, openFrame, paints, playing, readAddress, reasonOf, say, seq, store, tag,
+  answer, cancel, dialog, find, history, keep, library, namesIn, notes, open, openFrame, paints, playing, readAddress, reasonOf, say, seq, store, tag,
   text, theme, ticked, toast, values, view, words, writeAddress, writeAddressSoon,
 } from "./state.js";
 import { Status } from "./status.js";
+import { Verdicts } from "./verdicts.js";
 
 const html = htm.bind(h);
 const VIEWS = [["find", "Find"], ["coverage", "Coverage"], ["selection", "Selection"], ["compare", "Compare"]];
@@ -138,7 +139,7 @@ keys.push(["t", "tag this frame", { t: () => { if (open.value) dialog.value = "t
 
 effect(() => {
   if (theme.value) document.documentElement.dataset.theme = theme.value; else delete document.documentElement.dataset.theme;
-  localStorage.setItem("sgstore theme", theme.value);
+  keep("theme", theme.value);
   untracked(() => { paints.value++; });
 });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { paints.value++; });

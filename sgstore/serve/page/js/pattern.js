@@ -1,6 +1,6 @@
 // @ts-check
 // The pattern as a small drawing that stays still, while its edges and conditions turn ✓ or ✗.
-import { h, htm, useMemo } from "../vendor/vendor.js";
+import { h, htm, useMemo } from "../vendor/core.js";
 import { lit, open } from "./state.js";
 
 const html = htm.bind(h);

@@ -1,13 +1,12 @@
 // @ts-check
 // A match, or a frame: camera, view from above, the pattern, lanes of truth, all by one clock.
-import { effect, h, htm, signal, useEffect, useLayoutEffect, useRef, useState } from "../vendor/vendor.js";
+import { effect, h, htm, signal, useEffect, useLayoutEffect, useRef, useState } from "../vendor/core.js";
 import * as api from "./api.js";
 import { asked, askWhy, camera, copyLink, frame, holdsAt, lanes, nextMatch, panel, series, showSeries, why } from "./clock.js";
 import { arrived, nameOf, pictureAt, statesAt } from "./data.js";
 import { egoRow, fitted, lookAt, nodeAt, paintScene, rowOf } from "./draw.js";
-import { replacePart, setQuery } from "./editor.js";
 import { PatternDrawing } from "./pattern.js";
-import { chosen, find, lit, open, openFrame, paints, playing, rate, reasonOf, say, text, traces, writeAddress } from "./state.js";
+import { chosen, editing, find, lit, offline, open, openFrame, paints, playing, rate, reasonOf, say, text, traces, writeAddress } from "./state.js";
 import { Timeline } from "./timeline.js";
 
 const html = htm.bind(h);
@@ -20,7 +19,7 @@ effect(() => { open.value?.trace; zoom.value = { ...zoom.peek(), dx: 0, dy: 0 };
 function relax(change) {
   const raw = text.value, lead = raw.length - raw.trimStart().length;
   const now = open.value;
-  replacePart(change.start + lead, change.end + lead, change.text);
+  editing.replace(change.start + lead, change.end + lead, change.text);
   find({ keep: true }).then(() => { if (now) { why.value = null; openFrame(now.trace, frame.value, null); } });
 }
 
@@ -119,7 +118,7 @@ function Above() {
     const box = canvas.current.getBoundingClientRect();
     const node = nodeAt(seen.current, look.current, e.clientX - box.left, e.clientY - box.top);
     chosen.value = node < 0 ? null : node;
-    if (node >= 0) { panel.value = "node"; showSeries("speed", node); }
+    if (node >= 0) { panel.value = "node"; if (!offline.value) showSeries("speed", node); }
   };
   return html`<div class="panel above">
     <div class="caption">
@@ -148,7 +147,7 @@ const PAIRS = ["distance", "gap", "ttc", "headway", "bearing", "closing_speed"];
 const OF_NODE = ["speed", "accel", "yaw_rate", "heading", "steer", "brake"];
 
 function Details() {
-  const tabs = [["pattern", "pattern"], ["nodes", "nodes"], ["edges", "edges"], ...(chosen.value === null ? [] : [["node", nameOf(open.value?.trace || "", chosen.value)]])];
+  const tabs = [["pattern", "pattern"], ...(offline.value ? [] : [["nodes", "nodes"], ["edges", "edges"]]), ...(chosen.value === null ? [] : [["node", nameOf(open.value?.trace || "", chosen.value)]])];
   const now = panel.value === "node" && chosen.value === null ? "pattern" : panel.value;
   return html`<div class="panel pattern">
     <div class="tabs" role="tablist">${tabs.map(([key, name]) => html`<button role="tab" aria-selected=${now === key}
@@ -167,11 +166,11 @@ function NodePanel() {
   const other = ego >= 0 && c && c.node[ego] !== node ? c.node[ego] : undefined;
   return html`<div class="scroll" style=${{ padding: "8px 12px" }}>
     <table><tbody>${about.map(([name, value]) => html`<tr><td class="faint">${name}</td><td>${value}</td></tr>`)}</tbody></table>
-    <div class="row wrap" style=${{ marginTop: "8px" }}>
+    ${offline.value ? null : html`<div class="row wrap" style=${{ marginTop: "8px" }}>
       ${OF_NODE.map((name) => html`<button class="small" aria-pressed=${series.value?.attribute === name} onClick=${() => showSeries(name, node)}>${name}</button>`)}
       ${other === undefined ? null : PAIRS.map((name) => html`<button class="small" onClick=${() => showSeries(name, other, node)}>${name} from ego</button>`)}
     </div>
-    <p class="row wrap"><button class="small" onClick=${() => { setQuery(`MATCH (e:Ego), (x) WHERE x.id = ${node} AND trace.name = '${now.trace.replace(/'/g, "\\'")}' AND dist(e, x) < 30`); find(); }}>as a query</button></p>
+    <p class="row wrap"><button class="small" onClick=${() => { editing.set(`MATCH (e:Ego), (x) WHERE x.id = ${node} AND trace.name = '${now.trace.replace(/'/g, "\\'")}' AND dist(e, x) < 30`); find(); }}>as a query</button></p>`}
   </div>`;
 }
 
@@ -217,8 +216,8 @@ function Transport() {
       ${[0.25, 0.5, 1, 2, 4].map((r) => html`<option value=${r}>${r}×</option>`)}</select>
     <span class="time"><b>${now?.trace}</b>#${frame.value} · ${t.toFixed(2)} s</span>
     <span class="grow"></span>
-    <button title="why does this frame match, or not (w)" aria-expanded=${told ? "true" : "false"} onClick=${() => { if (told) why.value = null; else askWhy(); }}>Why?</button>
-    <button title="copy a link (y)" onClick=${copyLink}>Link</button>
+    ${offline.value ? null : html`<button title="why does this frame match, or not (w)" aria-expanded=${told ? "true" : "false"} onClick=${() => { if (told) why.value = null; else askWhy(); }}>Why?</button>
+    <button title="copy a link (y)" onClick=${copyLink}>Link</button>`}
     <button aria-label="Close" title="close (Esc)" onClick=${() => { playing.value = false; open.value = null; writeAddress(); }}>✕</button>
     ${told ? html`<span class="gap" role="status">${gap?.failed ? html`<span><b>fails</b> <code>${gap.failed}</code>${gap.found ? html` · found <code>${gap.found}</code>` : null}</span>`
       : told.error ? told.error.reason : "all of it holds in this frame"}

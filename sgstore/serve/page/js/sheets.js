@@ -1,6 +1,6 @@
 // @ts-check
 // Views beside the search: the library before anything is asked, coverage, the selection, two stores compared.
-import { h, htm, signal, useEffect, useState } from "../vendor/vendor.js";
+import { h, htm, signal, useEffect, useState } from "../vendor/core.js";
 import * as api from "./api.js";
 import { setQuery } from "./editor.js";
 import { answer, find, keyOf, library, open, openFrame, openMatch, reasonOf, say, store, tally, text, tick, ticked, traces, values, view } from "./state.js";
@@ -66,12 +66,6 @@ export function Start() {
           ${told?.spans.length ? html`<svg viewBox="0 0 1000 18" preserveAspectRatio="none" aria-hidden="true"><rect class="bar-back" width="1000" height="18" />${told.spans.map(([a, z]) => html`<rect class="bar-match" x=${a} width=${Math.max((z || 0) - (a || 0), 4)} height="18" />`)}</svg>` : null}
           ${one.drawing ? html`<pre aria-hidden="true">${one.drawing}</pre>` : null}</button>`;
       })}</div>`)}</div>`;
-}
-
-export function Verdicts() {
-  const told = answer.value.verdicts;
-  return html`<div class="sheet" tabindex="0"><table><thead><tr><th>check</th><th>trace</th><th>verdict</th><th class="number">violations</th><th>reason</th></tr></thead>
-    <tbody>${told.map((/** @type {any} */ v) => html`<tr><td>${v.check}</td><td>${v.trace}</td><td class=${v.verdict === "true" ? "holds" : v.verdict === "false" ? "fails" : ""}>${v.verdict}</td><td class="number">${v.violations}</td><td>${v.reason}</td></tr>`)}</tbody></table></div>`;
 }
 
 // Tables and charts --------------------------------------------------------------------------------------------------

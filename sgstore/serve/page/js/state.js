@@ -1,6 +1,6 @@
 // @ts-check
 // What the page knows and shows, as signals; and its address, from which all of it can be had again.
-import { batch, computed, signal } from "../vendor/vendor.js";
+import { batch, computed, signal } from "../vendor/core.js";
 import * as api from "./api.js";
 
 /** A match: a run of frames of a trace, and the nodes that are bound.
@@ -31,7 +31,14 @@ export const lit = signal(/** @type {Set<number>} */ (new Set()));
 export const chosen = signal(/** @type {number | null} */ (null));
 export const toast = signal("");
 export const dialog = signal("");
-export const theme = signal(localStorage.getItem("sgstore theme") || "");
+/** True in a report, which has no server. */
+export const offline = signal(false);
+export const theme = signal(remembered("theme"));
+/** What the editor does; a report has none. */
+export const editing = {
+  replace: (/** @type {number} */ _from, /** @type {number} */ _to, /** @type {string} */ _insert) => {},
+  set: (/** @type {string} */ query) => { text.value = query; },
+};
 
 /** Counts changes of colours: what is painted is painted again. */
 export const paints = signal(0);
@@ -77,11 +84,20 @@ export const reasonOf = (error) => (error instanceof Error ? error.message : Str
 let number = 0;
 /** @type {AbortController | null} */
 let under = null;
-const HISTORY = "sgstore history";
+
+/** What the browser kept for the page; nothing where it may keep nothing. @param {string} name */
+export function remembered(name) {
+  try { return localStorage.getItem(`sgstore ${name}`) || ""; } catch { return ""; }
+}
+
+/** @param {string} name @param {string} value */
+export function keep(name, value) {
+  try { localStorage.setItem(`sgstore ${name}`, value); } catch { /* no room, or not allowed */ }
+}
 
 /** @returns {string[]} */
 export function history() {
-  try { return JSON.parse(localStorage.getItem(HISTORY) || "[]"); } catch { return []; }
+  try { return JSON.parse(remembered("history") || "[]"); } catch { return []; }
 }
 
 /** Values of the parameters of a text, as numbers where they are numbers.
@@ -188,7 +204,7 @@ function fromVerdicts(told, found) {
 /** @param {string} query */
 function remember(query) {
   const kept = [query, ...history().filter((one) => one !== query)].slice(0, 40);
-  try { localStorage.setItem(HISTORY, JSON.stringify(kept)); } catch { /* no room */ }
+  if (!offline.value) keep("history", JSON.stringify(kept));
 }
 
 /** Open a match, or a frame of a trace. @param {Match} match @param {number} [at] */
@@ -224,6 +240,7 @@ export async function tag(body) {
 // The address: everything behind '#', so that it never reaches the server ----------------------------------
 
 export function writeAddress() {
+  if (offline.value) return;
   const parts = new URLSearchParams();
   if (view.value !== "find") parts.set("show", view.value);
   if (text.value.trim()) parts.set("q", text.value.trim());

@@ -1,7 +1,7 @@
 // @ts-check
 // What was found, in a line: how much, how long it took, who cannot answer.
-import { h, htm } from "../vendor/vendor.js";
-import { answer, filter, framesFound, keyOf, matches, store, tick, ticked } from "./state.js";
+import { h, htm } from "../vendor/core.js";
+import { answer, filter, framesFound, keyOf, matches, offline, store, tick, ticked } from "./state.js";
 
 const html = htm.bind(h);
 
@@ -14,8 +14,8 @@ export function Status() {
     ${told.state === "busy" ? html`<span class="busy" aria-hidden="true"></span>` : null}
     ${told.error ? html`<div class="error"><b>${told.error.reason}</b>${told.error.hint ? html` · ${told.error.hint}` : null}</div>`
       : told.rows ? html`<span><b>${told.rows.length.toLocaleString("en")}</b> rows</span>`
-      : html`<span><b>${found.toLocaleString("en")}</b> ${told.verdicts ? "violations" : found === 1 ? "match" : "matches"} in ${many} ${many === 1 ? "trace" : "traces"}, ${frames.toLocaleString("en")} frames</span>`}
-    ${told.ms ? html`<span class="faint">${Math.round(told.ms)} ms</span>` : null}
+      : html`<span><b>${found.toLocaleString("en")}</b> ${told.verdicts ? (found === 1 ? "violation" : "violations") : found === 1 ? "match" : "matches"} in ${many} ${many === 1 ? "trace" : "traces"}, ${frames.toLocaleString("en")} frames</span>`}
+    ${told.ms && !offline.value ? html`<span class="faint">${Math.round(told.ms)} ms</span>` : null}
     ${told.state === "cancelled" ? html`<span class="note">stopped: this is what was found before</span>` : null}
     ${told.truncated ? html`<span class="note">there are more: only the first ${(told.count || told.rows?.length || found).toLocaleString("en")} are shown</span>` : null}
     ${(told.notes || []).map((/** @type {string} */ note) => html`<span class="note">${note}</span>`)}
@@ -26,6 +26,6 @@ export function Status() {
       <option value="">all traces</option>${store.value.traces.map((/** @type {any} */ t) => html`<option>${t.name}</option>`)}</select>` : null}
     ${maps.length > 1 ? html`<select aria-label="Map" value=${where.map} onChange=${(/** @type {any} */ e) => { filter.value = { ...where, map: e.target.value }; }}>
       <option value="">all maps</option>${maps.map((m) => html`<option>${m}</option>`)}</select>` : null}
-    ${found && !told.rows ? html`<button class="small" onClick=${() => { for (const m of matches.value) if (!ticked.value.has(keyOf(m))) tick(m); }}>select all</button>` : null}
+    ${found && !told.rows && !offline.value ? html`<button class="small" onClick=${() => { for (const m of matches.value) if (!ticked.value.has(keyOf(m))) tick(m); }}>select all</button>` : null}
   </div>`;
 }

@@ -1,6 +1,6 @@
 // @ts-check
 // The whole trace in time: matches, a lane for each part of the pattern, tags, values; drag to go there.
-import { h, htm, useRef } from "../vendor/vendor.js";
+import { h, htm, useRef } from "../vendor/core.js";
 import { frame, goTo, holdsAt, lanes, series } from "./clock.js";
 import { keyOf, lit, matches, notes, open, playing, traces } from "./state.js";
 

@@ -1,8 +1,4 @@
-// What the page uses of other packages, as one module: tests/vendor.py makes sgstore/serve/page/vendor/vendor.js of it.
-export { h, render, Fragment } from "preact";
-export { useEffect, useLayoutEffect, useMemo, useRef, useState } from "preact/hooks";
-export { batch, computed, effect, signal, untracked, useComputed, useSignal, useSignalEffect } from "@preact/signals";
-export { default as htm } from "htm";
+// What the editor uses of CodeMirror: tests/vendor.py makes sgstore/serve/page/vendor/codemirror.js of it.
 export { Compartment, EditorState, StateEffect } from "@codemirror/state";
 export {
   drawSelection, EditorView, highlightSpecialChars, hoverTooltip, keymap, placeholder, tooltips,

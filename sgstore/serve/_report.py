@@ -1,0 +1,326 @@
+"""Matches of a query as one file of HTML, to be looked at and played without a server and without a network.
+
+It holds the page's own modules, made into one script, and the answers that they would ask a server for: the
+matches, lanes of truth, states around each match, outlines of maps and, if wanted, camera pictures. A policy in
+the file lets it run that script and load nothing.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import html
+import json
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.errors import SgstoreError
+from sgstore.files import write_bytes
+from sgstore.serve._notes import NotesFile
+from sgstore.serve._reads import Reads
+from sgstore.serve._wire import packed
+from sgstore.serve._worker import answer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from sgstore.query import Store
+
+PAGE: Final = Path(__file__).parent / "page"
+CHUNK: Final = 300
+"""Frames whose states the page asks for together (``CHUNK`` of ``data.js``)."""
+
+POLICY: Final = (
+    "default-src 'none'; script-src 'sha256-{script}'; style-src 'sha256-{style}';"
+    " base-uri 'none'; form-action 'none'; require-trusted-types-for 'script'"
+)
+
+Found = tuple[str, int, int, dict[str, int]]
+"""A match: trace, first and last frame, and nodes by variable."""
+Spans = dict[str, list[tuple[int, int]]]
+"""By trace: first and last frame of what is kept, in order and apart."""
+
+
+def report(
+    store: Store,
+    text: str,
+    to: Path,
+    *,
+    parameters: Mapping[str, Any] | None = None,
+    most: int = 100,
+    around_s: float = 2.0,
+    pictures: bool = False,
+) -> tuple[int, bool]:
+    """Write the matches of a query as a page that needs no server.
+
+    Parameters
+    ----------
+    store : Store
+    text : str
+        A pattern, or checks: their violations are shown.
+    to : Path
+        The file.
+    parameters : mapping, optional
+        Values of ``$name``.
+    most : int
+        Most matches that it holds.
+    around_s : float
+        Time before and after each match that can be watched, too; s.
+    pictures : bool
+        Keep a picture of the first camera for each second of a match.
+
+    Returns
+    -------
+    matches : int
+        How many it holds.
+    truncated : bool
+        Whether there are more.
+
+    Raises
+    ------
+    QueryError
+        The text is no query.
+    """
+    values = dict(parameters or {})
+    with store.file.snapshot():
+        kept, found, truncated = _kept(store, text, values, most, around_s)
+        if pictures:
+            kept["pictures"] = _pictures(store, kept["about"]["traces"], found)
+        write_bytes(to, _page(kept, Path(to).stem).encode())
+    return len(found), truncated
+
+
+def _kept(
+    store: Store, text: str, values: dict[str, Any], most: int, around_s: float
+) -> tuple[dict[str, Any], list[Found], bool]:
+    """Answers for the page, as JSON holds it; the matches; whether there are more."""
+    is_check = re.match(r"\s*(?:--[^\n]*\n\s*)*(?:DEFINE\b[^;]*;\s*)*CHECK\b", text, re.IGNORECASE)
+    question = {"text": text, "parameters": values}
+    told = list(answer(store, {"ask": "check" if is_check else "matches", **question}, most))
+    check, found = None, list[Found]()
+    if is_check:
+        verdicts = [reply["verdict"] for reply in told if "verdict" in reply]
+        check = {"verdicts": verdicts, **told[-1]}
+        found = [(v["trace"], first, last, {}) for v in verdicts for first, last, *_ in v["spans"]]
+    else:
+        found = list(_found(told))
+    reads = Reads(store)
+    about = reads.about()
+    traces = {one["name"]: one for one in about["traces"] if one["name"] in {m[0] for m in found}}
+    for one in traces.values():
+        one |= {"cameras": []}
+    spans = _spans(found, traces, around_s)
+    kept: dict[str, Any] = {
+        "about": {**about, "traces": [*traces.values()], "around": around_s},
+        "query": text,
+        "parameters": values,
+        "made": datetime.now(UTC).isoformat(" ", "minutes")[:16] + " UTC",
+        "find": told,
+        "check": check,
+        "parts": {} if is_check else _parts(store, question, found),
+        "notes": [[n.trace, n.seq, n.tag, n.note, n.who, n.at] for n in _notes(store)],
+        "columns": dict(_columns(store, reads, traces, spans)),
+        "pictures": {},
+    }
+    return kept, found, bool(told[-1].get("truncated"))
+
+
+def _found(told: list[dict[str, Any]]) -> Iterator[Found]:
+    """Matches among replies, as the page takes them."""
+    names: tuple[str, ...] = ()
+    for reply in told:
+        names = reply.get("names", names)
+        for trace, first, last, _, _, *values in reply.get("matches", ()):
+            pairs = zip(names, values, strict=True)
+            yield (
+                trace,
+                first,
+                last,
+                {n: v for n, v in pairs if f"{n}.name" in names and v is not None},
+            )
+
+
+def _notes(store: Store) -> list[Any]:
+    try:
+        return NotesFile(store.file.path).read()
+    except SgstoreError:
+        return []
+
+
+def _key(*values: Any) -> str:
+    """The key of an answer, as ``JSON.stringify`` writes it."""
+    return json.dumps(values, separators=(",", ":"), ensure_ascii=False)
+
+
+def _spans(found: list[Found], traces: Mapping[str, Any], around_s: float) -> Spans:
+    """Frames of the matches and around them."""
+    spans: Spans = {}
+    for trace, first, last, _ in sorted(found, key=lambda match: match[:3]):
+        about = traces[trace]
+        around = int(around_s / (about["period"] or 0.1))
+        low, high = max(first - around, 0), min(last + around, about["frames"] - 1)
+        mine = spans.setdefault(trace, [])
+        if mine and low <= mine[-1][1] + 1:
+            mine[-1] = mine[-1][0], max(mine[-1][1], high)
+        else:
+            mine.append((low, high))
+    return spans
+
+
+def _parts(store: Store, question: Mapping[str, Any], found: list[Found]) -> dict[str, Any]:
+    """Lanes of truth, by trace and nodes: matches of the same nodes have the same."""
+    parts: dict[str, Any] = {}
+    for trace, first, _, binding in found:
+        key = _key(trace, binding or None)
+        if key not in parts:
+            frame = store.file.frame(f"{trace}#{first}").frame_id
+            asked = {"ask": "parts", **question, "frame": frame, "binding": binding or None}
+            (parts[key],) = answer(store, asked, 0)
+    return parts
+
+
+def _columns(
+    store: Store, reads: Reads, traces: Mapping[str, Any], spans: Spans
+) -> Iterator[tuple[str, str]]:
+    """Columns that the page asks for, by key: states in the spans, what never moves, maps."""
+    maps: set[str] = set()
+    for name, about in traces.items():
+        yield _key("api/static", name), _small(reads.still(name))
+        if about["map_key"] and about["map_key"] not in maps:
+            maps.add(about["map_key"])
+            yield _key("api/map", about["map_key"]), _small(reads.outlines(name))
+        numbers = sorted({k for a, z in spans[name] for k in range(a // CHUNK, z // CHUNK + 1)})
+        for number in numbers:
+            first = number * CHUNK
+            last = min(first + CHUNK, about["frames"]) - 1
+            data = _states(store, name, first, last, spans[name])
+            yield _key("api/states", name, first, last), _small(data)
+
+
+def _states(store: Store, trace: str, first: int, last: int, spans: list[tuple[int, int]]) -> bytes:
+    """States of frames in the spans; the others have none."""
+    frames, states = store.file.states(trace, first, last)
+    seq = states.pop("seq")
+    inside = np.zeros(len(seq), bool)
+    for low, high in spans:
+        inside |= (low <= seq) & (seq <= high)
+    start = np.searchsorted(seq[inside], np.append(frames["seq"], last + 1)).astype(np.uint32)
+    columns = {f"frame.{name}": column for name, column in frames.items()} | {"frame.start": start}
+    # Places to a centimetre, the others to three digits behind the point: the file is a third smaller.
+    kept = {name: _rounded(column[inside]) for name, column in states.items()}
+    return packed({"trace": trace, "first": first, "last": last}, columns | kept)
+
+
+def _rounded(column: Any) -> Any:
+    """Numbers in steps of 1/128: their last bits are zeros, which need little room."""
+    if column.dtype.kind != "f":
+        return column
+    return (np.round(column * 128) / 128).astype(column.dtype)
+
+
+def _small(data: bytes) -> str:
+    return base64.b64encode(gzip.compress(data, 9, mtime=0)).decode()
+
+
+def _pictures(
+    store: Store, traces: list[dict[str, Any]], matches: list[Found]
+) -> dict[str, dict[str, str]]:
+    """Pictures of the first camera of each trace, one for each second of a match; ``cameras`` names it."""
+    reads, found = Reads(store), dict[str, dict[str, str]]()
+    cameras = {one["name"]: one["cameras"] for one in reads.about()["traces"]}
+    for about in traces:
+        trace, topics = about["name"], cameras[about["name"]][:1]
+        about["cameras"] = topics
+        every = max(round(1 / (about["period"] or 0.1)), 1)
+        mine = [match for match in matches if match[0] == trace]
+        wanted = {seq for _, first, last, _ in mine for seq in range(first, last + 1, every)}
+        for topic in topics:
+            kept = found[_key(trace, topic)] = {}
+            for seq in sorted(wanted):
+                try:
+                    data, _ = reads.picture_at(trace, seq, topic)
+                except SgstoreError:
+                    continue  # not every frame has one
+                kept[str(seq)] = base64.b64encode(data).decode()
+    return found
+
+
+# One file -----------------------------------------------------------------------------------------------------
+
+_IMPORT: Final = re.compile(
+    r"""^import (?:\* as (?P<whole>\w+)|\{(?P<names>[^}]*)\}) from "(?P<file>[^"]+)";$""",
+    re.MULTILINE,
+)
+_EXPORT: Final = re.compile(
+    r"^export (?P<kind>const|class|function\*?|async function\*?) (?P<name>\w+)", re.MULTILINE
+)
+_MINIFIED: Final = re.compile(r"export\{([^}]*)\};?\s*$")
+
+
+def script() -> str:
+    """The modules of a report as one script: each a function that gives what it exports."""
+    parts: list[str] = []
+    names: dict[Path, str] = {}
+
+    def add(file: Path) -> str:
+        if file.name == "api.js":
+            file = file.with_name("offline.js")
+        if file not in names:
+            text = file.read_text(encoding="utf-8")
+            text = _IMPORT.sub(
+                lambda found: _imported(found, add((file.parent / found["file"]).resolve())), text
+            )
+            names[file] = f"of_{file.stem}"
+            parts.append(f"const {names[file]} = (() => {{\n{_exported(text)}\n}})();\n")
+        return names[file]
+
+    add((PAGE / "js" / "report.js").resolve())
+    return "".join(parts)
+
+
+def _imported(found: re.Match[str], name: str) -> str:
+    if found["whole"]:
+        return f"const {found['whole']} = {name};"
+    return f"const {{{' '.join(found['names'].split())}}} = {name};"
+
+
+def _exported(text: str) -> str:
+    """A module as the body of a function."""
+    minified = _MINIFIED.search(text)
+    if minified:
+        pairs = (one.split(" as ") for one in minified[1].split(","))
+        told = ", ".join(f"{pair[-1]}: {pair[0]}" for pair in pairs)
+        return f"{text[: minified.start()]}return {{ {told} }};"
+    exported = [found["name"] for found in _EXPORT.finditer(text)]
+    body = _EXPORT.sub(lambda found: f"{found['kind']} {found['name']}", text)
+    return f"{body}\nreturn {{ {', '.join(exported)} }};"
+
+
+def _page(kept: dict[str, Any], title: str) -> str:
+    code, style = script(), (PAGE / "style.css").read_text(encoding="utf-8")
+    digests = {
+        name: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        for name, text in (("script", code), ("style", style))
+    }
+    data = json.dumps(kept, separators=(",", ":"), ensure_ascii=False).replace("<", "\\u003c")
+    return f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="content-security-policy" content="{POLICY.format(**digests)}">
+<title>{html.escape(title)}</title>
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<style>{style}</style>
+</head>
+<body><div id="app"></div>
+<script type="application/json" id="kept">{data}</script>
+<script type="module">{code}</script>
+</body>
+</html>
+"""

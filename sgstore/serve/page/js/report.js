@@ -1,0 +1,39 @@
+// @ts-check
+// A report: what a query found, to be looked at without a server. One file holds this page and its answers.
+import { h, htm, render } from "../vendor/core.js";
+import { Gallery } from "./gallery.js";
+import { Keys, keys } from "./keys.js";
+import { kept } from "./offline.js";
+import { Scene } from "./scene.js";
+import { Verdicts } from "./verdicts.js";
+import { answer, dialog, find, notes, offline, open, store, text, toast, values } from "./state.js";
+import { Status } from "./status.js";
+
+const html = htm.bind(h);
+
+function Head() {
+  const given = Object.entries(kept.parameters).map(([name, value]) => `$${name} = ${value}`).join(", ");
+  return html`<header><span class="brand">sgstore</span><h1>${kept.about.store} · ${kept.made}</h1>
+    <span class="grow"></span><button class="quiet" onClick=${() => { dialog.value = "keys"; }}><kbd>?</kbd> keys</button></header>
+    <section class="search asked"><code>${kept.query}</code>${given ? html`<span class="faint"> ${given}</span>` : null}</section>`;
+}
+
+function Report() {
+  const told = answer.value;
+  const body = open.value ? html`<main class="open"><${Gallery} /><${Scene} /></main>`
+    : told.verdicts && !told.matches.length ? html`<${Verdicts} />`
+    : told.state === "done" && !told.matches.length ? html`<div class="sheet"><h2>Nothing matches</h2></div>` : html`<main><${Gallery} /></main>`;
+  return html`<${Head} /><${Status} />${body}
+    ${dialog.value ? html`<div class="dialog" onClick=${() => { dialog.value = ""; }}><div role="dialog" aria-modal="true" aria-label="Keys"><${Keys} /></div></div>` : null}
+    ${toast.value ? html`<div class="toast" role="status">${toast.value}</div>` : null}`;
+}
+
+offline.value = true;
+store.value = kept.about;
+notes.value = kept.notes;
+text.value = kept.query;
+values.value = Object.fromEntries(Object.entries(kept.parameters).map(([name, value]) => [name, String(value)]));
+keys.splice(keys.findIndex(([sign]) => sign === "x"), 1);
+keys.splice(keys.findIndex(([sign]) => sign === "g"), 1);
+render(html`<${Report} />`, /** @type {HTMLElement} */ (document.getElementById("app")));
+find();
