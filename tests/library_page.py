@@ -171,6 +171,14 @@ PARTS: Final = (
         "Rules of SceneFlow",
         "Traffic rules of several road users. The drawings show scenes that violate them.",
     ),
+    (
+        "rules",
+        "Rules of regulations and of research",
+        "Safe distances of RSS, UN Regulation 157 (automated lane keeping), the interstate and intersection "
+        "rules of CommonRoad, and disturbances of ISO 34502, of the ego and every other vehicle. A parameter "
+        "is changed by `k=v`, and `ROBUSTNESS` behind the text of a rule says by how much it is kept. The "
+        "drawings show scenes that violate them.",
+    ),
 )
 
 

@@ -657,6 +657,81 @@ SCENES |= {
 }
 
 
+# Rules of regulations and of the literature: violated, kept; ISO 34502: found, not found ----------------------
+
+FOLLOWING = Scene(
+    WAYS,
+    ego(along(RIGHT), 8),
+    actor("v", along(RIGHT), 8, start=15),
+    seconds=3,
+    drawn=(0.0,),
+)
+SLOWLY = Scene(
+    WAYS,
+    ego(along(RIGHT), 10),
+    actor("v", along(RIGHT), 10, start=10),
+    seconds=8,
+    drawn=(0.0, 8.0),
+)
+CUT_OFF = Scene(
+    WAYS,
+    ego(along(RIGHT), 15),
+    actor("v", aside(62, LEFT, RIGHT, 10), 5, start=60),
+    seconds=7,
+    drawn=(0.0, 5.5),
+)
+RUN_INTO = HARD.with_actor("ego", speed=15.0)
+BRAKING_LEAD = Scene(
+    WAYS,
+    ego(along(RIGHT), 10),
+    actor("v", along(RIGHT), braking(10, 2, 4), start=40),
+    seconds=5,
+    drawn=(0.0, 4.0),
+)
+ABRUPT = Scene(WAYS, ego(along(RIGHT), braking(15, 2, 6)), seconds=5, drawn=(2.0, 5.0))
+WAITS_AT_STOP = [(0, 8), (3, 8), (5, 0), (8.5, 0), (10.5, 8)]
+UNDERTAKING = Scene(
+    WAYS,
+    ego(along(LEFT), 20),
+    actor("v", along(RIGHT), 15, start=15),
+    seconds=5,
+    drawn=(0.0, 4.0),
+)
+SCENES |= {
+    "rss_distance": (FOLLOWING, FOLLOWING.with_actor("v", start=40.0)),
+    "r157_following": (SLOWLY, SLOWLY.with_actor("v", start=25.0)),
+    "r157_cut_in": (CUT_OFF, CUT_OFF.with_actor("ego", speed=[(0, 15), (2, 15), (4, 5), (7, 5)])),
+    "r157_braking_lead": (RUN_INTO, HARD),
+    "r_g1_safe_distance": (
+        FOLLOWING.with_actor("v", start=6.5),
+        FOLLOWING.with_actor("v", route=aside(8, LEFT, RIGHT, 12), start=6.5),
+    ),
+    "r_g2_abrupt_braking": (
+        ABRUPT,
+        HARD.with_actor("ego", speed=braking(15, 2, 6)),
+    ),
+    "r_i1_stopping": (STOPPING, Scene(WAYS, *STOPPING.actors, actor("o", (60, RIGHT)), seconds=5)),
+    "r_i2_passing_on_the_right": (
+        UNDERTAKING,
+        UNDERTAKING.with_actor("ego", route=along(RIGHT)).with_actor("v", route=along(LEFT)),
+    ),
+    "r_i3_turning_back": (
+        Scene(WAYS, ego(along(RIGHT, 100, 0), 3, heading=0.0), seconds=3, drawn=(0.0, 3.0)),
+        STRAIGHT,
+    ),
+    "r_in1_stop_sign": (
+        AT_STOP,
+        Scene(STOPS, ego(through("s", "n"), WAITS_AT_STOP, start=92), seconds=11),
+    ),
+    "r_in2_red_light": (RED, RED.with_actor("light-s", shows=[(0, "green")])),
+    "iso_cut_in": (CUT_IN, CUT_IN.with_actor("v", route=along(LEFT))),
+    "iso_lead_brakes": (
+        BRAKING_LEAD,
+        BRAKING_LEAD.with_actor("v", speed=10.0),
+    ),
+}
+
+
 # All of them as traces --------------------------------------------------------------------------------------
 
 

@@ -51,6 +51,7 @@ def test_the_library_has_what_it_says() -> None:
     assert kinds.count(("nuplan", "scenario")) == 13
     assert kinds.count(("sgsm", "property")) == 2 * 9
     assert kinds.count(("sceneflow", "property")) >= 8
+    assert kinds.count(("rules", "property")) >= 11
     assert kinds.count(("std", "predicate")) >= 25
 
 
@@ -264,6 +265,20 @@ def test_a_rule_is_violated_in_its_example_and_kept_in_the_other(store: Store, n
         assert broken_in(violated) >= {example[1]}
         assert other[1] not in broken_in(kept)
     assert answered(verdicts["town"])
+
+
+@pytest.mark.parametrize("name", ["rss_distance", "r_g1_safe_distance", "r_g2_abrupt_braking"])
+def test_a_rule_says_by_how_much_it_is_kept(store: Store, name: str) -> None:
+    text = f"{patterns()[name].text.rstrip().rstrip(';')} ROBUSTNESS"
+
+    told = {one.trace: one for one in store.check(text)}
+
+    (violated, _), (kept, _) = PLACES[name]
+    for trace in {violated, kept}:
+        robustness = told[trace].robustness
+        assert robustness is not None
+        assert (robustness.value < 0) == (told[trace].verdict == "false")
+    assert told[violated].verdict == "false"
 
 
 def answered(verdict: Verdict) -> bool:
