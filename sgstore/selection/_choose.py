@@ -643,14 +643,7 @@ def locked_selection(
         A recording is gone, was replaced, or is damaged.
     """
     units = selection.units
-    wanted = [
-        (
-            units.frame_id[units.begin[unit] : units.end[unit]],
-            units.log_time_ns[units.begin[unit] : units.end[unit]],
-            (parts or {}).get(unit, ""),
-        )
-        for unit in sorted(selection.picked.tolist())
-    ]
+    wanted = units.cases(selection.picked, parts)
     how = selection.spec.as_dict(query)
     how |= {"parameters": dict(parameters or {}), "result": dict(selection.result)}
     return lock_of(units.chosen.store, wanted, how, payloads=payloads, progress=progress)

@@ -392,18 +392,12 @@ def locked_order(
         A recording is gone, was replaced, or is damaged.
     """
     units = order.units
-    parts = [
-        (
-            units.frame_id[units.begin[unit] : units.end[unit]],
-            units.log_time_ns[units.begin[unit] : units.end[unit]],
-            "",
-        )
-        for unit in sorted(order.picked.tolist())
-    ]
     names = names_of_units(units, order.picked)
     how = order.spec.as_dict(query) | {"parameters": dict(parameters or {})}
     how |= {"order": names, "reasons": dict(zip(names, order.reasons(), strict=True))}
-    return lock_of(units.chosen.store, parts, how, payloads=payloads, progress=progress)
+    return lock_of(
+        units.chosen.store, units.cases(order.picked), how, payloads=payloads, progress=progress
+    )
 
 
 def failed_in_order(order: Prioritized, outcomes: Mapping[str, bool]) -> Bools:

@@ -15,9 +15,10 @@ from sgstore.selection._sets import SetFamily, distinct, spread
 from sgstore.store import lengths_of_messages, trace_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from sgstore.coverage import ChosenFrames, Classed, Combinations
+    from sgstore.locks import CasePart
     from sgstore.world import Bools, Floats, Ints
 
 
@@ -145,6 +146,16 @@ class Units:
         np.add.at(step, self.begin[picked], 1)
         np.add.at(step, self.end[picked], -1)
         return np.flatnonzero(np.cumsum(step)[:-1])
+
+    def cases(self, picked: Ints, splits: Mapping[int, str] | None = None) -> list[CasePart]:
+        """Some units as cases of a lock, in order; ``splits``: the split that a unit belongs to."""
+        found: list[CasePart] = []
+        for unit in sorted(picked.tolist()):
+            rows = slice(self.begin[unit], self.end[unit])
+            found.append(
+                (self.frame_id[rows], self.log_time_ns[rows], (splits or {}).get(unit, ""))
+            )
+        return found
 
     def members(self) -> Iterator[tuple[Ints, Ints]]:
         """Units and rows of their frames, unit after unit, whole units at a time."""
