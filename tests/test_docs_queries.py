@@ -22,7 +22,13 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+OF_ITS_OWN = {"cookbook"}
+"""A page that is asked of the stores that it speaks of."""
+PAGES = [
+    page
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+    if page.stem not in OF_ITS_OWN
+]
 BEGINS = re.compile(r"\s*(MATCH|USING|DEFINE|CHECK|SELECT|WITH|DESCRIBE|FROM)\b")
 ASKS = re.compile(r"MATCH\s*\(|^CHECK\s|\bCHECK\s.*\bALWAYS|FROM\s|^DESCRIBE\s", re.MULTILINE)
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
