@@ -398,7 +398,10 @@ class MessageTrace:
             raise TraceError(f"no frame: {reason}", path=self.info.path, channel=topic)
 
 
-class SurveyedTrace(MessageTrace):
+AnySurvey = TypeVar("AnySurvey", bound=Survey[Any])
+
+
+class SurveyedTrace(MessageTrace, Generic[AnySurvey]):
     """A recording that was read once when it was opened.
 
     Parameters
@@ -416,8 +419,8 @@ class SurveyedTrace(MessageTrace):
         A schema is malformed, no frame can be read, or nothing bears the name given for the ego.
     """
 
-    def __init__(self, survey: Survey[Any], digest: str, **more: Any) -> None:
-        self._found = survey
+    def __init__(self, survey: AnySurvey, digest: str, **more: Any) -> None:
+        self._survey = survey
         recording = survey.recording
         _, digest = read_and_digest(recording.path, digest, survey.read)
         survey.leading = survey.first_lead()
@@ -437,7 +440,7 @@ class SurveyedTrace(MessageTrace):
 
     def ego_named(self, name: str) -> str | None:
         """The id of the ego that a name means, by what the first reading found."""
-        return self._found.ego_named(name)
+        return self._survey.ego_named(name)
 
 
 # Flavours that tell plain frames: messages → frames → blocks of frames ----------------------------

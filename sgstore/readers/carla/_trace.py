@@ -502,7 +502,7 @@ def _our_lights(bits: int) -> int:
 # The recording ------------------------------------------------------------------------------------
 
 
-class CarlaTrace(SurveyedTrace):
+class CarlaTrace(SurveyedTrace[CarlaSurvey]):
     """A recording of CARLA's ROS bridge.
 
     Parameters
@@ -530,8 +530,7 @@ class CarlaTrace(SurveyedTrace):
     name: ClassVar[str] = "carla"
 
     def __init__(self, recording: Recording, *, ego: str = "", digest: str = "") -> None:
-        self._survey = CarlaSurvey(recording, ego)
-        super().__init__(self._survey, digest)
+        super().__init__(CarlaSurvey(recording, ego), digest)
         self._signals: dict[int, str] = {}
         self._road_map: RoadMap | None = None
         self.on_map(self._own_map())

@@ -430,7 +430,7 @@ def _size(ego: Ego) -> tuple[float, float, float]:
 # The recording ------------------------------------------------------------------------------------
 
 
-class FoxgloveTrace(SurveyedTrace):
+class FoxgloveTrace(SurveyedTrace[FoxgloveSurvey]):
     """A recording of Foxglove scenes.
 
     Parameters
@@ -468,9 +468,8 @@ class FoxgloveTrace(SurveyedTrace):
     ) -> None:
         topics = [record.topic for record in recording.channels.values()]
         found = mapping_for(mapping, topics)
-        self._survey = FoxgloveSurvey(recording, ego, found)
         known_by = sha256(repr(found).encode("utf-8", "replace")).hexdigest()
-        super().__init__(self._survey, digest, mapping=known_by)
+        super().__init__(FoxgloveSurvey(recording, ego, found), digest, mapping=known_by)
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:

@@ -476,7 +476,7 @@ def _number(message: Any, part: str, name: str) -> float:
 # The recording ------------------------------------------------------------------------------------
 
 
-class OsiTrace(SurveyedTrace):
+class OsiTrace(SurveyedTrace[OsiSurvey]):
     """A recording of OSI ground truth.
 
     Parameters
@@ -503,8 +503,7 @@ class OsiTrace(SurveyedTrace):
     name: ClassVar[str] = "osi"
 
     def __init__(self, recording: Recording, *, ego: str = "", digest: str = "") -> None:
-        self._survey = OsiSurvey(recording, ego)
-        super().__init__(self._survey, digest)
+        super().__init__(OsiSurvey(recording, ego), digest)
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:
