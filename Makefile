@@ -137,7 +137,7 @@ pyg: $(VENV)/.base
 # Files of tests that try more where SGSTORE_LONG is set (tests/thorough.py).
 LONG := collection collection_ray temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \
   lang_after lang_attributes lang_counting lang_match lang_oracle lang_subgraphs doors frozen ingest_data ingest_hardship \
-  export_scenarios monitor notebook assistant online serve sgg_traces store_transactions tolerance lane_places
+  export_scenarios monitor notebook assistant online parts serve sgg_traces store_transactions tolerance lane_places
 oracle: $(VENV)/.dev
 	$(BIN)/python tests/oracle_temporal.py 100000
 	$(BIN)/python tests/oracle_monitor.py 100000

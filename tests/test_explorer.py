@@ -17,7 +17,7 @@ import pytest
 
 from sgstore.ingest import ingest
 from sgstore.query import Store
-from sgstore.serve import report
+from sgstore.serve import inline, report
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -315,6 +315,18 @@ def test_a_report_plays_from_a_file_without_a_network(
     seen(page, "report")
     if AXE.exists():
         assert faults(page) == []
+
+
+def test_matches_play_in_a_notebook(
+    visit: Callable[..., Any], town_store: Path, tmp_path: Path
+) -> None:
+    shown = inline(Store(town_store), f"{NEAR} WHERE e.speed > 3")._repr_html_()  # pyright: ignore[reportPrivateUsage]
+    (tmp_path / "cell.html").write_text(f"<!doctype html><p>A cell</p>{shown}")
+    frame = visit((tmp_path / "cell.html").as_uri(), offline=True).frame_locator("iframe")
+    frame.locator(".tile").first.click()
+    was = frame.locator(".transport .time").inner_text()
+    frame.get_by_role("button", name="Play").click()
+    expect(frame.locator(".transport .time")).not_to_have_text(was)
 
 
 def faults(page: Any) -> list[str]:

@@ -6,8 +6,10 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 import pytest
+from thorough import LONG
 
 from sgstore.errors import QueryNameError
+from sgstore.ingest import ingest
 from sgstore.lang import NamedPattern, patterns
 from sgstore.query import Store
 
@@ -112,17 +114,34 @@ def test_a_condition_over_time_has_a_lane(store: Store) -> None:
 
 @pytest.mark.parametrize("pattern", ONE_STEP, ids=lambda one: one.name)
 def test_patterns_of_the_library(store: Store, pattern: NamedPattern) -> None:
-    matches = store.find(pattern.text)
-    span = next(matches.intervals(bound=True), None)
-    if span is None:
-        return
-    binding = {key: v for key, v in span.values.items() if isinstance(v, int)}
-    lanes = store.parts(pattern.text, f"{span.trace}#{span.start_seq}", binding)
-    if lanes.steps == (0,):
-        found = frames_with(store, pattern.text, span.trace, binding)
-        assert in_spans(lanes.together()) == found
-    else:
-        assert all(lanes.together(step) for step in lanes.steps if step == 1)
+    compare_lanes(store, pattern, None if LONG else 1)
+
+
+@pytest.mark.data
+@pytest.mark.skipif(not LONG, reason="make oracle: a minute")
+@pytest.mark.parametrize("trace", ["sumo/Town10HD_sumo_osi", "carla/Town01.carla"])
+def test_patterns_of_the_library_in_other_towns(data: Path, tmp_path: Path, trace: str) -> None:
+    (outcome,) = ingest(tmp_path / "other.sgstore", [data / "traces" / f"{trace}.mcap"])
+    assert outcome.error is None
+    store = Store(tmp_path / "other.sgstore")
+    with store.file.snapshot():
+        for pattern in ONE_STEP:
+            compare_lanes(store, pattern, None)
+
+
+def compare_lanes(store: Store, pattern: NamedPattern, most: int | None) -> None:
+    """Compare the lanes of matches with the frames in which the query has the same nodes."""
+    found: dict[tuple[str, tuple[tuple[str, int], ...]], set[int]] = {}
+    for span in store.find(pattern.text).intervals(bound=True):
+        nodes = tuple((k, v) for k, v in span.values.items() if isinstance(v, int))
+        seqs = range(span.start_seq, span.end_seq + 1)
+        found.setdefault((span.trace, nodes), set()).update(seqs)
+    for (trace, nodes), seqs in islice(found.items(), most):
+        lanes = store.parts(pattern.text, f"{trace}#{min(seqs)}", dict(nodes))
+        if lanes.steps == (0,):
+            assert in_spans(lanes.together()) == seqs, (pattern.name, nodes)
+        else:
+            assert all(lanes.together(step) for step in lanes.steps if step == 1), pattern.name
 
 
 def test_a_union_has_the_lanes_of_the_part_that_matches(store: Store) -> None:

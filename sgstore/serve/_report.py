@@ -13,6 +13,7 @@ import hashlib
 import html
 import json
 import re
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -86,13 +87,87 @@ def report(
     QueryError
         The text is no query.
     """
+    page, many, truncated = _made(
+        store,
+        text,
+        dict(parameters or {}),
+        Path(to).stem,
+        most=most,
+        around_s=around_s,
+        pictures=pictures,
+    )
+    write_bytes(to, page.encode())
+    return many, truncated
+
+
+@dataclass(frozen=True)
+class PlayableMatches:
+    """Matches that a notebook shows as a report, in a frame of its own that can load nothing.
+
+    Attributes
+    ----------
+    page : str
+        The report, as :func:`report` writes it.
+    height : int
+        Of the frame; points.
+    """
+
+    page: str = field(repr=False)
+    height: int
+
+    def _repr_html_(self) -> str:
+        style = f"width:100%;height:{self.height}px;border:1px solid #8886;border-radius:8px"
+        page = html.escape(self.page, quote=True)
+        return f'<iframe sandbox="allow-scripts" style="{style}" srcdoc="{page}"></iframe>'
+
+
+def inline(
+    store: Store,
+    text: str,
+    *,
+    parameters: Mapping[str, Any] | None = None,
+    height: int = 620,
+    most: int = 20,
+    around_s: float = 2.0,
+    pictures: bool = False,
+) -> PlayableMatches:
+    """Matches of a query as an object that shows itself in a notebook: a report that plays there.
+
+    Parameters
+    ----------
+    store, text, parameters, most, around_s, pictures
+        As :func:`report` takes them.
+    height : int
+        Of the frame; points.
+
+    Raises
+    ------
+    QueryError
+        The text is no query.
+    """
     values = dict(parameters or {})
+    page, _, _ = _made(
+        store, text, values, "sgstore", most=most, around_s=around_s, pictures=pictures
+    )
+    return PlayableMatches(page, height)
+
+
+def _made(
+    store: Store,
+    text: str,
+    values: dict[str, Any],
+    title: str,
+    *,
+    most: int,
+    around_s: float,
+    pictures: bool,
+) -> tuple[str, int, bool]:
+    """A page, how many matches it holds, and whether there are more."""
     with store.file.snapshot():
         kept, found, truncated = _kept(store, text, values, most, around_s)
         if pictures:
             kept["pictures"] = _pictures(store, kept["about"]["traces"], found)
-        write_bytes(to, _page(kept, Path(to).stem).encode())
-    return len(found), truncated
+    return _page(kept, title), len(found), truncated
 
 
 def _kept(
