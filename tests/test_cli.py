@@ -17,6 +17,7 @@ import pytest
 from recordings import drive
 
 from sgstore.cli import VERBS, run
+from sgstore.query import Store
 
 REPOSITORY = Path(__file__).parents[1]
 SAMPLE = REPOSITORY / "sgstore" / "sample" / "town.mcap"
@@ -106,6 +107,32 @@ def test_find_prints_what_each_variable_is_bound_to(store: str, sgstore: Any) ->
     assert code == 0
     assert head.split() == ["frame", "t", "e", "lane", "p"]
     assert first.split()[0] == "town#251"
+
+
+def test_on_a_terminal_find_shows_stretches_and_what_they_come_to(
+    store: str, sgstore: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = json.loads(sgstore("find", store, CROSSING, "--json")[1])
+    piped = sgstore("find", store, CROSSING)[1]
+    stretches = list(Store(store).find(CROSSING).intervals())
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "200")
+
+    code, out, err = sgstore("find", store, CROSSING)
+
+    assert code == 0
+    head, _, *lines = out.splitlines()
+    assert head.split() == ["from", "start", "end", "frames", "e", "lane", "p"]
+    assert [(line.split()[0], line.split()[3]) for line in lines] == [
+        (f"town#{one.start_seq}", str(one.frames)) for one in stretches
+    ]
+    assert sum(one.frames for one in stretches) == len(rows)
+    assert f"{len(stretches)} stretches, {len(rows)} frames, " in err
+    assert "in 1 trace; --rows shows each frame" in err
+    assert sgstore("find", store, CROSSING, "--rows")[1] == piped
+    assert json.loads(sgstore("find", store, CROSSING, "--json")[1]) == rows
+    limited = sgstore("find", store, f"{CROSSING} LIMIT 2")[1]
+    assert limited.splitlines()[0] == piped.splitlines()[0], "who asks for rows gets rows"
 
 
 def test_count_is_the_number_of_distinct_frames_and_nothing_else(store: str, sgstore: Any) -> None:

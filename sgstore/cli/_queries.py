@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from enum import StrEnum
 from itertools import chain
 from pathlib import Path
@@ -76,12 +77,16 @@ def find(
     tables: With = None,
     engine: EngineName = "local",
     partial: Partial = False,
+    each_frame: Annotated[
+        bool, Option("--rows", help="On a terminal too, one row for each match in each frame.")
+    ] = False,
     *,
     ask: AskOptions,
 ) -> int:
     """Find frames by a pattern of their scene graphs.
 
     One row a match: the frame, its time, and what each variable is bound to; or what RETURN asks for.
+    Without RETURN, a terminal shows stretches of frames in which a match lasts.
     """
     text, values = question.asked()
     if (url := url_of(store)) is not None:
@@ -110,9 +115,48 @@ def find(
             return NO_MATCH if require and not number else 0
         if ask.chosen in BINARY and not matches.graphs:
             number = write_binary(matches.parquet, ask.chosen, ask.output)
+        elif not each_frame and _on_terminal(ask) and _returns_nothing(text):
+            number = _write_stretches(matches.intervals(), ask)
         else:
             number = ask.write(*_as_shown(matches, matches, ask.chosen))
     return _ended(number, ask, require=require)
+
+
+def _on_terminal(ask: AskOptions) -> bool:
+    """Tell whether a person sees the rows as they come."""
+    return ask.for_people and ask.file is None and sys.stdout.isatty()
+
+
+def _returns_nothing(text: str) -> bool:
+    """Tell whether a query says nothing of its results: a row comes for each match and frame."""
+    from sgstore.lang import each_match, parse
+    from sgstore.lang.syntax import MatchClause
+
+    asked = each_match(parse(text))
+    return all(one.returns is None for one in asked if isinstance(one, MatchClause))
+
+
+def _write_stretches(intervals: Iterator[Interval], ask: AskOptions) -> int:
+    """Show stretches of frames, and then what all of them come to."""
+    traces: set[str] = set()
+    frames, seconds = 0, 0.0
+
+    def counted() -> Iterator[Interval]:
+        nonlocal frames, seconds
+        for one in intervals:
+            traces.add(one.trace)
+            frames, seconds = frames + one.frames, seconds + one.end - one.start
+            yield one
+
+    number = _write_intervals(counted(), ask)
+    if number:
+        parts = (_many(number, "stretch", "es"), _many(frames, "frame"), f"{seconds:,.1f} s")
+        say(f"{', '.join(parts)} in {_many(len(traces), 'trace')}; --rows shows each frame")
+    return number
+
+
+def _many(number: int, what: str, more: str = "s") -> str:
+    return f"{number:,} {what}{'' if number == 1 else more}"
 
 
 def _found_in(
