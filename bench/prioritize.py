@@ -25,10 +25,19 @@ import numpy as np
 from bench.measure import Measure
 from sgstore.coverage import selection_of
 from sgstore.importing import import_graphs
-from sgstore.selection import PrioritySpec, failed_in_order, fault_detection, prioritize
+from sgstore.selection import (
+    MEASURES,
+    Priority,
+    PrioritySpec,
+    failed_in_order,
+    fault_detection,
+    prioritize,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from sgstore.coverage import ChosenFrames
 
 STRATEGIES: Final = {"random": "random strategy", "rl_based": "reinforcement learning"}
 SIZES: Final = {
@@ -42,6 +51,7 @@ SIZES: Final = {
 }
 """Kind, length and width of each model, which the data do not tell; m."""
 
+SPLITS: Final = 10
 PERSON: Final = ("person", 0.5, 0.5)
 BESIDE: Final = {"closing_time": ("closing_time",), "dce_3s": ("dce_3s",), "wttc": ("wttc",)}
 
@@ -81,19 +91,54 @@ def run(quick: bool = False) -> Iterator[Measure]:
         yield Measure("no data", 0, "", f"{data} is not there")
         return
     with tempfile.TemporaryDirectory() as name:
-        for strategy, title in STRATEGIES.items():
+        runs: dict[str, tuple[ChosenFrames, dict[str, bool]]] = {}
+        for strategy in STRATEGIES:
             graphs, failed = written(data, strategy, Path(name), 10 if quick else 1)
             store = Path(name) / f"{strategy}.sgstore"
             import_graphs(store, [graphs], "nodelink")
-            chosen = selection_of(str(store))
-            for label, measures in {"risk": None, **BESIDE}.items():
-                spec = PrioritySpec() if measures is None else PrioritySpec(measures=measures)
-                begun = time.perf_counter()
-                order = prioritize(chosen, spec)
-                took = time.perf_counter() - begun
-                found = fault_detection(failed_in_order(order, failed))
-                yield Measure(f"{title}, {label}", found.apfd, "APFD", found.said)
-                yield Measure("  for a million frames", took / len(order.units) * 1e6, "s")
-            rng = np.random.default_rng(0)
-            chance = fault_detection(rng.permutation(np.array(list(failed.values()))))
-            yield Measure(f"{title}, in random order", chance.apfd, "APFD", chance.said)
+            runs[strategy] = selection_of(str(store)), failed
+        for strategy, title in STRATEGIES.items():
+            yield from by_risk(title, *runs[strategy])
+            (other,) = runs.keys() - {strategy}
+            yield from learned(title, runs[strategy], runs[other])
+
+
+def by_risk(title: str, chosen: ChosenFrames, failed: dict[str, bool]) -> Iterator[Measure]:
+    """Orders that nobody taught, and a random one."""
+    for label, measures in {"risk": MEASURES, **BESIDE}.items():
+        begun = time.perf_counter()
+        order = prioritize(chosen, PrioritySpec(measures=measures))
+        took = time.perf_counter() - begun
+        found = fault_detection(failed_in_order(order, failed))
+        yield Measure(f"{title}, {label}", found.apfd, "APFD", found.said)
+        yield Measure("  for a million frames", took / len(order.units) * 1e6, "s")
+    rng = np.random.default_rng(0)
+    chance = fault_detection(rng.permutation(np.array(list(failed.values()))))
+    yield Measure(f"{title}, in random order", chance.apfd, "APFD", chance.said)
+
+
+def learned(
+    title: str,
+    runs: tuple[ChosenFrames, dict[str, bool]],
+    others: tuple[ChosenFrames, dict[str, bool]],
+) -> Iterator[Measure]:
+    """Orders learned from the other strategy, and from halves of the same one."""
+    chosen, failed = runs
+    spec = PrioritySpec(Priority.learned)
+    begun = time.perf_counter()
+    order = prioritize(chosen, spec, others[1], others[0])
+    took = time.perf_counter() - begun
+    found = fault_detection(failed_in_order(order, failed))
+    yield Measure(f"{title}, learned from the other", found.apfd, "APFD", found.said)
+    yield Measure("  for both", took, "s")
+    halves: list[float] = []
+    for seed in range(SPLITS):
+        names = np.random.default_rng(seed).permutation(list(failed))
+        known = {name: failed[name] for name in names[: len(names) // 2].tolist()}
+        rest = {name: one for name, one in failed.items() if name not in known}
+        order = prioritize(chosen, PrioritySpec(Priority.learned, seed=seed), known)
+        halves.append(fault_detection(failed_in_order(order, rest)).apfd)
+    told = f"the least {min(halves):.3f}, the most {max(halves):.3f}"
+    yield Measure(
+        f"{title}, learned from a half, mean of {SPLITS}", float(np.mean(halves)), "APFD", told
+    )

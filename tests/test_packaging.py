@@ -17,7 +17,7 @@ import pytest
 if TYPE_CHECKING:
     from pathlib import Path
 
-IMPORTED_AS = {"google": "protobuf", "PIL": "pillow", "pytest": None}
+IMPORTED_AS = {"google": "protobuf", "PIL": "pillow", "sklearn": "scikit-learn", "pytest": None}
 """Packages whose modules have another name; of pytest only the plugin is, and pytest loads it."""
 
 NEEDED = sorted(

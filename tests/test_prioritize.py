@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import sys
 from collections import defaultdict
 from typing import TYPE_CHECKING, Any
 
@@ -20,15 +21,21 @@ from sgstore.selection import (
     Priority,
     PrioritySpec,
     SelectionUnit,
+    failed_in_order,
+    failure_curve,
     fault_detection,
     prioritize,
+    units_of,
 )
+from sgstore.selection._learn import features_of, fitted
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from sgstore.query import Store
 
+OTHERS = """src_is_ego AND dst_kind NOT IN ('traffic_light', 'stop_sign', 'yield_sign', 'speed_limit', 'sign',
+  'building', 'pole', 'barrier', 'vegetation')"""
 EVERY = "MATCH (e:Ego) WHERE frame.seq % 5 = 0 RETURN FRAMES"
 
 
@@ -43,7 +50,7 @@ def worst_by_hand(some: ChosenFrames, name: str, low: bool = True) -> dict[int, 
     frames = {*some.frame_id.tolist()}
     found: dict[int, tuple[float, int]] = {}
     rows = some.store.sql(
-        f"SELECT frame_id, dst, {name} FROM criticality WHERE src_is_ego ORDER BY frame_id, dst"
+        f"SELECT frame_id, dst, {name} FROM criticality WHERE {OTHERS} ORDER BY frame_id, dst"
     ).values
     for frame, other, value in rows:
         if value is not None and frame in frames:
@@ -53,11 +60,9 @@ def worst_by_hand(some: ChosenFrames, name: str, low: bool = True) -> dict[int, 
     return found
 
 
-def mean_ranks(values: list[float]) -> list[float]:
-    """Ranks from the least value on; of equal ones the mean, counted one by one."""
-    return [
-        sum(v < one for v in values) + (sum(v == one for v in values) + 1) / 2 for one in values
-    ]
+def ranks(values: list[float]) -> list[int]:
+    """Ranks from the least value on, counted one by one."""
+    return [1 + sum(v < one for v in values) for one in values]
 
 
 def test_risk_is_the_sum_of_the_ranks_of_the_worst_values(some: ChosenFrames) -> None:
@@ -70,7 +75,7 @@ def test_risk_is_the_sum_of_the_ranks_of_the_worst_values(some: ChosenFrames) ->
     for worst, name in zip(found.worst, names, strict=True):
         hand = worst_by_hand(some, name, low=name != "a_req")
         sign = -1 if name == "a_req" else 1
-        total += mean_ranks([sign * hand[f][0] if f in hand else math.inf for f in frames])
+        total += ranks([sign * hand[f][0] if f in hand else math.inf for f in frames])
         known = [f in hand for f in frames]
         assert (~np.isnan(worst.value)).tolist() == known
         for unit, frame in enumerate(frames):
@@ -121,7 +126,8 @@ def test_no_order_has_more_classes_in_its_first_cases_than_the_diverse_one(
 
 
 def test_risk_and_diversity_together_lie_between_the_two(some: ChosenFrames) -> None:
-    orders = {by: prioritize(some, PrioritySpec(by, abstraction="E")) for by in Priority}
+    kinds = (Priority.risk, Priority.diverse, Priority.both)
+    orders = {by: prioritize(some, PrioritySpec(by, abstraction="E")) for by in kinds}
     half = len(orders[Priority.risk].picked) // 4
 
     def classes(by: Priority) -> int:
@@ -181,6 +187,151 @@ def test_failures_that_come_first_come_soonest() -> None:
         fault_detection(np.zeros(7, np.bool_))
 
 
+def test_the_curve_of_failures_counts_them() -> None:
+    failed = np.array([True, False, True, False, False, False, True])
+
+    assert failure_curve(failed) == [
+        (many, int(failed[:many].sum()), failed[:many].sum() / 3, 3 * many / 7)
+        for many in range(1, 8)
+    ]
+    assert [row[0] for row in failure_curve(failed, 2)] == [4, 7]
+
+
+# Learning -----------------------------------------------------------------------------------------
+
+LEARNED = Priority.learned
+
+
+@pytest.fixture(params=["boosted trees", "plain"])
+def model(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Learn with each model; scikit-learn is not there for the plain one."""
+    if request.param == "plain":
+        monkeypatch.setitem(sys.modules, "sklearn", None)
+    else:
+        pytest.importorskip("sklearn")
+    return request.param
+
+
+def named_outcomes(some: ChosenFrames, failed: set[int]) -> dict[str, bool]:
+    """Outcomes of all frames, of which some failed, by frame ids."""
+    assert some.frame_id is not None
+    return {str(frame): frame in failed for frame in some.frame_id.tolist()}
+
+
+def test_what_is_learned_finds_what_fails(some: ChosenFrames, model: str) -> None:
+    """Frames fail whose nearest neighbour, whoever it is, is on the left: nothing that risk knows."""
+    pairs = f"criticality WHERE {OTHERS} GROUP BY frame_id"
+    sql = f"SELECT frame_id, arg_min(lat, closing_time) FROM {pairs}"
+    left = {frame for frame, lat in some.store.sql(sql).values if lat is not None and lat > 0}
+    outcomes = named_outcomes(some, left)
+
+    learned, risky = (
+        prioritize(some, PrioritySpec(by), outcomes) for by in (LEARNED, Priority.risk)
+    )
+
+    found, beside = (fault_detection(failed_in_order(one, outcomes)) for one in (learned, risky))
+    assert found.apfd > max(beside.apfd, 0.5) + 0.05
+    assert (np.diff(learned.chance[learned.picked]) <= 0).all()
+    assert ((learned.chance >= 0) & (learned.chance <= 1)).all()
+    assert learned.said[-1].startswith("learned by ")
+    assert f"of which {found.failures:,} failed" in learned.said[-1]
+    assert learned.reasons()[0].startswith("fails with probability ")
+    assert ("gradient boosting" in learned.said[-1]) == (model != "plain")
+
+
+def test_no_case_is_judged_by_a_model_that_knows_its_outcome(
+    some: ChosenFrames, model: str
+) -> None:
+    assert some.frame_id is not None
+    assert model
+    frames = some.frame_id.tolist()
+    failed = {*frames[::3]}
+    before = prioritize(some, PrioritySpec(LEARNED), named_outcomes(some, failed)).chance
+
+    changed = failed ^ {frames[7]}
+    after = prioritize(some, PrioritySpec(LEARNED), named_outcomes(some, changed)).chance
+
+    assert after[7] == before[7]
+    assert (after != before).any()
+
+
+def test_what_has_no_outcome_is_judged_by_all_that_have(some: ChosenFrames, model: str) -> None:
+    assert some.frame_id is not None
+    assert model
+    half = len(some.frame_id) // 2
+    known, asked = (
+        ChosenFrames("part", some.store, part)
+        for part in (some.frame_id[:half], some.frame_id[half:])
+    )
+    outcomes = named_outcomes(known, {*some.frame_id[:half:4].tolist()})
+
+    together = prioritize(some, PrioritySpec(LEARNED), outcomes)
+    apart = prioritize(asked, PrioritySpec(LEARNED), outcomes, known)
+
+    assert together.chance[half:].tolist() == apart.chance.tolist()
+    assert len({*apart.chance.tolist()}) > 3
+
+
+def test_the_plain_model_is_the_logistic_regression_of_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    linear = pytest.importorskip("sklearn.linear_model")
+    rng = np.random.default_rng(5)
+    x = rng.normal(size=(300, 4)).astype(np.float32)
+    x[rng.random(x.shape) < 0.2] = np.nan
+    failed = rng.random(300) < 1 / (1 + np.exp(-2 * np.nan_to_num(x[:, 0]) + x[:, 1] ** 2 % 1))
+
+    def design(row: np.ndarray) -> list[float]:
+        told: list[float] = []
+        for value, column in zip(row, x.T, strict=True):
+            known = column[~np.isnan(column)]
+            place = ((known < value).sum() + (known == value).sum() / 2) / len(known) - 0.5
+            told += [0 if np.isnan(value) else place, 0.5 - np.isnan(value)]
+        return told
+
+    told = np.array([design(row) for row in x])
+    theirs = linear.LogisticRegression(C=1.0, tol=1e-10, max_iter=10_000).fit(told, failed)
+    monkeypatch.setitem(sys.modules, "sklearn", None)
+
+    ours = fitted(x, failed, x, seed=0)
+
+    assert ours == pytest.approx(theirs.predict_proba(told)[:, 1], abs=1e-5)
+
+
+@pytest.mark.parametrize("share", [0, 1])
+def test_to_learn_takes_failures_and_others(some: ChosenFrames, share: int) -> None:
+    assert some.frame_id is not None
+    outcomes = named_outcomes(some, {*some.frame_id.tolist()} if share else set())
+
+    with pytest.raises(ConfigError, match="to learn takes failures and others"):
+        prioritize(some, PrioritySpec(LEARNED), outcomes)
+
+
+def test_a_case_is_told_by_its_most_critical_neighbours(some: ChosenFrames) -> None:
+    units = units_of(some, SelectionUnit.frame, 2.0, None)
+    rows = np.arange(len(units))
+    sql = f"""
+      SELECT c.frame_id, c.closing_time, c.dce_3s, c.lon, n.width FROM criticality c
+      JOIN nodes n ON n.frame_id = c.frame_id AND n.node_id = c.dst WHERE {OTHERS}
+    """
+    by_frame: dict[int, list[tuple[float, float, float, float]]] = defaultdict(list)
+    for frame, *row in some.store.sql(sql).values:
+        time, dce, lon, width = (math.inf if value is None else value for value in row)
+        by_frame[frame].append((time, dce, lon, width))
+
+    told = features_of(units, rows)
+
+    for row, frame in zip(told, units.frame_id.tolist(), strict=True):
+        others = sorted(by_frame[frame])[:3]
+        assert row[-1] == len(by_frame[frame])
+        for place, (time, *_, lon, width) in enumerate(others):
+            numbers = row[place * 14 : (place + 1) * 14]
+            assert np.nan_to_num(numbers[1], nan=math.inf) == pytest.approx(time)
+            assert numbers[[8, 13]] == pytest.approx([lon, width], rel=1e-5)
+        assert np.isnan(row[len(others) * 14 : 42]).all()
+    assert len(by_frame) > 10
+
+
 # The verb -----------------------------------------------------------------------------------------
 
 
@@ -209,6 +360,52 @@ def test_the_verb_says_why_and_locks_the_order(
     assert kept.selection["order"] == names
     assert kept.selection["reasons"][names[0]] == rows[0]["reason"]
     assert [case.id for case in kept.ordered] == names
+
+
+def test_an_order_is_learned_from_another_store(
+    town_store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["prioritize", str(town_store), EVERY, "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    lessons, known = tmp_path / "lessons.csv", tmp_path / "known.csv"
+    for path, part in ((lessons, rows[::2]), (known, rows[1::2])):
+        told = [f"{row['unit']},{int(row['place'] <= 8)}\n" for row in part]
+        path.write_text("frame,failed\n" + "".join(told))
+    learn = ["--by", "learned", "--learn-outcomes", str(lessons), "--outcomes", str(known)]
+    other, picture = ["--learn-from", str(town_store)], tmp_path / "found.svg"
+
+    assert run(["prioritize", str(town_store), EVERY, *learn, "--json"]) == 0
+    here = capsys.readouterr()
+    assert run(["prioritize", str(town_store), EVERY, *learn, *other, "--json"]) == 0
+    there = capsys.readouterr()
+    drawn = ["prioritize", str(town_store), EVERY, *learn, "--picture", str(picture)]
+    assert run([*drawn, "--no-payloads", "-o", str(tmp_path / "order.lock")]) == 0
+
+    assert "of 4 failures in 75 cases" in here.err
+    assert "learned by " in there.err
+    first = {row["unit"]: row["probability"] for row in json.loads(here.out)}
+    second = {row["unit"]: row["probability"] for row in json.loads(there.out)}
+    asked = [row["unit"] for row in rows[1::2]]
+    assert [first[unit] for unit in asked] == [second[unit] for unit in asked]
+    assert "failures found, of 4" in picture.read_text()
+    assert "learned by " in read_lock(tmp_path / "order.lock").selection["learned"]
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--by", "learned"], "--by learned needs --outcomes or --learn-outcomes"),
+        (["--learn-outcomes", "x.csv"], "belong to --by learned"),
+        (["--by", "learned", "--learn-from", "x"], "--learn-from needs --learn-outcomes"),
+        (["--picture", "x.svg"], "--picture needs --outcomes"),
+    ],
+)
+def test_options_that_need_others_say_so(
+    town_store: Path, capsys: pytest.CaptureFixture[str], options: list[str], told: str
+) -> None:
+    assert run(["prioritize", str(town_store), *options]) == 2
+
+    assert told in " ".join(capsys.readouterr().err.split())
 
 
 def test_cases_of_a_lock_come_in_its_order(

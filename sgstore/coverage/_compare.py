@@ -386,7 +386,7 @@ S3C_THRESHOLD: Final = 5 / 140
 """The error beyond which S3C's code counts a steering angle, -1 … 1 for ±70°, as a failure: 2.5°, though its
 paper says 5°."""
 
-_ID: Final = re.compile(r"[0-9]{1,18}")
+_ID: Final = re.compile(r"[0-9]{1,19}")
 
 
 def read_outcomes(path: str | Path, threshold: float = S3C_THRESHOLD) -> dict[str, bool]:

@@ -1,6 +1,7 @@
 # The face of this package: what others may import from it.
 
 from ._apfd import FaultDetection as FaultDetection
+from ._apfd import failure_curve as failure_curve
 from ._apfd import fault_detection as fault_detection
 from ._choose import Curve as Curve
 from ._choose import Selection as Selection
@@ -50,6 +51,7 @@ __all__ = [
     "Units",
     "curve",
     "failed_in_order",
+    "failure_curve",
     "fault_detection",
     "listed",
     "locked_order",

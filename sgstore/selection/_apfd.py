@@ -88,6 +88,31 @@ def fault_detection(failed: Bools, seed: int = 0) -> FaultDetection:
     return FaultDetection(len(failed), len(where), float(left.mean()), low, high, found)
 
 
+def failure_curve(failed: Bools, points: int = 200) -> list[tuple[int, int, float, float]]:
+    """Failures in the first cases of an order.
+
+    Parameters
+    ----------
+    failed : (N,) bool
+        Outcomes of the cases, in their order.
+    points : int
+        Most rows.
+
+    Returns
+    -------
+    list of tuple
+        Cases, failures among them, their share of all failures, and as many cases' failures in random order, in
+        the mean.
+    """
+    cases = np.unique(np.ceil(np.linspace(0, len(failed), points + 1)[1:]).astype(np.int64))
+    found = np.cumsum(failed)[cases - 1]
+    total = max(int(failed.sum()), 1)
+    return [
+        (many, got, got / total, failed.sum() * many / len(failed))
+        for many, got in zip(cases.tolist(), found.tolist(), strict=True)
+    ]
+
+
 def _drawn(left: Floats, rng: np.random.Generator) -> float:
     """The mean of as many failures, drawn with replacement."""
     return float(left[rng.integers(0, len(left), len(left))].mean())

@@ -1,8 +1,9 @@
-"""Order of test cases: the most critical first, the most diverse first, or both.
+"""Order of test cases: the most critical first, the most diverse first, both, or as other outcomes teach.
 
 The *risk* of a case goes by measures of criticality of the ego and others that move, each the worst value
 in its frames. Measures have different units and scales, so cases are ranked by each of them, and the ranks
-are added up (Borda count): no weight, no threshold. A case of which a measure is not known comes last by it.
+are added up (Borda count): no weight, no threshold. A rank is one more than the number of cases that are more
+critical, as ``rank()`` in SQL. A case of which a measure is not known comes after those of which it is.
 
 For *diversity* the class of a case is that of its most critical frame in an abstraction. Cases come in rounds:
 one of each class, then a second one of each that has two, and so on. As each case brings one class, no order of
@@ -22,6 +23,13 @@ from sgstore.errors import ConfigError
 from sgstore.locks import lock_of
 from sgstore.pair_numbers import PAIR_FUNCTIONS
 from sgstore.selection._choose import BudgetTracker, names_of_units
+from sgstore.selection._learn import (
+    OTHERS,
+    cross_fitted,
+    features_of,
+    learned_elsewhere,
+    model_name,
+)
 from sgstore.selection._units import Budget, SelectionUnit, units_of
 from sgstore.store import trace_of
 
@@ -41,11 +49,12 @@ RANKED: Final = {name: one for name, one in PAIR_FUNCTIONS.items() if one.sql an
 
 
 class Priority(StrEnum):
-    """Rule of an order: the most critical first, one of each class first, or both."""
+    """Rule of an order: the most critical first, one of each class first, both, or the likeliest to fail."""
 
     risk = "risk"
     diverse = "diverse"
     both = "both"
+    learned = "learned"
 
 
 @dataclass(frozen=True)
@@ -101,7 +110,9 @@ class PrioritySpec:
             "unit": self.unit.value,
             "clip_s": self.clip_s if clip else None,
             "stride_s": self.stride_s if clip else None,
-            "abstraction": self.abstraction if self.by is not Priority.risk else None,
+            "abstraction": self.abstraction
+            if self.by in {Priority.diverse, Priority.both}
+            else None,
             "budget": None if self.budget is None else str(self.budget),
             "seed": self.seed,
         }
@@ -128,11 +139,11 @@ class WorstValues:
     other: Ints
 
     def ranks(self) -> Floats:
-        """(U,): ranks from the worst, 1, on; of those that are equal the mean; unknown ones are last."""
+        """(U,): one more than the number of units that are worse; unknown ones are last."""
         sign = -1.0 if RANKED[self.name].worse == "high" else 1.0
         filled = np.where(np.isnan(self.value), np.inf, sign * self.value)
         _, place, many = np.unique(filled, return_inverse=True, return_counts=True)
-        return (np.cumsum(many) - (many - 1) / 2)[place]
+        return 1 + (np.cumsum(many) - many)[place].astype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -146,13 +157,16 @@ class Prioritized:
     picked : int64
         Numbers of units, in order, as far as the budget goes.
     risk : (U,) float64
-        Share of all units that are no more critical, by the sum of ranks; above 0, and 1 for the first.
+        Share of all units that are no more critical, by the sum of ranks, or no more likely to fail; above 0,
+        and 1 for the first.
     worst : tuple of WorstValues
         Of each measure.
     code : (U,) int64
         Class of each unit, where that was asked; −1 where it is not known.
     said : list of str
         What a person must know of the order.
+    chance : (U,) float64
+        Probability of failure of each unit, where it was learned.
     """
 
     spec: PrioritySpec
@@ -162,6 +176,7 @@ class Prioritized:
     worst: tuple[WorstValues, ...] = ()
     code: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     said: list[str] = field(default_factory=list[str])
+    chance: Floats = field(default_factory=lambda: np.zeros(0))
 
     def reasons(self) -> list[str]:
         """Reasons for the place of each unit, in the order of :attr:`picked`."""
@@ -179,7 +194,8 @@ class Prioritized:
         many = np.bincount(self.code[self.code >= 0]) if len(self.code) else np.zeros(0, np.int64)
         told: list[str] = []
         for unit in self.picked.tolist():
-            parts = [
+            likely = [f"fails with probability {self.chance[unit]:.2g}"] if len(self.chance) else []
+            parts = likely + [
                 _reason(
                     one,
                     unit,
@@ -203,21 +219,41 @@ class Prioritized:
         columns = [one.value[self.picked].tolist() for one in self.worst]
         known = [[None if v != v else v for v in column] for column in columns]  # noqa: PLR0124 - NaN
         risk = self.risk[self.picked].tolist() if len(self.risk) else [None] * len(names)
+        if len(self.chance):
+            known.insert(0, self.chance[self.picked].tolist())
         rows = zip(range(1, len(names) + 1), names, risk, *known, self.reasons(), strict=True)
-        head = ("place", "unit", "risk", *(one.name for one in self.worst), "reason")
+        likely = ["probability"] * bool(len(self.chance))
+        head = ("place", "unit", "risk", *likely, *(one.name for one in self.worst), "reason")
         return ReportTable(head, list(rows), self.said)
 
 
-def prioritize(chosen: ChosenFrames, spec: PrioritySpec) -> Prioritized:
+def prioritize(
+    chosen: ChosenFrames,
+    spec: PrioritySpec,
+    outcomes: Mapping[str, bool] | None = None,
+    learn_from: ChosenFrames | None = None,
+) -> Prioritized:
     """Order units of some frames.
+
+    Parameters
+    ----------
+    chosen : ChosenFrames
+    spec : PrioritySpec
+    outcomes : mapping of str to bool, optional
+        Known outcomes to learn from, as :func:`sgstore.coverage.read_outcomes` reads them.
+    learn_from : ChosenFrames, optional
+        Frames that the outcomes are about; by default those that are ordered. Units with outcomes that are
+        ordered themselves are judged by models that have not seen theirs.
 
     Raises
     ------
     AbstractionError
         There is no such abstraction.
     ConfigError
-        Units have no meaning.
+        Units have no meaning, or there is nothing to learn from.
     """
+    if spec.by is Priority.learned and outcomes is None:
+        raise ConfigError("to learn an order takes known outcomes")
     units = units_of(chosen, spec.unit, spec.clip_s, spec.stride_s)
     if not len(units):
         said = [f"{chosen.text}: no frame to put in order"]
@@ -225,14 +261,18 @@ def prioritize(chosen: ChosenFrames, spec: PrioritySpec) -> Prioritized:
     rank = units.ranks(spec.seed)
     worst: tuple[WorstValues, ...] = ()
     total, risk, key = rank.astype(np.float64), np.zeros(0), units.begin
+    chance, lesson = np.zeros(0), ""
     if spec.by is not Priority.diverse:
         worst = worst_values(units, spec.measures)
-        total = np.sum([one.ranks() for one in worst], axis=0)
-        risk = 1 - _places(total, rank) / len(units)
         key = worst[0].row
+        total = np.sum([one.ranks() for one in worst], axis=0)
+        if spec.by is Priority.learned:
+            chance, lesson = _learned(units, key, spec, outcomes or {}, learn_from)
+            total = -chance
+        risk = 1 - _places(total, rank) / len(units)
     order = np.lexsort((rank, total))
     code = np.zeros(0, np.int64)
-    if spec.by is not Priority.risk:
+    if spec.by in {Priority.diverse, Priority.both}:
         code = _classes(units, spec.abstraction)[key]
         rounds = _in_rounds(order, code)
         order = _together(order, rounds) if spec.by is Priority.both else rounds
@@ -240,8 +280,32 @@ def prioritize(chosen: ChosenFrames, spec: PrioritySpec) -> Prioritized:
     if spec.budget is not None:
         tracker = BudgetTracker.of(units, spec.budget.measure, spec.budget.most)
         picked = tracker.fitting(order)
-    said = [_said(spec, units, picked, worst, code)]
-    return Prioritized(spec, units, picked, risk, worst, code, said)
+    said = [_said(spec, units, picked, worst, code), *([lesson] if lesson else [])]
+    return Prioritized(spec, units, picked, risk, worst, code, said, chance)
+
+
+def _learned(
+    units: Units,
+    key: Ints,
+    spec: PrioritySpec,
+    outcomes: Mapping[str, bool],
+    learn_from: ChosenFrames | None,
+) -> tuple[Floats, str]:
+    """(U,): the probability that each unit fails; and from how many outcomes it was learned."""
+    x = features_of(units, key)
+    if learn_from is None:
+        failed, known = outcomes_of(units, outcomes)
+        chance = cross_fitted(x, failed, known, spec.seed)
+    else:
+        others = units_of(learn_from, spec.unit, spec.clip_s, spec.stride_s)
+        failed, known = outcomes_of(others, outcomes)
+        rows = worst_values(others, spec.measures)[0].row
+        chance = learned_elsewhere(x, features_of(others, rows), failed, known, spec.seed)
+    many, wrong = int(known.sum()), int((failed & known).sum())
+    return (
+        chance,
+        f"learned by {model_name()} from {many:,} {units.unit}s, of which {wrong:,} failed",
+    )
 
 
 def _said(
@@ -308,7 +372,7 @@ def worst_values(units: Units, measures: Sequence[str]) -> tuple[WorstValues, ..
     )
     sql = f"""
       SELECT frame_id, {parts} FROM (
-        SELECT {", ".join(columns)} FROM criticality WHERE src_is_ego GROUP BY frame_id)
+        SELECT {", ".join(columns)} FROM criticality WHERE {OTHERS} GROUP BY frame_id)
       ORDER BY frame_id
     """  # noqa: S608  names of ours
     found = units.chosen.store.file.arrays(sql)
@@ -394,6 +458,8 @@ def locked_order(
     units = order.units
     names = names_of_units(units, order.picked)
     how = order.spec.as_dict(query) | {"parameters": dict(parameters or {})}
+    if len(order.chance):
+        how["learned"] = order.said[-1]
     how |= {"order": names, "reasons": dict(zip(names, order.reasons(), strict=True))}
     return lock_of(
         units.chosen.store, units.cases(order.picked), how, payloads=payloads, progress=progress
@@ -414,15 +480,23 @@ def failed_in_order(order: Prioritized, outcomes: Mapping[str, bool]) -> Bools:
     ConfigError
         No outcome is about a case.
     """
-    units = order.units
+    failed, known = outcomes_of(order.units, outcomes)
+    return failed[order.picked][known[order.picked]]
+
+
+def outcomes_of(units: Units, outcomes: Mapping[str, bool]) -> tuple[Bools, Bools]:
+    """(U,): units that failed, and units with a known outcome.
+
+    Raises
+    ------
+    ConfigError
+        No outcome is about a unit.
+    """
     told = told_outcomes(outcomes, units.chosen.store, units.frame_id)
     ranges = np.stack([units.begin, units.end], axis=1).ravel()
-    failed, known = (
-        np.logical_or.reduceat(np.append(column, False), ranges)[::2][order.picked]
-        for column in told
-    )
+    failed, known = (np.logical_or.reduceat(np.append(one, False), ranges)[::2] for one in told)
     if not known.any():
         raise ConfigError(
             f"none of the {len(outcomes)} outcomes is about a case of {units.chosen.text}"
         )
-    return failed[known]
+    return failed, known
