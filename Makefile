@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: help demo check test tests test-edges test-ui test-wheel test-versions lint format bench fuzz kill mutants soak pyg oracle patterns sample clean duckdb-versions fuzz-queries frozen house api vendor cluster
+.PHONY: help demo check test tests test-edges test-ui test-wheel test-versions lint format bench fuzz kill mutants soak pyg viewers oracle patterns sample clean duckdb-versions fuzz-queries frozen house api vendor cluster
 
 help:
 	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
@@ -25,6 +25,7 @@ help:
 	@echo "make mutants  put faults in on purpose and look whether the tests of their room find them (about an hour)"
 	@echo "make soak    one writer and eight readers on one store for ten minutes"
 	@echo "make pyg     PyTorch Geometric reads what is exported for it, and a small network learns from it (downloads torch)"
+	@echo "make viewers  Rerun's reader looks at what is exported for it (downloads Rerun)"
 	@echo "make oracle  100,000 random patterns and formulas against exhaustive search, 12,000 pairs of graphs against networkx (hours)"
 	@echo "make cluster  1,000 random questions of collections; S3 and Ray, and faults of both (an hour; installs ray, obstore, moto)"
 	@echo "make duckdb-versions  every construct of the language under DuckDB 1.5 and 2.0: equal answers (minutes)"
@@ -77,7 +78,7 @@ test: $(VENV)/.dev
 # pictures, exports, graphs and simulators of others, plug-ins of other programs, pages of the docs, and parts of the long
 # programs below. A file that is not listed is of the core.
 EDGES := coverage coverage_docs derive derive_using like locks selection selection_docs selection_overlapping prioritize \
-  draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap export_scenarios export_viewers exports exports_docs timeline \
+  draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap export_scenarios export_rerun export_viewers exports exports_docs timeline \
   assistant notebook carla_live collection collection_landing collection_ray collection_remote importing junit lang_sgl pytest_plugin record sample \
   docs_house docs_queries lang_docs packaging views_page \
   fuzz mutants serve report
@@ -133,6 +134,12 @@ pyg: $(VENV)/.base
 	@test -x build/pyg/bin/python || $(BIN)/python -m venv build/pyg || $(BIN)/python -m virtualenv -q build/pyg
 	@build/pyg/bin/python -m pip install -q --disable-pip-version-check -e '.[pyg]'
 	build/pyg/bin/python tests/learning.py
+
+# Likewise: Rerun takes 500 MB. Its own reader looks at what is written for it.
+viewers: $(VENV)/.base
+	@test -x build/viewers/bin/python || $(BIN)/python -m venv build/viewers || $(BIN)/python -m virtualenv -q build/viewers
+	@build/viewers/bin/python -m pip install -q --disable-pip-version-check -e '.[rerun,viz,arrow]' pytest hypothesis foxglove-schemas-protobuf
+	build/viewers/bin/python -m pytest tests/test_export_rerun.py tests/test_export_viewers.py
 
 # Files of tests that try more where SGSTORE_LONG is set (tests/thorough.py).
 LONG := collection collection_ray temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \

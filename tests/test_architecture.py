@@ -70,6 +70,7 @@ OWNERS = {
     "PIL": {"draw", "exporters"},
     "av": {"draw"},
     "pytest": {"pytest_plugin"},
+    "rerun": {"exporters"},
     "torch": {"exporters"},
     "torch_geometric": {"exporters"},
     "carla": {"readers"},

@@ -403,7 +403,7 @@ class StoreTools:
         before: Annotated[float, Field(ge=0, le=600, description="before each match; s")] = 2.0,
         after: Annotated[float, Field(ge=0, le=600, description="after each match; s")] = 2.0,
         form: Annotated[
-            str, Field(description="mcap, parquet, frames, nx, pyg, s3c, xosc")
+            str, Field(description="mcap, parquet, frames, nx, pyg, s3c, xosc, rrd")
         ] = "mcap",
         with_graph: Annotated[bool, Field(description="mcap: with the scene graphs")] = False,  # noqa: FBT002
         limit: Annotated[int, Field(ge=1, description="clips at most")] = ROWS,

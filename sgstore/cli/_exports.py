@@ -69,7 +69,7 @@ class ClipOptions:
         Option(
             "--mount",
             metavar="AXES=X,Y,Z[,YAW]",
-            help=f"{_formats('mounts')} with graphs: where a sensor sits on the ego, by the frame_id of its"
+            help=f"{_formats('mounts')}, with graphs: where a sensor sits on the ego, by the frame_id of its"
             " messages; m, degrees; repeatable.",
         ),
     ] = None
@@ -146,8 +146,9 @@ def export(
     """Cut matches out of their recordings, as clips with the original messages.
 
     Other formats: tables (parquet), pictures and clouds (frames), scenarios to drive
-    again (xosc), graphs for networkx (nx), PyTorch Geometric (pyg) and S3C (s3c).
-    RETURN CLIPS(-3s, +5s) in the query wins over --before and --after.
+    again (xosc), recordings for Rerun (rrd), graphs for networkx (nx), PyTorch
+    Geometric (pyg) and S3C (s3c). RETURN CLIPS(-3s, +5s) in the query wins over
+    --before and --after.
     """
     from sgstore.exporters import exporter_named, labelled, parse_labels, write_export
 

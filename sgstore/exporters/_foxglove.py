@@ -247,7 +247,7 @@ def message(graph: SceneGraph, log_time_ns: int) -> bytes:
     update = message_type(SCENE)()
     gone = update.deletions.add(type=_ALL)
     stamp(gone, log_time_ns)
-    places = {node: _place(about) for node, about in graph.nodes.items()}
+    places = {node: place_of(about) for node, about in graph.nodes.items()}
     for node, about in graph.nodes.items():
         place = places[node]
         if place is not None:
@@ -283,14 +283,13 @@ def _add_node(
     for key in ("kind", "special", "speed", "light_state"):
         if key in about:
             entity.metadata.add(key=key, value=str(about[key]))
-    solid = node >= 0 and all(about.get(side) for side in ("length", "width", "height"))
+    solid = is_solid(node, about)
     body = entity.cubes.add() if solid else entity.spheres.add()
     body.pose.position.x, body.pose.position.y, body.pose.position.z = place
     _turn(body.pose.orientation, quaternion(*turn_of(about)))
     size = (about["length"], about["width"], about["height"]) if solid else (DOT, DOT, DOT)
     body.size.x, body.size.y, body.size.z = size
-    colour = LIGHTS.get(about.get("light_state", ""), COLOURS.get(about["kind"], OTHERS))
-    _paint(body.color, EGO_COLOUR if about.get("is_ego") else colour)
+    _paint(body.color, colour_of(about))
     if node >= 0 and not about.get("is_static"):
         name = entity.texts.add(
             text=about["name"], billboard=True, font_size=TEXT, scale_invariant=True
@@ -299,6 +298,18 @@ def _add_node(
         name.pose.position.z = place[2] + about.get("height", 0.0) / 2 + DOT
         name.pose.orientation.w = 1.0
         _paint(name.color, TEXT_COLOUR)
+
+
+def is_solid(node: int, about: Mapping[str, Any]) -> bool:
+    """Tell whether a node is an entity whose box is known."""
+    return node >= 0 and all(about.get(side) for side in ("length", "width", "height"))
+
+
+def colour_of(about: Mapping[str, Any]) -> Colour:
+    """Return the colour of a node, by what it is and what it shows."""
+    if about.get("is_ego"):
+        return EGO_COLOUR
+    return LIGHTS.get(about.get("light_state", ""), COLOURS.get(about["kind"], OTHERS))
 
 
 @dataclass(frozen=True, slots=True)
@@ -356,7 +367,8 @@ def _turn(orientation: Any, turn: tuple[float, float, float, float]) -> None:
     orientation.x, orientation.y, orientation.z, orientation.w = turn
 
 
-def _place(about: dict[str, Any]) -> tuple[float, float, float] | None:
+def place_of(about: Mapping[str, Any]) -> tuple[float, float, float] | None:
+    """Return where a node is; m. ``None``: not known."""
     if "x" not in about or "y" not in about:
         return None
     return about["x"], about["y"], about.get("z", 0.0)
