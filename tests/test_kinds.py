@@ -6,18 +6,20 @@ from itertools import product
 from typing import TYPE_CHECKING
 
 import pytest
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from mcap.reader import make_reader
 from recordings import Recorder, car
 from test_cli_ingest import in_json, sgstore
 
 import sgstore as library
-import sgstore.exporters._foxglove as foxglove_scene
-import sgstore.exporters._recorder as recorder
-from sgstore.abstractions._literature import ACTORS
+from sgstore import exporters
+from sgstore.exporters import Export, write_export
 from sgstore.importing import import_graphs
 from sgstore.ingest import ingest
 from sgstore.lang import node_of_kind
 from sgstore.step import Frame
 from sgstore.vocabulary import ENTITY_KINDS, SUPER_KINDS, VEHICLES
+from sgstore.world import Clip
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,7 +33,7 @@ MOVING = (*VEHICLES, "person", "animal", "unknown")
 def everything(tmp_path_factory: pytest.TempPathFactory) -> Store:
     """A store of a recording with one entity of every kind, named after it, around an ego that is a car."""
     folder = tmp_path_factory.mktemp("kinds")
-    with recorder.Recorder(folder / "all.mcap") as recording:
+    with exporters.Recorder(folder / "all.mcap") as recording:
         for step in range(3):
             frame = Frame(step * 10**8, ego="ego")
             frame.add("ego", "car", 0.0, 0.0, 0.7, heading=0.0, length=4.0, width=2.0, height=1.4)
@@ -82,9 +84,31 @@ def test_an_example_with_such_a_vehicle_finds_its_own_frame_and_says_the_kind(
     assert everything.find(text).count() == 3
 
 
-def test_each_vehicle_has_a_colour_and_an_actor_of_roadscene2vec() -> None:
-    assert set(VEHICLES) <= set(foxglove_scene.COLOURS)
-    assert set(VEHICLES) - set(ACTORS) == {"train"}
+def test_each_vehicle_but_a_train_is_an_actor_of_roadscene2vec(everything: Store) -> None:
+    seen = everything.graph("all#1", "roadscene2vec").nodes(data="base_class")
+    ridden = [actor for _, actor in seen if actor in {"car", "moto", "bicycle"}]
+
+    assert len(ridden) == len(VEHICLES) - 1
+
+
+def test_each_vehicle_has_a_colour_of_its_own_kind(everything: Store, tmp_path: Path) -> None:
+    export = Export(everything, (Clip("all", 0, 10**9),), with_graph=True)
+    (written,) = write_export(export, tmp_path / "out")
+    with written.file.open("rb") as file:
+        found = make_reader(file).iter_messages(topics=["/sgstore/scene"])
+        scene = SceneUpdate.FromString(next(message.data for _, _, message in found))
+    colours = {
+        next(pair.value for pair in one.metadata if pair.key == "kind"): (
+            body.color.r,
+            body.color.g,
+        )
+        for one in scene.entities
+        for body in [*one.cubes, *one.spheres]
+        if one.id != "ego"
+    }
+
+    assert {*VEHICLES} <= colours.keys()
+    assert {colours[kind] for kind in VEHICLES}.isdisjoint({colours["prop"], colours["unknown"]})
 
 
 def test_a_vehicle_of_a_graph_from_elsewhere_is_one_and_no_more(tmp_path: Path) -> None:

@@ -12,11 +12,12 @@ import pytest
 
 carla = pytest.importorskip("carla")
 
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage  # noqa: E402
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud  # noqa: E402
 from google.protobuf import descriptor_pb2  # noqa: E402
 from mcap.reader import make_reader  # noqa: E402
 from standin_carla import StandInActor, StandInWorld, at_red, box, transform  # noqa: E402
 
-import sgstore.exporters._foxglove as foxglove  # noqa: E402
 from sgstore.cli import run  # noqa: E402
 from sgstore.config import Config  # noqa: E402
 from sgstore.demo import RECORDING  # noqa: E402
@@ -24,8 +25,7 @@ from sgstore.errors import ConfigError, ExportError, TraceError  # noqa: E402
 from sgstore.exporters import Recorder  # noqa: E402
 from sgstore.ingest import ingest  # noqa: E402
 from sgstore.query import Store  # noqa: E402
-from sgstore.readers import LiveWorld, Sensor, load_sensors  # noqa: E402
-from sgstore.readers.carla._live import LIDAR  # noqa: E402
+from sgstore.readers import LiveWorld, Sensor, load_sensors, png  # noqa: E402
 from sgstore.record import record  # noqa: E402
 from sgstore.sgg import SceneGraphGenerator  # noqa: E402
 from sgstore.step import Frame  # noqa: E402
@@ -173,14 +173,12 @@ def test_pictures_and_points_are_what_the_sensor_measured(tmp_path: Path) -> Non
 
     schema, message = messages(path, "/ego/front/image")[0]
     assert schema.name == "foxglove.CompressedImage"
-    picture = foxglove.message_type("CompressedImage").FromString(message.data)
+    picture = CompressedImage.FromString(message.data)
     pixels = np.asarray(image.open(io.BytesIO(picture.data)))
     assert pixels.shape == (6, 8, 3)
     assert pixels[3, 5].tolist() == [30, 101, 10]
-    cloud = foxglove.message_type("PointCloud").FromString(
-        messages(path, "/ego/roof/points")[0][1].data
-    )
-    points = np.frombuffer(cloud.data, LIDAR)
+    cloud = PointCloud.FromString(messages(path, "/ego/roof/points")[0][1].data)
+    points = np.frombuffer(cloud.data, [(name, "<f4") for name in ("x", "y", "z", "intensity")])
     assert points["y"].tolist() == [-2.0, 5.0]
     assert [f.name for f in cloud.fields] == ["x", "y", "z", "intensity"]
     unit = json.loads(messages(path, "/ego/imu")[0][1].data)
@@ -252,7 +250,7 @@ def test_a_picture_survives_being_a_png(seed: int) -> None:
     rng = np.random.default_rng(seed)
     pixels = rng.integers(0, 256, (rng.integers(1, 9), rng.integers(1, 9), 3)).astype(np.uint8)
 
-    read = np.asarray(image.open(io.BytesIO(foxglove.png(pixels))).convert("RGB"))
+    read = np.asarray(image.open(io.BytesIO(png(pixels))).convert("RGB"))
 
     assert (read == pixels).all()
 

@@ -18,7 +18,6 @@ from graph_blocks import RandomTrace, publish
 
 from sgstore.errors import StoreError
 from sgstore.store import StoreFile
-from sgstore.store._locking import Access
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -250,7 +249,7 @@ def test_the_lock_of_a_writer_holds_while_its_process_looks_elsewhere(
 ) -> None:
     other = StoreFile.create(tmp_path / "other.db")
     connection = duckdb.connect()
-    with Access(store.path, memory=1 << 28, wait_s=5).writing(connection):
+    with StoreFile(store.path).access.writing(connection):
         other.traces()  # closes another file of this process
         code = f"import duckdb; duckdb.connect({str(store.path)!r}, read_only=True)"
         run = subprocess.run(

@@ -9,8 +9,7 @@ import pytest
 
 from sgstore.cli import run
 from sgstore.demo import RECORDING
-from sgstore.draw import draw_timelines, lines_of, parts_timeline, timelines
-from sgstore.draw._swimlanes import Lane, Timeline
+from sgstore.draw import Lane, Timeline, draw_timelines, lines_of, parts_timeline, timelines
 from sgstore.query import Store
 
 if TYPE_CHECKING:
