@@ -66,6 +66,8 @@ OWNERS = {
     "shapely": {"geometry", "roads", "opendrive"},
     "lark": {"lang"},
     "highspy": {"selection"},
+    "sklearn": {"selection"},
+    "threadpoolctl": {"selection"},
     "matplotlib": {"draw"},
     "PIL": {"draw", "exporters"},
     "av": {"draw"},

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from sgstore.coverage import ChosenFrames, Classed, ReportTable
     from sgstore.locks import Lock
     from sgstore.query import Store
-    from sgstore.selection import PrioritySpec, Selection, SelectionSpec, Strategy
+    from sgstore.selection import Selection, SelectionSpec, Strategy
 
 PANEL: Final = "Coverage and test sets"
 
@@ -537,7 +537,7 @@ def select(
         raise typer.BadParameter(f"--output {output}: the name of a lock ends in {ENDING}")
     shares = parse_split(split) if split else {}
     opened = bounds.opened(store)
-    found = choose(_chosen(opened, str(store), query, parameters), spec)
+    found = choose(chosen_frames(opened, str(store), query, parameters), spec)
     parts = split_up(found, shares) if shares else {}
     for text in found.said:
         say(text)
@@ -550,106 +550,7 @@ def select(
         _lock(found, asked, parts, output, payloads=not no_payloads)
 
 
-@dataclass(frozen=True)
-class OrderOptions:
-    """Options for an order of cases: what comes first, and what a case is."""
-
-    by: Annotated[
-        Literal["risk", "diverse", "both"],
-        Option("--by", help="The most critical first, one of each class first, or both."),
-    ] = "risk"
-    measures: Annotated[
-        list[str] | None,
-        Option(
-            "--measure",
-            "-m",
-            metavar="NAME",
-            help="Rank by this measure of criticality; may be repeated.",
-            show_default="closing_time, dce_3s",
-        ),
-    ] = None
-    budget: Annotated[
-        str, Option("--budget", help="At most 600s, 10min, 5GB, 1000frames or 40units.")
-    ] = ""
-    unit: Annotated[
-        Literal["frame", "clip", "trace"], Option("--unit", help="Frames, clips, or whole traces.")
-    ] = "frame"
-    clip: Annotated[str, Option("--clip", metavar="TIME", help="Longest clip of --unit clip.")] = (
-        "2s"
-    )
-    abstraction: Abstraction = "RSV"
-    seed: Annotated[int, Option("--seed", min=0, max=(1 << 63) - 1, help="Random seed.")] = 0
-
-    def spec(self) -> PrioritySpec:
-        """Make what the options say together."""
-        from sgstore.selection import MEASURES, Budget, Priority, PrioritySpec, SelectionUnit
-
-        return PrioritySpec(
-            Priority(self.by),
-            tuple(self.measures or MEASURES),
-            SelectionUnit(self.unit),
-            seconds_of(self.clip, "--clip"),
-            None,
-            self.abstraction,
-            Budget.parse(self.budget) if self.budget else None,
-            self.seed,
-        )
-
-
-@app.command(rich_help_panel=PANEL)
-def prioritize(
-    store: StorePath,
-    order: OrderOptions,
-    query: QueryText = None,
-    parameters: Parameters = None,
-    outcomes: Annotated[
-        Path | None,
-        Option("--outcomes", metavar="CSV", help="Known outcomes: tell how soon failures come."),
-    ] = None,
-    output: Annotated[
-        Path | None, Option("--output", "-o", metavar="FILE", help="Write a lock.")
-    ] = None,
-    no_payloads: NoPayloads = False,
-    *,
-    out: PrintedRows,
-    bounds: QueryLimits,
-) -> None:
-    """Order frames, clips or traces so that failures are found soon, with reasons.
-
-    The risk of a case is the sum of its ranks by measures of criticality of the
-    ego and others that move.
-    """
-    from sgstore.coverage import read_outcomes
-    from sgstore.locks import ENDING
-    from sgstore.selection import failed_in_order, fault_detection, locked_order
-    from sgstore.selection import prioritize as put_in_order
-
-    spec = order.spec()
-    if output is not None and output.suffix != ENDING:  # before anything is searched
-        raise typer.BadParameter(f"--output {output}: the name of a lock ends in {ENDING}")
-    known = read_outcomes(outcomes) if outcomes is not None else None
-    found = put_in_order(_chosen(bounds.opened(store), str(store), query, parameters), spec)
-    for text in found.said:
-        say(text)
-    if known is not None:
-        failed = failed_in_order(found, known)
-        none = f"none of the {len(failed):,} cases with a known outcome failed"
-        say(fault_detection(failed, spec.seed).said if failed.any() else none)
-    out.report(found.table())
-    if output is not None:
-        values = parameters_of(parameters)
-        with count_bar(output.name, "cases") as progress:
-            made = locked_order(
-                found,
-                query or "",
-                parameters=values,
-                payloads=not no_payloads,
-                progress=progress,
-            )
-        _made(made, output)
-
-
-def _chosen(
+def chosen_frames(
     opened: Store, name: str, query: str | None, parameters: list[str] | None
 ) -> ChosenFrames:
     """The frames that are selected from."""
@@ -704,7 +605,7 @@ def _lock(
         made = locked_selection(
             found, asked[0], parts, parameters=asked[1], payloads=payloads, progress=progress
         )
-    _made(made, output)
+    say_made(made, output)
 
 
 @lock.command("verify")
@@ -752,7 +653,7 @@ def union_(a: LockA, b: LockB, output: LockOut) -> None:
     """Write a lock of the cases that are in A or in B."""
     from sgstore.locks import read_lock, union
 
-    _made(union(read_lock(a), read_lock(b)), output)
+    say_made(union(read_lock(a), read_lock(b)), output)
 
 
 @lock.command("intersect")
@@ -760,7 +661,7 @@ def intersect_(a: LockA, b: LockB, output: LockOut) -> None:
     """Write a lock of the cases that are in A and in B."""
     from sgstore.locks import intersect, read_lock
 
-    _made(intersect(read_lock(a), read_lock(b)), output)
+    say_made(intersect(read_lock(a), read_lock(b)), output)
 
 
 @lock.command("minus")
@@ -768,10 +669,11 @@ def minus_(a: LockA, b: LockB, output: LockOut) -> None:
     """Write a lock of the cases of A that share no frame with B."""
     from sgstore.locks import minus, read_lock
 
-    _made(minus(read_lock(a), read_lock(b)), output)
+    say_made(minus(read_lock(a), read_lock(b)), output)
 
 
-def _made(made: Lock, output: Path) -> None:
+def say_made(made: Lock, output: Path) -> None:
+    """Write a lock, and say what is in it."""
     made.write(output)
     say(f"{output}: {len(made.cases)} cases of {len(made.traces)} traces")
 

@@ -290,8 +290,9 @@ def draw_curve(
     unit: str,
     title: str,
     below: str,
+    words: tuple[str, str] = ("kept", "selected"),
 ) -> None:
-    """Draw a curve of coverage against size.
+    """Draw a curve of coverage, or of failures that are found, against size.
 
     Parameters
     ----------
@@ -306,6 +307,8 @@ def draw_curve(
         What units are: ``clip``.
     title, below : str
         Two sentences above it.
+    words : tuple of str
+        What becomes of the elements, and what is said of the units: ``failures found``, ``in order``.
 
     Raises
     ------
@@ -319,10 +322,10 @@ def draw_curve(
     most, whole = max((row[0] for row in rows), default=1), max(total, 1)
     random = [(0, 0.0), *((row[0], row[3] / whole) for row in rows)]
     chosen = [(0, 0.0), *((row[0], row[1] / whole) for row in rows if row[1] is not None)]
-    with _chart(to, title, below, (f"{unit}s", f"kept, of {total:,}")) as axes:
+    with _chart(to, title, below, (f"{unit}s", f"{words[0]}, of {total:,}")) as axes:
         axes.plot(*zip(*random, strict=True), label=f"{unit}s at random", **AT_RANDOM)
         size, share = chosen[-1]
-        label = f"selected: {size:,} {unit}s"
+        label = f"{words[1]}: {size:,} {unit}s"
         axes.plot(*zip(*chosen, strict=True), label=label, **CHOSEN)
         axes.vlines(size, 0, share, color=EGO, linewidth=1.0)
         axes.set_xlim(0, most)
