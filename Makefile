@@ -27,7 +27,7 @@ help:
 	@echo "make pyg     PyTorch Geometric reads what is exported for it, and a small network learns from it (downloads torch)"
 	@echo "make viewers  Rerun's reader looks at what is exported for it (downloads Rerun)"
 	@echo "make oracle  100,000 random patterns and formulas against exhaustive search, 12,000 pairs of graphs against networkx (hours)"
-	@echo "make cluster  1,000 random questions of collections; S3 and Ray, and faults of both (an hour; installs ray, obstore, moto)"
+	@echo "make cluster  1,000 random questions of collections; S3, Ray, Spark, and faults of all (an hour; installs ray, pyspark, obstore, moto)"
 	@echo "make duckdb-versions  every construct of the language under DuckDB 1.5 and 2.0: equal answers (minutes)"
 	@echo "make patterns  draw the examples of the library, and write its page, again"
 	@echo "make api     write docs/api.md and docs/relations.md from the code again"
@@ -79,7 +79,7 @@ test: $(VENV)/.dev
 # programs below. A file that is not listed is of the core.
 EDGES := coverage coverage_docs derive derive_using like locks selection selection_docs selection_overlapping prioritize \
   draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap export_scenarios export_rerun export_viewers exports exports_docs timeline \
-  assistant notebook carla_live collection collection_landing collection_ray collection_remote importing junit lang_sgl pytest_plugin record sample \
+  assistant notebook carla_live collection collection_landing collection_ray collection_remote collection_spark importing junit lang_sgl pytest_plugin record sample \
   docs_house docs_queries lang_docs packaging views_page \
   fuzz mutants serve report
 tests-of = $(foreach name,$(1),tests/test_$(name).py)
@@ -142,7 +142,7 @@ viewers: $(VENV)/.base
 	build/viewers/bin/python -m pytest tests/test_export_rerun.py tests/test_export_viewers.py
 
 # Files of tests that try more where SGSTORE_LONG is set (tests/thorough.py).
-LONG := collection collection_ray temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \
+LONG := collection collection_ray collection_spark temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \
   lang_after lang_attributes lang_counting lang_match lang_oracle lang_subgraphs doors frozen ingest_data ingest_hardship \
   export_scenarios monitor notebook assistant online parts serve sgg_traces store_transactions tolerance lane_places
 oracle: $(VENV)/.dev
@@ -158,7 +158,7 @@ oracle: $(VENV)/.dev
 	SGSTORE_COVERAGE_RATE=2 $(BIN)/python -m pytest tests/test_coverage.py
 
 $(VENV)/.cluster: $(VENV)/.dev
-	@$(BIN)/python -m pip install -q --disable-pip-version-check --group cluster -e '.[cluster,ray]'
+	@$(BIN)/python -m pip install -q --disable-pip-version-check --group cluster -e '.[cluster,ray,spark]'
 	@touch $@
 
 cluster: $(VENV)/.cluster

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import signal
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -23,3 +25,23 @@ def answer_late(task: dict[str, Any]) -> dict[str, Any]:
     found = answer(task)
     time.sleep(SECONDS / 2)
     return found
+
+
+class Killer(threading.Thread):
+    """Kills whoever has begun the n-th task, some seconds after he did."""
+
+    def __init__(self, folder: Path, number: int, after: float) -> None:
+        super().__init__(daemon=True)
+        self.folder, self.number, self.after = folder, number, after
+        self.killed = 0
+
+    def run(self) -> None:
+        until = time.monotonic() + 60
+        while time.monotonic() < until:
+            marks = sorted(self.folder.iterdir())
+            if len(marks) > self.number:
+                time.sleep(self.after)
+                self.killed = int(marks[self.number].name.partition("-")[2])
+                os.kill(self.killed, signal.SIGKILL)
+                return
+            time.sleep(0.005)

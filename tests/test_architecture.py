@@ -80,6 +80,7 @@ OWNERS = {
     "pydantic": {"assistant"},
     "obstore": {"collection"},
     "ray": {"collection"},
+    "pyspark": {"collection"},
     "starlette": {"serve"},
     "uvicorn": {"serve"},
 }

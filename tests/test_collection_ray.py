@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import threading
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -72,26 +69,6 @@ def test_a_bundle_that_is_refused_is_named(place: Path, tmp_path: Path) -> None:
     assert [*refused.value.bundles] == [bundle.stem]
 
 
-class Killer(threading.Thread):
-    """Kills whoever has begun the n-th task, some seconds after he did."""
-
-    def __init__(self, folder: Path, number: int, after: float) -> None:
-        super().__init__(daemon=True)
-        self.folder, self.number, self.after = folder, number, after
-        self.killed = 0
-
-    def run(self) -> None:
-        until = time.monotonic() + 60
-        while time.monotonic() < until:
-            marks = sorted(self.folder.iterdir())
-            if len(marks) > self.number:
-                time.sleep(self.after)
-                self.killed = int(marks[self.number].name.partition("-")[2])
-                os.kill(self.killed, signal.SIGKILL)
-                return
-            time.sleep(0.005)
-
-
 @pytest.fixture
 def marks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder where tasks that take a while leave their marks."""
@@ -115,7 +92,7 @@ def test_a_worker_that_is_killed_costs_a_repetition(
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(worker, "answer", dying.answer)
         rows = wanted.rows()
-    killer = Killer(marks, number, after)
+    killer = dying.Killer(marks, number, after)
     killer.start()
 
     found = Collection(place, engine="ray").find(QUESTIONS[0]).rows()

@@ -252,7 +252,7 @@ EngineName = Annotated[
     Option(
         "--engine",
         metavar="NAME",
-        help="Of a collection: local:N processes, ray, or ray://HOST:PORT.",
+        help="Of a collection: local:N processes, ray, ray://HOST:PORT, spark, spark:MASTER.",
         rich_help_panel=COLLECTIONS,
     ),
 ]

@@ -1,7 +1,7 @@
 """Engines: who does the tasks of a question. One seam, ``map``; nobody here knows what a task is about.
 
 ``local:N`` does them in N processes of this machine, ``local`` or ``local:1`` in this one. ``ray`` and
-``ray://HOST:PORT`` hand them to Ray.
+``ray://HOST:PORT`` hand them to Ray, ``spark``, ``spark:MASTER`` and ``spark://HOST:PORT`` to Spark.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import sys
 import threading
 from collections import deque
 from contextlib import suppress
+from functools import partial
 from importlib import import_module
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, Protocol, TextIO
@@ -21,10 +22,13 @@ from sgstore.errors import MissingExtraError, SgstoreError, StoreError
 from sgstore.processes import command
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
 RETRIES: Final = 3
 """How often a task is done again whose process or machine was lost."""
+
+TOGETHER: Final = 256
+"""Tasks of a job of Spark, whose outcomes come to the driver together."""
 
 Task = dict[str, Any]
 Outcome = dict[str, Any]
@@ -47,7 +51,7 @@ class Engine(Protocol):
 
 
 def engine_named(name: str) -> Engine:
-    """An engine by its name: ``local``, ``local:4``, ``ray``, ``ray://HOST:PORT``.
+    """An engine by its name: ``local``, ``local:4``, ``ray``, ``ray://HOST:PORT``, ``spark``, ``spark:MASTER``.
 
     Raises
     ------
@@ -65,7 +69,11 @@ def engine_named(name: str) -> Engine:
         return _Here() if count == 1 else _Processes(count)
     if word == "ray":
         return _Ray(name if rest else None)
-    raise StoreError(f"no engine {name!r}; there are: local, local:N, ray, ray://HOST:PORT")
+    if word == "spark":
+        return _Spark(name if rest.startswith("//") else rest)
+    raise StoreError(
+        f"no engine {name!r}; there are: local, local:N, ray, ray://HOST:PORT, spark, spark:MASTER, spark://HOST:PORT"
+    )
 
 
 def refusal(task: Task, error: SgstoreError) -> Outcome:
@@ -195,8 +203,75 @@ class _Ray:
                 try:
                     yield self._ray.get(one)
                 except self._ray.exceptions.RayError as error:
-                    (first, *_) = str(error).strip().splitlines() or [type(error).__name__]
-                    yield {"bundle": task["bundle"], "error": first}
+                    yield {"bundle": task["bundle"], "error": _first_line(error)}
+
+
+class _Spark:
+    """Tasks of Spark, a partition each. One that is lost is done again, by Spark itself.
+
+    Of a job that fails as a whole, nobody knows which task it was: its tasks are then done one by one.
+    """
+
+    shares_files = False
+
+    def __init__(self, master: str) -> None:
+        try:
+            sql: Any = import_module("pyspark.sql")
+            import_module("pyarrow")
+        except ImportError as error:
+            raise MissingExtraError("the engine spark", "spark") from error
+        os.environ.setdefault("PYSPARK_PYTHON", sys.executable)
+        session = None if master else sql.SparkSession.getActiveSession()
+        try:
+            self._spark: Any = session or _session(sql, master)
+        except Exception as error:
+            raise StoreError(f"Spark does not start: {_first_line(error)}") from error
+
+    def map(self, function: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[Outcome]:
+        name = f"{function.__module__}:{function.__qualname__}"
+        for first in range(0, len(tasks), TOGETHER):
+            some = tasks[first : first + TOGETHER]
+            try:
+                found = self._done(name, some)
+            except Exception:  # noqa: BLE001  errors of Java have no common type
+                found = [outcome for task in some for outcome in self._alone(name, task)]
+            yield from found
+
+    def _alone(self, name: str, task: Task) -> list[Outcome]:
+        try:
+            return self._done(name, [task])
+        except Exception as error:  # noqa: BLE001  as above
+            return [{"bundle": task["bundle"], "error": _first_line(error)}]
+
+    def _done(self, name: str, tasks: Sequence[Task]) -> list[Outcome]:
+        rows = [(json.dumps(task),) for task in tasks]
+        parts = self._spark.sparkContext.parallelize(rows, len(rows))
+        frame = self._spark.createDataFrame(parts, "task string")
+        done = frame.mapInArrow(partial(_batches_done, name), "outcome string").collect()
+        return [json.loads(row["outcome"]) for row in done]
+
+
+def _session(sql: Any, master: str) -> Any:
+    """A session of Spark: on a master, or on all cores of this machine; lost tasks are done again."""
+    build = sql.SparkSession.builder.appName("sgstore").master(master or f"local[*,{RETRIES + 1}]")
+    build = build.config("spark.task.maxFailures", RETRIES + 1).config("spark.ui.enabled", "false")
+    session = build.getOrCreate()
+    session.sparkContext.setLogLevel("OFF")
+    return session
+
+
+def _batches_done(name: str, batches: Iterable[Any]) -> Iterator[Any]:
+    """Do the tasks in batches of Arrow; a batch of outcomes for each."""
+    arrow: Any = import_module("pyarrow")
+    for batch in batches:
+        tasks = (json.loads(value) for value in batch.column(0).to_pylist())
+        done = [json.dumps(_done(name, task)) for task in tasks]
+        yield arrow.RecordBatch.from_pydict({"outcome": done})
+
+
+def _first_line(error: BaseException) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[0][:300] if lines else type(error).__name__
 
 
 # A process that does tasks for another -----------------------------------------------------------

@@ -62,7 +62,7 @@ def open(  # noqa: PLR0913  those of a store, and those of a collection
     create, memory, tables, max_spill, root
         As :class:`sgstore.Store` takes them; of a collection ``tables`` only.
     engine : str
-        Who asks the stores of a collection: ``local``, ``local:8``, ``ray``, ``ray://HOST:PORT``.
+        Who asks the stores of a collection: ``local``, ``local:8``, ``ray``, ``ray://HOST:PORT``, ``spark``.
     partial : bool
         Whether an answer of a collection may lack stores that cannot be asked.
 

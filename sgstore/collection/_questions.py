@@ -96,7 +96,8 @@ class Collection:
     url : str or Path
         A folder, or ``s3://bucket/prefix``.
     engine : str
-        Who asks the bundles: ``local`` (this process), ``local:4`` (4 processes), ``ray``, ``ray://HOST:PORT``.
+        Who asks the bundles: ``local`` (this process), ``local:4`` (4 processes), ``ray``, ``ray://HOST:PORT``,
+        ``spark``, ``spark:MASTER`` such as ``spark:local[2,4]``, ``spark://HOST:PORT``.
     tables : mapping of str to path or data frame, optional
         Tables of one's own that are joined to the frames, as :class:`sgstore.Store` takes them.
     partial : bool
