@@ -157,13 +157,12 @@ oracle: $(VENV)/.dev
 	SGSTORE_HURT_GRAPHS=20000 $(BIN)/python -m pytest tests/test_importing.py
 	SGSTORE_COVERAGE_RATE=2 $(BIN)/python -m pytest tests/test_coverage.py
 
-$(VENV)/.cluster: $(VENV)/.dev
-	@$(BIN)/python -m pip install -q --disable-pip-version-check --group cluster -e '.[cluster,ray,spark]'
-	@touch $@
-
-cluster: $(VENV)/.cluster
-	cd tests && ../$(BIN)/python oracle_collection.py 1000
-	SGSTORE_LONG=1 $(BIN)/python -m pytest $(wildcard tests/test_collection*.py)
+# In an environment of its own, because Ray and Spark are large, and bring older packages.
+cluster: $(VENV)/.base
+	@test -x build/cluster/bin/python || $(BIN)/python -m venv build/cluster || $(BIN)/python -m virtualenv -q build/cluster
+	@build/cluster/bin/python -m pip install -q --disable-pip-version-check --group dev --group cluster -e '.[cluster,ray,spark]'
+	cd tests && ../build/cluster/bin/python oracle_collection.py 1000
+	SGSTORE_LONG=1 build/cluster/bin/python -m pytest $(wildcard tests/test_collection*.py)
 
 duckdb-versions: $(VENV)/.dev
 	$(BIN)/python tests/duckdb_versions.py

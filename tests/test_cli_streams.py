@@ -33,7 +33,9 @@ word: so full it is for every verb, closed for these, and for all of them in ``m
 """
 UNHEARD = {*TALKING, *some([*LINES], 11)}
 """Verbs whose reader goes away: the same stream of ours ends all of them; in ``make oracle`` every one."""
-WITHOUT_OUTPUT = {"record", "lock union", "lock intersect", "lock minus", "mcp"}
+WITHOUT_OUTPUT = {
+    *("record", "lock union", "lock intersect", "lock minus", "mcp", "collection unpack"),
+}
 """Verbs that print nothing on stdout here: no simulator runs, locks are files, and no assistant asks."""
 
 
@@ -60,11 +62,13 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     assert run(["select", str(store), "--minimal", "--no-payloads", "-o", str(lock)]) == 0
     second = folder / "second.sgstore"  # a second of the recording
     assert run(["ingest", str(second), str(RECORDING), "--until", "1s"]) == 0
+    fleet = folder / "fleet"
+    assert run(["collection", "pack", str(second), str(fleet)]) == 0
     found = {name: str(folder / file) for name, (file, _) in texts.items()}
     return (
         found
         | {"store": str(store), "recording": str(RECORDING), "lock": str(lock)}
-        | {"second": str(second)}
+        | {"second": str(second), "fleet": str(fleet)}
     )
 
 

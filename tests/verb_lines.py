@@ -70,6 +70,11 @@ LINES: dict[str, list[str]] = {
     "demo": ["{new}.demo"],
     "record": ["{new}.mcap"],
     "mcp": ["{store}"],
+    "collection pack": ["{second}", "{new}.fleet"],
+    "collection commit": ["{fleet}", "--json"],
+    "collection unpack": ["{fleet}", "{new}.sgstore"],
+    "collection verify": ["{fleet}", "--json"],
+    "collection gc": ["{fleet}", "--dry-run", "--json"],
 }
 """What is given to each verb; the names in braces are files."""
 

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from sgstore.collection._place import Place
+    from sgstore.lang import Triple
     from sgstore.store import Facts
 
 ABOUT: Final = "COLLECTION.json"
@@ -216,6 +217,35 @@ class Snapshot:
             mapped=frozenset(kinds["mapped"]),
             sets=subset_catalogs(),
         )
+
+    def triples(
+        self, name: str, relations: Iterable[str]
+    ) -> dict[str, dict[str, frozenset[Triple]]]:
+        """Bundle → relation → its triples, of some relations, in a derived set or as they were ingested."""
+        wanted = frozenset(relations)
+        found: dict[str, dict[str, list[Triple]]] = {}
+        for row in self.facts["triple"]:
+            if row[3] in wanted and row[1] == name:
+                of = found.get(row[0])
+                if of is None:
+                    of = found[row[0]] = {}
+                if row[3] in of:
+                    of[row[3]].append(row[3:6])
+                else:
+                    of[row[3]] = [row[3:6]]
+        return {
+            bundle: {relation: frozenset(triples) for relation, triples in of.items()}
+            for bundle, of in found.items()
+        }
+
+    @cached_property
+    def kinds(self) -> dict[str, tuple[frozenset[str], ...]]:
+        """Bundle → its kinds that move, that are fixed, and those of the map."""
+        homes = {home: place for place, home in enumerate(("moving", "fixed", "mapped"))}
+        found = {one["bundle"]: (set[str](), set[str](), set[str]()) for one in self.bundles}
+        for bundle, home, kind in self.facts["kind"]:
+            found[bundle][homes[home]].add(kind)
+        return {bundle: tuple(map(frozenset, some)) for bundle, some in found.items()}
 
     @cached_property
     def _homes(self) -> tuple[str, ...]:

@@ -58,13 +58,13 @@ from sgstore.vocabulary import natural
 from sgstore.world import Clip, tolerance_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 
     import networkx as nx
 
     from sgstore.collection._catalogue import Snapshot
     from sgstore.collection._engines import Engine
-    from sgstore.lang import Catalog, CheckInCatalog, ClassQuestion, Compiled, Pattern
+    from sgstore.lang import Catalog, CheckInCatalog, ClassQuestion, Compiled, Pattern, Triple
     from sgstore.temporal import Verdict
 
 _SHOWN: Final = 8
@@ -348,29 +348,28 @@ class Collection:
         asked = (every if chosen is None else chosen) - left
         homes = {row["bundle"] for row in self.snapshot.traces if row["trace_id"] in asked}
         pruning = Pruning(compiled)
-        name = compiled.catalog.name
-        return [
-            b for b in self.bundles() if b in homes and pruning.may_answer(*self._held(b, name))
-        ]
+        held = self._held(compiled.catalog.name, pruning.relations)
+        return [b for b in self.bundles() if b in homes and pruning.may_answer(*held(b))]
 
-    def _held(self, bundle: str, name: str) -> tuple[Mapping[str, Any], tuple[frozenset[str], ...]]:
-        """The triples of a bundle by relation, and its kinds, under an abstraction."""
-        held = self._memo.get((bundle, name))
-        if held is None:
-            derived = name if name in self.snapshot.sets else ""
-            seen = self.snapshot.contents([bundle], derived)
-            seen = (seen.under(name) if name and not derived else seen) or seen
-            triples: dict[str, set[Any]] = {}
-            for triple in (*seen.edges, *seen.map_edges):
-                triples.setdefault(triple[0], set()).add(triple)
-            kinds = seen.moving, seen.fixed, seen.mapped
-            held = {of: frozenset(some) for of, some in triples.items()}, kinds
-            self._memo[bundle, name] = held
-        return held
+    def _held(
+        self, name: str, relations: Sequence[str]
+    ) -> Callable[[str], tuple[Mapping[str, frozenset[Triple]], Sequence[frozenset[str]]]]:
+        """Tell of a bundle the triples of some relations, by relation, and its kinds, under an abstraction."""
+        snapshot = self.snapshot
+        if name and name not in snapshot.sets:
 
-    @cached_property
-    def _memo(self) -> dict[tuple[str, str], Any]:
-        return {}
+            def narrowed(bundle: str) -> Any:
+                whole = snapshot.contents([bundle])
+                seen = whole.under(name) or whole
+                triples: dict[str, set[Triple]] = {}
+                for triple in (*seen.edges, *seen.map_edges):
+                    triples.setdefault(triple[0], set()).add(triple)
+                kinds = seen.moving, seen.fixed, seen.mapped
+                return {of: frozenset(some) for of, some in triples.items()}, kinds
+
+            return narrowed
+        triples, kinds = snapshot.triples(name, relations), snapshot.kinds
+        return lambda bundle: (triples.get(bundle, {}), kinds[bundle])
 
 
 def _facts_of_table(name: str, told: Mapping[str, Any]) -> TableFacts:

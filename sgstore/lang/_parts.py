@@ -208,13 +208,18 @@ class Pruning:
     ----------
     compiled : Compiled
         Against the whole.
+
+    Attributes
+    ----------
+    relations : list of str
+        Of whose triples it wants to know.
     """
 
     def __init__(self, compiled: Compiled) -> None:
         query = compiled.query
         self._scopes = [step.scope for step in query.steps if not step.absent] or [query.scope]
         self._known: dict[tuple[object, ...], bool] = {}
-        self._relations = sorted(
+        self.relations = sorted(
             {r for scope in self._scopes for e in scope.edges if e.high == 1 for r in e.relations}
         )
 
@@ -231,7 +236,7 @@ class Pruning:
             Kinds that move, that are fixed, and those of the map.
         """
         nothing = frozenset["Triple"]()
-        held = tuple(triples.get(one, nothing) for one in self._relations)
+        held = tuple(triples.get(one, nothing) for one in self.relations)
         key = (held, *kinds)
         if key not in self._known:
             edges = {triple: 1 for some in held for triple in some}
@@ -271,6 +276,7 @@ def class_questions(asked: Query | BoundCheck) -> tuple[ClassQuestion, ...]:
     if isinstance(asked, BoundCheck):
         values = [asked.formula, *(q.where for q in asked.quantifiers if q.where is not None)]
         values += [*asked.scope.where, *([] if asked.reset is None else [asked.reset])]
+        values += [column.value for column in asked.returns]
     else:
         values = [*asked.scope.where, *asked.result.values]
         values += [v for step in asked.steps for v in (*step.scope.where, *step.when)]
