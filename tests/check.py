@@ -38,7 +38,8 @@ TESTS = {
     "files": "outputs folders moved",
     "geometry": "geometry",
     "ingest": "ingest ingest_*",
-    "lang": "lang_* cookbook union second_match sql_patterns needs notes library library_data like tolerance",
+    "lang": "lang_* cookbook textmate tck union second_match sql_patterns needs notes library library_data"
+    " like tolerance",
     "map_files": "cli_map",
     "matches": "query query_recordings api rows",
     "mcap": "mcap_* spool ahead",
