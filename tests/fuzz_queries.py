@@ -284,6 +284,7 @@ class Writer:
             f"prev({a}.speed) {sign} {a}.speed",
             f"delta({a}.speed, 1s) {sign} {value}",
             f"{self.rng.choice(WINDOWS)}({a}.speed, {self.rng.choice(('2s', '5frames'))}) {sign} {value}",
+            f"robustness({a}.speed {sign} {value} OR {b}.x > {a}.x) > -2",
             f"{self.rng.choice(OF_ONE)}({a}.y) {sign} pow({b}.x, {value})",
             f"{self.rng.choice(NEXT)}({a}) {sign} {value}",
         ]

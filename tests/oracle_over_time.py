@@ -60,7 +60,16 @@ def parts_of(expression: Any) -> Iterator[Any]:
 
 
 def is_temporal(expression: Any) -> bool:
-    courses = {"prev", "delta", "run_length", "since_true", "age", "exists_now", *WINDOWS}
+    courses = {
+        "prev",
+        "delta",
+        "run_length",
+        "since_true",
+        "age",
+        "exists_now",
+        "robustness",
+        *WINDOWS,
+    }
     return any(
         isinstance(part, s.Temporal) or (isinstance(part, s.Call) and part.name in courses)
         for part in parts_of(expression)
@@ -269,6 +278,8 @@ class Told:
                 told = [self.value(inner, j, binding) for j in frames]
                 known = [value for value in told if value is not None]
                 return WINDOWS[name](known) if known else None
+            case s.Call(name="robustness", arguments=(inner,)):
+                return self.margin(inner, i, binding)
             case s.Call(name="run_length", arguments=(inner,)):
                 run = self.run_up_to(inner, i, binding)
                 return (self.times[i] - self.times[run[0]]) / 1e9 if run else 0
@@ -584,6 +595,7 @@ COURSES = (
     "max_over(e.speed, 3frames) > e.speed",
     "avg_over(e.speed, 0.2s) >= e.speed",
     "sum_over(e.x, 0.5s) > 3 * sum_over(e.speed, 2frames)",
+    "robustness(e.speed > 1 OR NOT e.x < 99) >= 0.5",
     "CASE WHEN prev(e.speed) < e.speed THEN delta(e.x, 0.2s) WHEN ONCE e.speed > 2 THEN e.x END > 1",
     "CASE WHEN run_length(e.speed > 0.5) >= 2frames THEN prev(e.speed) ELSE 2 END > 1",
 )
@@ -594,7 +606,14 @@ PAIR_COURSES = (
     "prev(dist(e, v)) > dist(e, v)",
     "exists_now(v)",
     "age(v) >= 0.1s",
+    "robustness(dist(e, v) < 6 AND v.speed > 0.5) > -1",
 )
+MARGINS = (
+    "robustness(EVENTUALLY[0s, 0.3s] (dist(e, v) > 6 AND e.speed > 1)) > -2",
+    "robustness(e.speed > 1 SINCE v.speed < 2) < robustness(WEAKNEXT v.speed > 1)",
+    "robustness(ALWAYS[0s, 0.2s] prev(e.speed) > 1) - robustness(HISTORICALLY e.speed < 3) > 0.5",
+)
+"""What a monitor does not know at once."""
 BOUNDS = ("", "", "[0s, 0.3s]", "[0.1s, 1s]", "[1frames, 3frames]", "[0.2s, INF]")
 HOLDS = ("", "", "", " FOR >= 0.1s", " FOR >= 2frames", " FOR < 0.3s", " FOR >= 0.2s INCLUSIVE")
 THEN = (

@@ -12,6 +12,7 @@ import pytest
 from formulas import OnlineFormula, formula_of, prefix_verdicts
 from oracle_over_time import (
     COURSES,
+    MARGINS,
     PAIR_COURSES,
     compare_check,
     compare_condition,
@@ -158,7 +159,7 @@ def test_a_step_is_asked_for_no_more_nodes_than_the_others_leave(store: Store) -
     assert found == []
 
 
-@pytest.mark.parametrize("where", [*COURSES, *PAIR_COURSES])
+@pytest.mark.parametrize("where", [*COURSES, *PAIR_COURSES, *MARGINS])
 def test_each_value_over_time_is_what_its_definition_says(
     asked: tuple[World, Store], where: str
 ) -> None:

@@ -87,6 +87,22 @@ def test_risk_is_the_sum_of_the_ranks_of_the_worst_values(some: ChosenFrames) ->
     assert len(set(total.tolist())) > 10
 
 
+def test_an_expression_is_a_measure_whose_least_value_comes_first(some: ChosenFrames) -> None:
+    rule = "robustness(ALWAYS[0s, 1s] ego.speed < 8)"
+    found = prioritize(some, PrioritySpec(measures=(rule, "ttc")))
+
+    rows = some.store.find(f"MATCH (e:Ego) RETURN frame.id, {rule.replace('ego', 'e')} AS m")
+    margins = dict(map(tuple, rows))
+    assert some.frame_id is not None
+    wanted = [margins[frame] for frame in some.frame_id.tolist()]
+    assert found.worst[0].value.tolist() == wanted
+    alone = prioritize(some, PrioritySpec(measures=(rule,)))
+    assert (np.diff(np.array(wanted)[alone.picked]) >= 0).all()
+    assert alone.reasons()[0].startswith(f"{rule} is ")
+    with pytest.raises(ConfigError, match="expected a number"):
+        prioritize(some, PrioritySpec(measures=("ego.kind",)))
+
+
 def test_the_worst_of_a_clip_is_that_of_its_frames(open_town: Store) -> None:
     first = frames_of(open_town, "MATCH (e:Ego) WHERE frame.seq < 100 RETURN FRAMES")
     beginning = ChosenFrames("town", open_town, first)

@@ -44,7 +44,7 @@ class OrderOptions:
             "--measure",
             "-m",
             metavar="NAME",
-            help="Rank by this measure of criticality; may be repeated.",
+            help="Rank by this measure of criticality, or by an expression, least first; may be repeated.",
             show_default="closing_time, dce_3s",
         ),
     ] = None

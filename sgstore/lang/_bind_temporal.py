@@ -190,6 +190,10 @@ def _of_past(e: s.Call, names: SymbolTable) -> b.Bound:
     return found
 
 
+def _robustness(e: s.Call, names: SymbolTable) -> b.SignalCall:
+    return b.SignalCall("robustness", names.condition(e.arguments[0]))
+
+
 def _age(e: s.Call, names: SymbolTable) -> b.SignalCall:
     return b.SignalCall("age", _node(e, names))
 
@@ -226,6 +230,7 @@ COURSES: Final[dict[str, Callable[[s.Call, SymbolTable], b.Bound]]] = {
     **dict.fromkeys(_WINDOWS, _window),
     "runlength": _run_length,
     "sincetrue": _since_true,
+    "robustness": _robustness,
     "age": _age,
     "existsnow": _exists_now,
     "t": _moment,

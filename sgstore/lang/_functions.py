@@ -35,6 +35,7 @@ _COURSES: Final = (
     "t",
     "age",
     "exists_now",
+    "robustness",
 )
 _TEMPORAL: Final = frozenset(map(normalize_name, _COURSES))
 FUNCTIONS: Final = frozenset(

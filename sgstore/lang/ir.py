@@ -303,9 +303,11 @@ class SignalCall:
     Attributes
     ----------
     word : str
-        ``prev``, ``delta``, one of :data:`WINDOWS`, ``run_length``, ``since_true``, ``age`` or ``exists_now``.
+        ``prev``, ``delta``, one of :data:`WINDOWS`, ``run_length``, ``since_true``, ``age``, ``exists_now`` or
+        ``robustness``.
     operand : Bound
-        A value, a condition (``run_length``, ``since_true``), or a node (``age``, ``exists_now``).
+        A value, a condition (``run_length``, ``since_true``, ``robustness``), or a node (``age``,
+        ``exists_now``).
     by : int
         How far ``delta`` looks back, and how long a window is; ns, or frames.
     frames : bool

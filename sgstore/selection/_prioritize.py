@@ -3,7 +3,9 @@
 The *risk* of a case goes by measures of criticality of the ego and others that move, each the worst value
 in its frames. Measures have different units and scales, so cases are ranked by each of them, and the ranks
 are added up (Borda count): no weight, no threshold. A rank is one more than the number of cases that are more
-critical, as ``rank()`` in SQL. A case of which a measure is not known comes after those of which it is.
+critical, as ``rank()`` in SQL. A case of which a measure is not known comes after those of which it is. An
+expression of the query language is a measure, too, its least value being the worst:
+``robustness(ego.speed < 10)``.
 
 For *diversity* the class of a case is that of its most critical frame in an abstraction. Cases come in rounds:
 one of each class, then a second one of each that has two, and so on. As each case brings one class, no order of
@@ -65,7 +67,7 @@ class PrioritySpec:
     ----------
     by : Priority
     measures : tuple of str
-        Numbers of pairs of which it is known which way is worse.
+        Numbers of pairs of which it is known which way is worse, and expressions, whose least value is worst.
     unit : SelectionUnit
     clip_s : float
         Length of clips; s.
@@ -95,10 +97,13 @@ class PrioritySpec:
         ------
         ConfigError
         """
-        wrong = [name for name in self.measures if name not in RANKED]
+        wrong = [name for name in self.measures if name not in RANKED and name.isidentifier()]
         if wrong or not self.measures:
             said = f"no measure of criticality: {wrong[0]!r}" if wrong else "no measure is given"
-            raise ConfigError(f"{said}; expected some of {', '.join(RANKED)}")
+            known = ", ".join(RANKED)
+            raise ConfigError(
+                f"{said}; expected some of {known}, or an expression such as -ego.speed"
+            )
 
     def as_dict(self, query: str) -> dict[str, Any]:
         """All of it as plain values, as a lock says it."""
@@ -130,7 +135,7 @@ class WorstValues:
     row : (U,) int64
         The first row of the units' frames that has it.
     other : (U,) int64
-        The entity, beside the ego, by its node id.
+        The entity, beside the ego, by its node id; −1: it is of none.
     """
 
     name: str
@@ -140,10 +145,15 @@ class WorstValues:
 
     def ranks(self) -> Floats:
         """(U,): one more than the number of units that are worse; unknown ones are last."""
-        sign = -1.0 if RANKED[self.name].worse == "high" else 1.0
+        sign = _sign(self.name)
         filled = np.where(np.isnan(self.value), np.inf, sign * self.value)
         _, place, many = np.unique(filled, return_inverse=True, return_counts=True)
         return 1 + (np.cumsum(many) - many)[place].astype(np.float64)
+
+
+def _sign(name: str) -> float:
+    """What makes the worst value of a measure the least one: 1, or −1."""
+    return -1.0 if name in RANKED and RANKED[name].worse == "high" else 1.0
 
 
 @dataclass(frozen=True)
@@ -359,7 +369,28 @@ def _classes(units: Units, abstraction: str) -> Ints:
 
 
 def worst_values(units: Units, measures: Sequence[str]) -> tuple[WorstValues, ...]:
-    """The worst value of each measure in each unit, of the ego and any other that moves."""
+    """The worst value of each measure in each unit: of the ego and others that move, or an expression's."""
+    pairs = _worst_of_pairs(units, [name for name in measures if name in RANKED])
+    return tuple(pairs[m] if m in RANKED else _worst_of_expression(units, m) for m in measures)
+
+
+def _worst_of_expression(units: Units, text: str) -> WorstValues:
+    from sgstore.exporters import Labels
+
+    asked = np.flatnonzero(units.asked)
+    labels = Labels.asked(units.chosen.store, {"measure": text}, units.frame_id[asked])
+    found = labels.of(units.frame_id[asked])["measure"]
+    wrong = next((v for v in found if not isinstance(v, int | float | None)), None)
+    if wrong is not None:
+        raise ConfigError(f"the measure {text} is {wrong!r}; expected a number")
+    value = np.array([np.nan if one is None else float(one) for one in found])
+    value = np.where(np.isnan(value), np.inf, value)
+    return _worst_of(units, text, asked, value, np.full(len(asked), -1))
+
+
+def _worst_of_pairs(units: Units, measures: Sequence[str]) -> dict[str, WorstValues]:
+    if not measures:
+        return {}
     columns = ["frame_id"]
     for i, name in enumerate(measures):
         column = RANKED[name].column or name
@@ -381,10 +412,10 @@ def worst_values(units: Units, measures: Sequence[str]) -> tuple[WorstValues, ..
     here = at < len(units.frame_id)
     here[here] = units.frame_id[at[here]] == frame_id[here]
     here[here] &= units.asked[at[here]]
-    return tuple(
-        _worst_of(units, name, at[here], found[f"value{i}"][here], found[f"other{i}"][here])
+    return {
+        name: _worst_of(units, name, at[here], found[f"value{i}"][here], found[f"other{i}"][here])
         for i, name in enumerate(measures)
-    )
+    }
 
 
 def _worst_of(units: Units, name: str, rows: Ints, value: Any, other: Any) -> WorstValues:
@@ -397,8 +428,8 @@ def _worst_of(units: Units, name: str, rows: Ints, value: Any, other: Any) -> Wo
     row = units.begin.copy()
     for unit in np.flatnonzero(units.sizes > 1).tolist():
         row[unit] += int(np.argmin(frames[units.begin[unit] : units.end[unit]]))
-    sign = -1.0 if RANKED[name].worse == "high" else 1.0
-    return WorstValues(name, np.where(np.isinf(least), np.nan, sign * least), row, who[row])
+    unknown = least == np.inf
+    return WorstValues(name, np.where(unknown, np.nan, _sign(name) * least), row, who[row])
 
 
 def _times(units: Units, frame_id: Ints) -> dict[int, float]:
@@ -414,9 +445,11 @@ def _times(units: Units, frame_id: Ints) -> dict[int, float]:
 def _reason(
     worst: WorstValues, unit: int, kind: str | None, times: Mapping[int, float], units: Units
 ) -> str:
+    time = times[int(units.frame_id[worst.row[unit]])]
+    if worst.name not in RANKED:
+        return f"{worst.name} is {worst.value[unit]:.3g} at {time:.1f} s"
     measure = RANKED[worst.name]
     of = "" if measure.unit == "ratio" else f" {measure.unit}"
-    time = times[int(units.frame_id[worst.row[unit]])]
     return (
         f"{worst.name} {worst.value[unit]:.3g}{of} with {kind} {worst.other[unit]} at {time:.1f} s"
     )

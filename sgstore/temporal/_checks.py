@@ -28,6 +28,7 @@ from sgstore.temporal._matches import lacking
 from sgstore.temporal._offline import PlanValues, TraceReader, refuse_many, traces
 from sgstore.temporal._plan import needs_text, plan_of_check, plan_of_returned, plan_text
 from sgstore.temporal._robustness import (
+    MARGIN_CELLS,
     MarginTable,
     Robustness,
     condition_text,
@@ -59,10 +60,6 @@ if TYPE_CHECKING:
 
 
 # Quantifiers: which entities of a trace they are about, and what is true of all, or of some, of them ----
-
-
-MARGIN_CELLS: Final = 16
-"""Times the memory of a truth value that the margins of a formula take, some being held at once."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,6 +28,7 @@ from sgstore.records import dataclass
 from sgstore.store import trace_of
 from sgstore.temporal._formula import Formula, propositions, tolerant
 from sgstore.temporal._plan import Ask, ask_text
+from sgstore.temporal._robustness import MARGIN_CELLS, MarginTable, margin_columns
 from sgstore.temporal._signals import Clock, SignalValues, evaluate_rows
 from sgstore.vocabulary import RELATIONS
 from sgstore.world import longest_step_ns, tolerance_ns
@@ -38,10 +39,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang import Catalog
-    from sgstore.lang.ir import Bound, Query
+    from sgstore.lang.ir import Bound, Query, SignalCall
     from sgstore.store import StoreFile
     from sgstore.temporal._plan import Plan, Test
-    from sgstore.world import Bools, Ints
+    from sgstore.world import Bools, Floats, Ints
 
     Keys = NDArray[np.int64]
 
@@ -259,6 +260,19 @@ class PlanValues(SignalValues):
     def condition(self, expression: Bound, test: Test) -> Bools:
         """(B, F) where a condition within a test is true."""
         return self.formula(test.formulas[expression])
+
+    def margins(self, course: SignalCall, test: Test) -> Floats:
+        """(B, F) the margin by which a condition within a test is true."""
+        rows, size = len(self._bindings), max(self._trace.together // MARGIN_CELLS, 1)
+        if rows > size:
+            parts = (self._bindings[low : low + size] for low in range(0, rows, size))
+            about = self._plan, self._trace, self._variables
+            found = [PlanValues(*about, part).margins(course, test) for part in parts]
+            return np.concatenate(found)
+        formula, tolerance = test.quantities[course.operand], self.clock.tolerance
+        columns = margin_columns(self._plan, formula, self.test, self.proposition, tolerance)
+        value = MarginTable(columns, self.clock.times, tolerance).value(formula)
+        return np.broadcast_to(value, (rows, len(self._trace)))
 
     def signal(self, signal: Ask) -> Column:
         """The values of a signal: (B, F)."""

@@ -122,6 +122,8 @@ class Test:
         By the part of the expression that each is.
     formulas : dict of Bound to Formula
         Of the conditions within ``run_length`` and ``since_true``.
+    quantities : dict of Bound to Formula
+        Of the conditions within ``robustness``, over margins.
     presence : dict of str to str
         Node → the atom that says where it is, for ``age``.
     """
@@ -131,6 +133,7 @@ class Test:
     variables: tuple[str, ...]
     signals: dict[b.Bound, Ask] = field(default_factory=dict[b.Bound, Ask])
     formulas: dict[b.Bound, f.Formula] = field(default_factory=dict[b.Bound, f.Formula])
+    quantities: dict[b.Bound, f.Formula] = field(default_factory=dict[b.Bound, f.Formula])
     presence: dict[str, str] = field(default_factory=dict[str, str])
 
     __test__ = False  # it is no test of pytest's
@@ -315,6 +318,8 @@ class Plan:
         match expression:
             case b.SignalCall(word="run_length" | "since_true", operand=operand):
                 test.formulas[operand] = self.formula(operand)
+            case b.SignalCall(word="robustness", operand=operand):
+                test.quantities[operand] = self.quantity(operand)
             case b.SignalCall(word="age" | "exists_now", operand=operand):
                 node = next(iter(b.nodes_of(operand)))
                 present = self._atom(TRUE, frozenset({node}))

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import reduce
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -45,6 +45,10 @@ if TYPE_CHECKING:
     from sgstore.world import Bools, Floats, Ints
 
     Places = NDArray[np.int32 | np.int64]
+
+
+MARGIN_CELLS: Final = 16
+"""Times the memory of a truth value that the margins of a formula take, some being held at once."""
 
 
 @dataclass(frozen=True, slots=True)

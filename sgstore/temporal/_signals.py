@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     from sgstore.lang import Columns
     from sgstore.temporal._plan import Ask, Test
-    from sgstore.world import Bools, Ints
+    from sgstore.world import Bools, Floats, Ints
 
     Places = NDArray[np.int32 | np.int64]
     Array = NDArray[Any]
@@ -293,13 +293,17 @@ class SignalValues:
         """(B, F) where the atom, or the test, of that name is true."""
         raise NotImplementedError
 
+    def margins(self, course: b.SignalCall, test: Test) -> Floats:
+        """(B, F) the margin by which a condition within a test is true."""
+        raise NotImplementedError
+
     def test(self, test: Test) -> Column:
         """Return the value of a test: (B, F), or of length 1 in an axis in which it is the same everywhere."""
         with np.errstate(all="ignore"):
             found = _evaluator(test)(self)
         return Column(np.atleast_2d(found.values), found.known)
 
-    def course(self, course: b.SignalCall, test: Test) -> Column:
+    def course(self, course: b.SignalCall, test: Test) -> Column:  # noqa: PLR0911 - a case each
         """The value of a :class:`~sgstore.lang.ir.SignalCall`."""
         match course.word:
             case "prev":
@@ -313,6 +317,8 @@ class SignalValues:
                 return self._run_length(self.condition(course.operand, test), frames=course.frames)
             case "since_true":
                 return self._since(self.condition(course.operand, test), frames=course.frames)
+            case "robustness":
+                return Column(self.margins(course, test))
             case word:
                 (node,) = b.nodes_of(course.operand)
                 seen = self.proposition(test.presence[node])

@@ -19,9 +19,27 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 import numpy as np
 
 from sgstore.errors import QueryError
-from sgstore.lang import FUTURE, Binding, Column, ScopeSearch, expression, unnumbered_text
+from sgstore.lang import (
+    FUTURE,
+    Binding,
+    Column,
+    ScopeSearch,
+    expression,
+    unnumbered_text,
+    value_text,
+)
 from sgstore.lang import ir as b
-from sgstore.temporal._formula import Progression, ProgressionFrame, Tick
+from sgstore.temporal._formula import (
+    Next,
+    Previous,
+    Progression,
+    ProgressionFrame,
+    Since,
+    Tick,
+    Until,
+    walk,
+)
+from sgstore.temporal._robustness import MarginTable, margin_columns
 from sgstore.temporal._signals import NS, Clock, SignalValues, wrapped
 from sgstore.temporal._windows import next_window, window_value
 from sgstore.vocabulary import RELATIONS
@@ -32,7 +50,7 @@ if TYPE_CHECKING:
 
     from sgstore.lang import FrameView
     from sgstore.temporal._plan import Ask, Plan, Test
-    from sgstore.world import Bools
+    from sgstore.world import Bools, Floats
 
 
 Partial = tuple["int | None", ...]
@@ -343,6 +361,15 @@ class StreamClock:
         insort(self._sorted, span)
 
 
+def _courses(expression: b.Bound) -> Iterator[b.SignalCall]:
+    """The values over time that an expression is made of; those in their conditions are of other tests."""
+    if isinstance(expression, b.SignalCall):
+        yield expression
+    elif not isinstance(expression, b.Tense):
+        for operand in b.operands_of(expression):
+            yield from _courses(operand)
+
+
 class SignalState:
     """The tests of a plan, frame by frame.
 
@@ -365,14 +392,20 @@ class SignalState:
         self.places: dict[b.Bound, int] = {}
         self.conditions: dict[b.Bound, Progression] = {}
         for test in plan.tests.values():
+            for condition, formula in test.quantities.items():
+                if any(isinstance(part, Next | Previous | Until | Since) for part in walk(formula)):
+                    raise QueryError(
+                        f"robustness({value_text(condition)}) is not of this frame alone",
+                        hint="a monitor has the margins of checks: CHECK ALWAYS … ROBUSTNESS",
+                    )
             for part in b.walk(test.expression):
                 if isinstance(part, b.Tense) and part.word in FUTURE:
                     raise QueryError(
                         f"{part.word} stands where its value must be known at once, and it looks ahead",
                         hint="join conditions by AND, OR, NOT, IMPLIES",
                     )
-                if isinstance(part, b.SignalCall):
-                    self.places.setdefault(part, len(self.places))
+            for course in _courses(test.expression):
+                self.places.setdefault(course, len(self.places))
             for condition, formula in test.formulas.items():
                 self.conditions[condition] = Progression(formula)
         self._frames: deque[tuple[int, int]] = deque()  # times and numbers since the last gap
@@ -501,6 +534,13 @@ class _Now(SignalValues):
             return np.broadcast_to(found, (self._rows, 1))
         return self._atom(name)[:, None]
 
+    def margins(self, course: b.SignalCall, test: Test) -> Floats:
+        """(B, 1) the margin by which a condition on this frame is true."""
+        formula, tolerance = test.quantities[course.operand], self._tick.tolerance
+        columns = margin_columns(self._all.plan, formula, self.test, self.proposition, tolerance)
+        value = MarginTable(columns, np.zeros(1, np.int64)).value(formula)
+        return np.broadcast_to(value, (self._rows, 1))
+
     def condition(self, expression: b.Bound, test: Test) -> Bools:
         """(B, 1) where a condition within a test is true."""
         if expression not in self._flags:
@@ -529,7 +569,7 @@ class _Now(SignalValues):
             self._courses[course] = self._course(course, test)
         return self._courses[course]
 
-    def _course(self, course: b.SignalCall, test: Test) -> Column:
+    def _course(self, course: b.SignalCall, test: Test) -> Column:  # noqa: PLR0911 - a case each
         match course.word:
             case "prev" | "delta" | "min_over" | "max_over" | "avg_over" | "sum_over":
                 column = self.signal(test.signals[course.operand])
@@ -545,6 +585,9 @@ class _Now(SignalValues):
                 if course.word == "run_length":
                     return self._run_now(course, flags)
                 return self._since_true(course, flags)
+            case "robustness":
+                self._new[course] = [None] * self._rows
+                return Column(self.margins(course, test))
             case word:
                 (node,) = b.nodes_of(course.operand)
                 seen = self.proposition(test.presence[node])[:, 0].tolist()
