@@ -142,7 +142,7 @@ viewers: $(VENV)/.base
 	build/viewers/bin/python -m pytest tests/test_export_rerun.py tests/test_export_viewers.py
 
 # Files of tests that try more where SGSTORE_LONG is set (tests/thorough.py).
-LONG := collection collection_ray collection_spark temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \
+LONG := collection collection_landing collection_ray collection_spark temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \
   lang_after lang_attributes lang_counting lang_match lang_oracle lang_subgraphs doors frozen ingest_data ingest_hardship \
   export_scenarios monitor notebook assistant online parts serve sgg_traces store_transactions tolerance lane_places
 oracle: $(VENV)/.dev

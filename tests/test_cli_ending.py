@@ -38,7 +38,7 @@ NOT_ASKING = {
     *("doctor", "map", "monitor", "record", "demo", "mcp"),
     *("config", "translate", "patterns list", "patterns search", "patterns show", "payload"),
     *("lock list", "lock union", "lock intersect", "lock minus"),
-    *(f"collection {verb}" for verb in ("pack", "commit", "unpack", "verify", "gc")),
+    *(f"collection {verb}" for verb in ("pack", "commit", "unpack", "verify", "rebuild", "gc")),
 }
 """Verbs that write stores or tell of them, that read recordings, and that need no store at all.
 

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import shutil
+import subprocess
+import sys
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from opendrive_maps import a_map, a_road, lane, line, section
 from recordings import Recorder, car
+from thorough import LONG
 
 from sgstore.cli import run as run_verb
-from sgstore.collection import Collection, commit, gc, land, verify
+from sgstore.collection import Collection, commit, gc, land, rebuild, verify
+from sgstore.collection import _catalogue as catalogue
 from sgstore.collection import _landing as landing
+from sgstore.collection import _place as places
 from sgstore.errors import StoreError
 from sgstore.ingest import ingest
 from sgstore.query import Store
@@ -98,6 +104,31 @@ def test_shares_that_were_stopped_and_begun_again_are_the_whole(
     assert one.find(COUNTED).rows() == other.find(COUNTED).rows() != []
 
 
+@pytest.mark.skipif(not LONG, reason="four shares are begun three times each: make cluster")
+@pytest.mark.parametrize("seed", range(3))
+def test_shares_that_are_killed_twice_and_begun_again_are_the_whole(
+    drives: list[Path], unsharded: Path, tmp_path: Path, seed: int
+) -> None:
+    rng, place = random.Random(seed), tmp_path / "c"
+    for share in range(1, 5):
+        words = [sys.executable, "-m", "sgstore", "ingest", str(place), *map(str, drives)]
+        words += ["--shard", f"{share}/4"]
+        for _ in range(2):
+            with subprocess.Popen(words, stdout=subprocess.DEVNULL) as running:
+                with suppress(subprocess.TimeoutExpired):
+                    running.wait(rng.uniform(0.2, 1.5))
+                running.kill()
+        assert subprocess.run(words, stdout=subprocess.DEVNULL, check=False).returncode == 0
+    done = commit(place)
+
+    assert done.refused == []
+    assert segments_of(place) == segments_of(unsharded)
+    assert facts_of(place) == facts_of(unsharded)
+    one, other = Collection(place), Collection(unsharded)
+    assert one.find(COUNTED).rows() == other.find(COUNTED).rows() != []
+    assert verify(place).faults == []
+
+
 def test_each_recording_is_in_one_share(drives: list[Path], tmp_path: Path) -> None:
     found = [
         [outcome.path for outcome in land(tmp_path / "c", drives, shard=(share, 2))]
@@ -172,6 +203,31 @@ def test_a_share_that_is_none_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="shard 3/2"):
         land(tmp_path / "c", [], shard=(3, 2))
     assert run_verb(["ingest", str(tmp_path / "c"), "x.mcap", "--shard", "half"]) == 2
+
+
+def test_bundles_of_another_version_are_made_anew(
+    drives: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = tmp_path / "c"
+    land(place, drives[:2])
+    commit(place)
+    wanted = Collection(place).find(COUNTED).rows()
+    before = catalogue.latest(places.place_at(place))
+    old = [(*row[:4], "0", *row[5:]) for row in before.facts["bundle"]]
+    catalogue.write(places.place_at(place), 2, before.facts | {"bundle": old})
+
+    assert run_verb(["find", str(place), NEAR]) == 1
+    assert "collection rebuild" in capsys.readouterr().err
+    assert [*rebuild(place)] == [row[0] for row in old]
+    assert Collection(place).find(COUNTED).rows() == wanted != []
+    assert verify(place).faults == []
+    assert rebuild(place) == {}
+    drives[0].rename(tmp_path / drives[0].name)
+    with pytest.raises(StoreError, match="gone"):
+        rebuild(place, everything=True)
+    assert len(rebuild(place, everything=True, look_in=[tmp_path])) == 1
+    (tmp_path / drives[0].name).rename(drives[0])
+    assert Collection(place).find(COUNTED).rows() == wanted
 
 
 def test_the_verbs_do_it(

@@ -74,6 +74,7 @@ LINES: dict[str, list[str]] = {
     "collection commit": ["{fleet}", "--json"],
     "collection unpack": ["{fleet}", "{new}.sgstore"],
     "collection verify": ["{fleet}", "--json"],
+    "collection rebuild": ["{fleet}", "--json"],
     "collection gc": ["{fleet}", "--dry-run", "--json"],
 }
 """What is given to each verb; the names in braces are files."""

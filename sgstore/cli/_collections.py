@@ -1,4 +1,4 @@
-"""The verbs of collections: collection commit, pack, unpack, verify, gc."""
+"""The verbs of collections: collection commit, pack, unpack, verify, rebuild, gc."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typer import Argument, Option
 
 from sgstore.cli._options import (
     ERROR,
+    Jobs,
     PrintedRows,
     StorePath,
     Verbs,
     app,
+    jobs_of,
     seconds_of,
 )
 from sgstore.cli._output import count_bar, say
@@ -95,6 +97,40 @@ def verify(url: Place, *, out: PrintedRows) -> int:
     wrong = f"{len(found.faults)} faults" if found.faults else "no fault"
     say(f"{url}: snapshot {found.number}, {found.bundles} bundles, {found.traces} traces: {wrong}")
     return ERROR if found.faults else 0
+
+
+@collection.command()
+def rebuild(
+    url: Place,
+    look_in: Annotated[
+        list[Path] | None,
+        Option(
+            "--look-in",
+            metavar="FOLDER",
+            help="Folder to look in for recordings that were moved; repeatable.",
+        ),
+    ] = None,
+    everything: Annotated[
+        bool, Option("--all", help="Also bundles of this version of the schema.")
+    ] = False,
+    jobs: Jobs = 1,
+    *,
+    out: PrintedRows,
+) -> int:
+    """Make the bundles of another version anew from their recordings, one after another."""
+    from sgstore.collection import rebuild as make_anew
+
+    with count_bar("rebuilding", "bundles") as on_bundle:
+        made = make_anew(
+            url_of(url) or url,
+            look_in=look_in or (),
+            jobs=jobs_of(jobs),
+            everything=everything,
+            on_bundle=on_bundle,
+        )
+    out.write(("bundle", "is now"), made.items())
+    say(f"{url}: {len(made)} bundles made anew")
+    return 0
 
 
 @collection.command()

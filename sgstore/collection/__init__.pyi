@@ -11,6 +11,7 @@ from ._pack import pack as pack
 from ._pack import unpack as unpack
 from ._pack import verify as verify
 from ._questions import Collection as Collection
+from ._remake import rebuild as rebuild
 from ._questions import PartedChecks as PartedChecks
 from ._questions import PartedMatches as PartedMatches
 from ._questions import PartedRows as PartedRows
@@ -32,6 +33,7 @@ __all__ = [
     "land",
     "open",
     "pack",
+    "rebuild",
     "unpack",
     "verify",
 ]

@@ -299,7 +299,7 @@ def refuse_others(place: Place, snapshot: Snapshot) -> None:
         more = f" and {len(odd) - 8} more" if len(odd) > 8 else ""
         raise StoreError(
             f"{place.url}: {len(odd)} of {len(snapshot.bundles)} bundles are of another version than {wanted}:"
-            f" {listed}{more}; 'sgstore rebuild' makes a copy of each anew, to be packed again"
+            f" {listed}{more}; 'sgstore collection rebuild' makes them anew from their recordings"
         )
 
 

@@ -1,0 +1,100 @@
+"""Bundles made anew from their recordings, one after another: ``collection rebuild``."""
+
+from __future__ import annotations
+
+import shutil
+from typing import TYPE_CHECKING
+
+from sgstore.collection import _catalogue as catalogue
+from sgstore.collection._cache import bundle_path
+from sgstore.collection._pack import ATTEMPTS, put_bundle
+from sgstore.collection._place import place_at
+from sgstore.errors import StoreError
+from sgstore.files import working_folder
+from sgstore.rebuild import rebuild as rebuild_store
+from sgstore.store import maps_of_traces, names_of_traces
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from sgstore.collection._place import Place
+    from sgstore.store import Facts
+
+
+def rebuild(
+    url: str | Path,
+    *,
+    look_in: Sequence[str | Path] = (),
+    jobs: int = 1,
+    everything: bool = False,
+    on_bundle: Callable[[int, int], None] | None = None,
+) -> dict[str, str]:
+    """Make the bundles of another version anew from their recordings, each with a snapshot of its own.
+
+    A run that was stopped goes on with the bundles that are left. Names of traces and maps stay.
+
+    Parameters
+    ----------
+    url : str or Path
+        Of the collection.
+    look_in : sequence of str or Path
+        Folders in which to look for recordings that are not where they were.
+    jobs : int
+        Recordings that are read at the same time.
+    everything : bool
+        Whether bundles of this version are made anew, too.
+    on_bundle : function, optional
+        Called after each bundle with how many are done, and how many there are.
+
+    Returns
+    -------
+    dict of str to str
+        Bundle as it was called → as it is called now.
+
+    Raises
+    ------
+    StoreError
+        There is no collection, a recording is gone or has changed, or something cannot be read or written. What
+        was made before stays made.
+    """
+    place = place_at(url)
+    wanted = catalogue.About().schema_version
+    every = catalogue.latest(place).bundles
+    old = [one["bundle"] for one in every if everything or one["schema_version"] != wanted]
+    made: dict[str, str] = {}
+    for number, bundle in enumerate(old, start=1):
+        fresh = _remade(place, bundle, look_in, jobs)
+        if _replaced(place, bundle, fresh):
+            made[bundle] = fresh["bundle"][0][0]
+        if on_bundle is not None:
+            on_bundle(number, len(old))
+    return made
+
+
+def _remade(place: Place, bundle: str, look_in: Sequence[str | Path], jobs: int) -> Facts:
+    """Make a bundle anew, and put it beside the old one; what the catalogue is to say of it."""
+    with working_folder("rebuild") as folder:
+        path = folder / "bundle.sgstore"
+        shutil.copyfile(bundle_path(place, bundle), path)
+        rebuild_store(path, look_in=look_in, jobs=jobs)
+        names = {number: name for number, (name, _, _) in names_of_traces(path).items()}
+        segments = {
+            row["trace_id"]: row["segment"]
+            for row in catalogue.latest(place).traces
+            if row["bundle"] == bundle
+        }
+        maps = maps_of_traces(path, names)
+        return put_bundle(place, path, folder / "fresh.sgstore", names, maps, segments)
+
+
+def _replaced(place: Place, bundle: str, fresh: Facts) -> bool:
+    """Commit a bundle in the place of another one; ``False``: that is not there any more."""
+    for _ in range(ATTEMPTS):
+        before = catalogue.latest(place)
+        if bundle not in {one["bundle"] for one in before.bundles}:
+            return False
+        facts = catalogue.joined([catalogue.without(before.facts, [bundle]), fresh])
+        if catalogue.write(place, before.number + 1, facts):
+            return True
+    raise StoreError(f"{place.url}: others commit without a pause; try again later")
