@@ -515,11 +515,12 @@ def test_what_reaches_beyond_the_store_is_refused(
     secret.write_text("a,b\nhunter2,it\n")
     places = {"{secret}": secret, "{out}": tmp_path / "out", "{folder}": tmp_path / "tables"}
 
-    for probe, _ in PROBES:
+    for number, (probe, _) in enumerate(PROBES):
         for name, place in places.items():
             probe = probe.replace(name, str(place))  # noqa: PLW2901
         # As a statement of SQL, whatever its first word is; as a pattern; and behind one that is allowed.
-        for text in (probe, f"FROM frames LIMIT 1; {probe}", f"WITH x AS (SELECT 1) {probe}"):
+        texts = (probe, f"FROM frames LIMIT 1; {probe}", f"WITH x AS (SELECT 1) {probe}")
+        for text in texts if LONG else (texts[number % 3],):
             answer = page.find(text)[0]
             assert "hunter2" not in json.dumps(answer), text
             assert "error" in answer, text
