@@ -175,6 +175,10 @@ def test_lanes_are_the_parts_of_the_pattern(page: Any, town_store: Path) -> None
     assert [text.lstrip("✓✗? ").strip() for text in texts] == [one.part.text for one in lanes.lanes]
     assert page.locator(".timeline .lane[data-holds=true]").count() == len(lanes.lanes)
     seen(page, "scene")
+    page.get_by_role("button", name="Beside").click()
+    expect(page.locator(".views .above canvas")).to_have_count(2)
+    expect(page.locator(".views .chip")).to_have_text(["town.sgstore", "town.sgstore"])
+    seen(page, "beside")
 
 
 # What a person does, from a search to a test set ----------------------------------------------------------

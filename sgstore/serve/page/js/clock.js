@@ -10,6 +10,8 @@ export const lanes = signal(/** @type {any} */ (null));
 export const why = signal(/** @type {any} */ (null));
 export const camera = signal("");
 export const panel = signal("pattern");
+/** Whether the second store is shown beside the first, by the same clock. */
+export const beside = signal(false);
 /** An attribute over time. */
 export const series = signal(/** @type {any} */ (null));
 

@@ -25,6 +25,9 @@ const thumbs = new Map();
 /** @type {Map<string, any>} */
 const pictures = new Map();
 
+/** What a request calls a trace. @param {import("./state.js").Trace} about */
+const of = (about) => (about.side ? { trace: about.name, side: about.side } : { trace: about.name });
+
 /** What is known of a key; asks for it if nothing is. @param {Map<string, any>} kept @param {string} key @param {() => Promise<any>} ask */
 function known(kept, key, ask) {
   if (!kept.has(key)) {
@@ -42,7 +45,7 @@ export function mapOf(trace) {
   const about = traces.value.get(trace);
   if (!about?.map_key) return null;
   return known(maps, about.map_key, async () => {
-    const { header, columns } = await api.columns(api.address("api/map", { trace }));
+    const { header, columns } = await api.columns(api.address("api/map", of(about)));
     if (!columns.x) return { origin: [0, 0], rings: [], nodes: new Map() };
     const rings = [], nodes = new Map();
     for (let i = 0; i + 1 < columns.start.length; i++) {
@@ -67,7 +70,8 @@ export function mapOf(trace) {
 
 /** What never moves in a trace, and the names of its entities. @param {string} trace */
 export function stillOf(trace) {
-  return known(still, trace, () => api.columns(api.address("api/static", { trace })));
+  const about = traces.value.get(trace);
+  return about ? known(still, trace, () => api.columns(api.address("api/static", of(about)))) : null;
 }
 
 /** A person's name of a node. @param {string} trace @param {number} node */
@@ -83,7 +87,7 @@ export function statesAt(trace, frame) {
   if (!about) return null;
   const found = known(chunks, key, async () => {
     const first = number * CHUNK, last = Math.min(first + CHUNK, about.frames) - 1;
-    return (await api.columns(api.address("api/states", { trace, first, last }))).columns;
+    return (await api.columns(api.address("api/states", { ...of(about), first, last }))).columns;
   });
   if (found) { // the one that was used last is the last to go
     chunks.delete(key);

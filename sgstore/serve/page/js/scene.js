@@ -2,11 +2,11 @@
 // A match, or a frame: camera, view from above, the pattern, lanes of truth, all by one clock.
 import { effect, h, htm, signal, useEffect, useLayoutEffect, useRef, useState } from "../vendor/core.js";
 import * as api from "./api.js";
-import { asked, askWhy, camera, copyLink, frame, holdsAt, lanes, nextMatch, panel, series, showSeries, why } from "./clock.js";
+import { asked, askWhy, beside, camera, copyLink, frame, holdsAt, lanes, nextMatch, panel, series, showSeries, why } from "./clock.js";
 import { arrived, nameOf, pictureAt, statesAt } from "./data.js";
 import { egoRow, fitted, lookAt, nodeAt, paintScene, rowOf } from "./draw.js";
 import { PatternDrawing } from "./pattern.js";
-import { chosen, editing, find, lit, offline, open, openFrame, paints, playing, rate, reasonOf, say, text, traces, writeAddress } from "./state.js";
+import { chosen, editing, find, inOther, lit, offline, open, openFrame, paints, playing, rate, reasonOf, say, store, text, traces, writeAddress } from "./state.js";
 import { Timeline } from "./timeline.js";
 
 const html = htm.bind(h);
@@ -52,14 +52,15 @@ function Camera() {
 
 // View from above ---------------------------------------------------------------------------------------------------
 
-function Above() {
+/** @param {{trace: string}} props */
+function Above({ trace }) {
   const canvas = useRef(/** @type {HTMLCanvasElement | null} */ (null));
   const look = useRef(/** @type {any} */ (null)), drag = useRef(/** @type {any} */ (null));
   const now = open.value, at = frame.value;
   const [, redraw] = useState(0);
-  const states = now ? statesAt(now.trace, at) : null;
+  const states = statesAt(trace, at), about = traces.value.get(trace);
   const seen = useRef(/** @type {any} */ (null));
-  if (states) seen.current = states;
+  if (states || seen.current?.trace !== trace) seen.current = states && { ...states, trace };
   useEffect(() => {
     const watch = new ResizeObserver(() => redraw((/** @type {number} */ n) => n + 1));
     if (canvas.current) watch.observe(canvas.current);
@@ -71,7 +72,7 @@ function Above() {
     const ctx = canvas.current?.getContext("2d");
     if (!canvas.current || !ctx || !now || !seen.current) return;
     const { width, height, ratio } = fitted(canvas.current), nodes = Object.values(now.binding || {});
-    const base = lookAt(now.trace, seen.current, nodes, width, height);
+    const base = lookAt(trace, seen.current, nodes, width, height);
     if (north) base.turn = 0;
     // The scale stays while it plays: it is that of the whole match.
     const kept = look.current?.key === `${now.trace} ${now.match?.index} ${width} ${height}` ? look.current : null;
@@ -80,16 +81,16 @@ function Above() {
     const mine = { ...base, scale: reach * factor, x: base.x - (dx * cos + dy * sin), y: base.y - (-dx * sin + dy * cos) };
     look.current = { ...mine, base: reach, key: `${now.trace} ${now.match?.index} ${width} ${height}` };
     const holds = holdsAt(at), names = new Map(), edges = /** @type {any[]} */ ([]);
-    for (const [key, node] of Object.entries(now.binding || {})) names.set(node, `${key} · ${(node < 0 && now.match?.names[key]) || nameOf(now.trace, node)}`);
-    if (picked !== null && !names.has(picked)) names.set(picked, nameOf(now.trace, picked));
-    (known?.lanes || []).forEach((/** @type {any} */ lane, /** @type {number} */ i) => {
+    for (const [key, node] of Object.entries(now.binding || {})) names.set(node, `${key} · ${(node < 0 && now.match?.names[key]) || nameOf(trace, node)}`);
+    if (picked !== null && !names.has(picked)) names.set(picked, nameOf(trace, picked));
+    (about?.side ? [] : known?.lanes || []).forEach((/** @type {any} */ lane, /** @type {number} */ i) => {
       for (const edge of lane.edges) {
         const src = now.binding?.[edge.src], dst = now.binding?.[edge.dst];
         if (src !== undefined && dst !== undefined) edges.push({ ...edge, src, dst, holds: holds[i] });
       }
     });
-    paintScene(ctx, now.trace, seen.current, mine, ratio, {
-      marked: new Set(nodes), lit: marks, chosen: picked, names, edges, track: picked === null ? undefined : trackOf(now.trace, picked, at),
+    paintScene(ctx, trace, seen.current, mine, ratio, {
+      marked: new Set(nodes), lit: marks, chosen: picked, names, edges, track: picked === null ? undefined : trackOf(trace, picked, at),
     });
   });
   const wheel = (/** @type {WheelEvent} */ e) => {
@@ -125,9 +126,10 @@ function Above() {
       <button class="small" aria-pressed=${north} onClick=${() => { zoom.value = { ...zoom.value, north: !north }; }}>${north ? "north up" : "heading up"}</button>
       <button class="small" aria-label="Nearer" onClick=${() => { zoom.value = { ...zoom.value, factor: factor * 1.4 }; }}>+</button>
       <button class="small" aria-label="Farther" onClick=${() => { zoom.value = { ...zoom.value, factor: factor / 1.4 }; }}>−</button>
+      ${beside.value ? html`<span class="chip">${about?.side ? store.value.other.store : store.value.store}</span>` : null}
       ${factor !== 1 || dx || dy ? html`<button class="small" onClick=${() => { zoom.value = { factor: 1, dx: 0, dy: 0, north }; }}>reset</button>` : null}
     </div>
-    <canvas ref=${canvas} role="img" aria-label="View from above" onPointerDown=${down} onPointerMove=${move} onPointerUp=${up}></canvas>
+    <canvas ref=${canvas} role="img" aria-label=${about?.side ? "View from above, second store" : "View from above"} onPointerDown=${down} onPointerMove=${move} onPointerUp=${up}></canvas>
   </div>`;
 }
 
@@ -216,6 +218,7 @@ function Transport() {
       ${[0.25, 0.5, 1, 2, 4].map((r) => html`<option value=${r}>${r}×</option>`)}</select>
     <span class="time"><b>${now?.trace}</b>#${frame.value} · ${t.toFixed(2)} s</span>
     <span class="grow"></span>
+    ${traces.value.has(inOther(now?.trace || "")) ? html`<button aria-pressed=${beside.value} title="the second store by the same clock" onClick=${() => { beside.value = !beside.value; }}>Beside</button>` : null}
     ${offline.value ? null : html`<button title="why does this frame match, or not (w)" aria-expanded=${told ? "true" : "false"} onClick=${() => { if (told) why.value = null; else askWhy(); }}>Why?</button>
     <button title="copy a link (y)" onClick=${copyLink}>Link</button>`}
     <button aria-label="Close" title="close (Esc)" onClick=${() => { playing.value = false; open.value = null; writeAddress(); }}>✕</button>
@@ -226,6 +229,7 @@ function Transport() {
 }
 
 export function Scene() {
-  const seen = traces.value.get(open.value?.trace || "")?.cameras.length;
-  return html`<section class=${seen ? "scene" : "scene blind"} aria-label="Scene">${seen ? html`<${Camera} />` : null}<${Above} /><${Details} /><${Timeline} /><${Transport} /></section>`;
+  const trace = open.value?.trace || "", seen = traces.value.get(trace)?.cameras.length, other = inOther(trace);
+  const both = beside.value && traces.value.has(other);
+  return html`<section class=${seen ? "scene" : "scene blind"} aria-label="Scene">${seen ? html`<${Camera} />` : null}<div class=${both ? "views both" : "views"}><${Above} key=${trace} trace=${trace} />${both ? html`<${Above} key=${other} trace=${other} />` : null}</div><${Details} /><${Timeline} /><${Transport} /></section>`;
 }

@@ -2,8 +2,9 @@
 // Views beside the search: the library before anything is asked, coverage, the selection, two stores compared.
 import { h, htm, signal, useEffect, useState } from "../vendor/core.js";
 import * as api from "./api.js";
+import { beside } from "./clock.js";
 import { setQuery } from "./editor.js";
-import { answer, find, keyOf, library, open, openFrame, openMatch, reasonOf, say, store, tally, text, tick, ticked, traces, values, view } from "./state.js";
+import { answer, find, keyOf, library, open, openFrame, openMatch, reasonOf, say, store, tally, text, tick, ticked, values, view } from "./state.js";
 
 const html = htm.bind(h);
 
@@ -45,7 +46,7 @@ export async function countLibrary() {
 /** Where a frame is in all traces, one behind the other: 0 to 1000. @param {string} trace @param {number} at */
 function placeOf(trace, at) {
   let before = 0, whole = 0;
-  for (const one of traces.value.values()) {
+  for (const one of store.value.traces) {
     if (one.name === trace) before = whole + at;
     whole += one.frames;
   }
@@ -73,6 +74,7 @@ export function Start() {
 /** A frame by its name: TRACE#SEQ. @param {any} name */
 function go(name) {
   const found = /^(.*)#(\d+)$/.exec(String(name));
+  if (view.value === "compare") beside.value = true;
   if (found) openFrame(found[1] || "", Number(found[2]));
 }
 
@@ -199,7 +201,7 @@ function Comparing({ other }) {
       ${names.map((name) => {
         const a = found[0].get(name) || new Set(), b = found[1].get(name) || new Set();
         const odd = [...a].filter((s) => !b.has(s)), even = [...b].filter((s) => !a.has(s)), first = Math.min(...odd, ...even);
-        return html`<tr><td>${name}</td><td class="number">${a.size}</td><td class="number">${b.size}</td><td class="number">${odd.length}</td><td class="number">${even.length}</td><td>${Number.isFinite(first) ? html`<button class="quiet small" onClick=${() => openFrame(name, first)}>${name}#${first}</button>` : "the same"}</td></tr>`;
+        return html`<tr><td>${name}</td><td class="number">${a.size}</td><td class="number">${b.size}</td><td class="number">${odd.length}</td><td class="number">${even.length}</td><td>${Number.isFinite(first) ? html`<button class="quiet small" onClick=${() => { beside.value = true; openFrame(name, first); }}>${name}#${first}</button>` : "the same"}</td></tr>`;
       })}</tbody></table>` : null}
     <${Waiting} told=${told}>${(/** @type {any} */ d) => html`<h2>Scenes</h2><${Table} table=${d.scenes} /><h2>Frame by frame</h2><${Table} table=${d.frames} />`}</${Waiting}></div>`;
 }

@@ -7,7 +7,7 @@ import * as api from "./api.js";
  * @typedef {{trace: string, first: number, last: number, start: number, end: number,
  *   binding: Record<string, number>, names: Record<string, string>, values: Record<string, any>, index: number}} Match */
 /** @typedef {{name: string, frames: number, seconds: number, period: number, map: string, map_key: string,
- *   origin: [number, number], ego: string, cameras: string[], answers: string[]}} Trace */
+ *   origin: [number, number], ego: string, cameras: string[], answers: string[], side?: string}} Trace */
 
 export const store = signal(/** @type {any} */ (null));
 export const words = signal(/** @type {any} */ (null));
@@ -43,7 +43,13 @@ export const editing = {
 /** Counts changes of colours: what is painted is painted again. */
 export const paints = signal(0);
 
-export const traces = computed(() => new Map(/** @type {Trace[]} */ (store.value?.traces || []).map((t) => [t.name, t])));
+/** How a trace of the second store is called here. @param {string} trace */
+export const inOther = (trace) => `${trace}\n${store.value?.other?.store}`;
+/** Traces of the store by name; those of the second store have `side`. */
+export const traces = computed(() => new Map(/** @type {[string, Trace][]} */ ([
+  ...(store.value?.traces || []).map((/** @type {Trace} */ t) => [t.name, t]),
+  ...(store.value?.other?.traces || []).map((/** @type {Trace} */ t) => [inOther(t.name), { ...t, side: "b" }]),
+])));
 export const matches = computed(() => {
   const { trace, map } = filter.value;
   return /** @type {Match[]} */ (answer.value.matches)
