@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import xml.etree.ElementTree as ET
 from typing import TYPE_CHECKING, Any
 
@@ -62,7 +63,7 @@ def test_a_crosswalk_lies_where_points_of_the_centre_line_are_in_it(data: Path) 
     columns = [c for c, kind in enumerate(road_map.nodes.kind) if KINDS[kind] == "crosswalk"]
     met = 0
     for lane, length in enumerate(road_map.ribbons.lengths.tolist()):
-        along = np.arange(0, length, 0.05)
+        along = np.arange(0, length, 0.02 if LONG else 0.1)
         points = road_map.ribbons.at(np.full(len(along), lane), along)
         for column in columns:
             inside = along[shapely.contains_xy(shapes[column], points.x, points.y)]
@@ -70,9 +71,9 @@ def test_a_crosswalk_lies_where_points_of_the_centre_line_are_in_it(data: Path) 
             if len(inside):
                 met += 1
                 (place,) = told
-                assert place == pytest.approx((inside.min(), inside.max()), abs=0.1)
+                assert place == pytest.approx((inside.min(), inside.max()), abs=0.11)
             else:
-                assert all(end - start < 0.1 for start, end in told)
+                assert all(end - start < 0.11 for start, end in told)
     assert met > 30
 
 
@@ -166,7 +167,7 @@ def test_from_any_place_it_is_as_far_as_dijkstra_finds(data: Path, name: str) ->
         for sort in SORTS
     }
     told = 0
-    for _ in range(2000 if LONG else 60):
+    for _ in range(2000 if LONG else 30):
         lane = int(rng.integers(len(lengths)))
         along = float(rng.uniform(0, lengths[lane]))
         here, at = [(-2 - lane, along, along)], [(lane, along, along)]
@@ -186,7 +187,7 @@ def test_from_any_place_it_is_as_far_as_dijkstra_finds(data: Path, name: str) ->
             expected = nearest if nearest <= FARTHEST else None
             assert reach.next(here, sort) == pytest.approx(expected, abs=1e-9)
             told += expected is not None
-    assert told > 10
+    assert told > 5
 
 
 def columns_of(road_map: RoadMap) -> list[list[Any]]:
@@ -354,3 +355,23 @@ def test_mistakes_are_told(store: Store, text: str, reason: str) -> None:
     with pytest.raises(QueryError) as refused:
         store.find(text)
     assert reason in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "MATCH (v:Car), (w:Car) WHERE lane_dist(v, w) > 0 AND v.length > 1",
+        "MATCH (w:Car), (v:Car) WHERE lane_dist(w, v) > 0 AND v.length > 1",
+        "MATCH (v:Car) WHERE to_junction(v) < 90 AND v.length > 1",
+        "MATCH (v:Car), (t:TrafficLight) WHERE abs(lane_dist(v, t)) < 90 AND v.length > 1",
+        "MATCH (v:Car), (j:Junction) WHERE abs(lane_dist(v, j)) < 90 AND v.length > 1",
+        "MATCH (v:Car)-[:isIn]->(l:Lane) WHERE l.role = 'Ego Lane' AND v.length > 1",
+    ],
+)
+def test_what_a_variable_is_called_changes_nothing(store: Store, text: str) -> None:
+    query = f"{text} RETURN frame.seq AS t, COUNT(*) AS n, SUM(v.id) AS i"
+    rows = store.find(query).rows()
+
+    for name in [*"abcfgmoprs", "ways"] if LONG else "abfrs":
+        assert store.find(re.sub(r"\bv\b", name, query)).rows() == rows
+    assert rows or store.find("MATCH (:Ego) WHERE trace.map <> 'Town07'").count()

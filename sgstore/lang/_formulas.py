@@ -210,8 +210,8 @@ def owner_text(node: str, profile: Profile, trace: str, road_map: str) -> str:
 
 def role_text(frame: str, node: str) -> str:
     """Return the SQL of the role of a lane to the ego in a frame."""
-    on = [f'"r"."frame_id" = {frame}', f'"r"."node_id" = {node}']
-    role = Select(['any_value("r"."role")'], ['"roles" AS "r"'], on)
+    on = [f'":r"."frame_id" = {frame}', f'":r"."node_id" = {node}']
+    role = Select(['any_value(":r"."role")'], ['"roles" AS ":r"'], on)
     return f"({role.text()})"
 
 
@@ -220,13 +220,15 @@ def own_text(attribute: Attribute, frame: str, node: str, edge: Sequence[str] = 
 
     It is one of a node, or of the edge from there whose relation and other end are given.
     """
-    told = 'json_extract_string("o"."value", \'$\')'
+    told = 'json_extract_string(":o"."value", \'$\')'
     value = told if attribute.type is Type.text else f"CAST({told} AS {_NATIVE[attribute.type]})"
-    on = [f'"o"."frame_id" = {frame}', f'"o"."node_id" = {node}']
-    ends = [f'"o"."{name}" = {text}' for name, text in zip(("relation", "dst"), edge, strict=False)]
-    on += ends or ['"o"."relation" IS NULL']
-    on.append(f'"o"."attribute" = {literal(attribute.name)}')
-    rows = Select([f"any_value({value})"], ['"attribute" AS "o"'], on)
+    on = [f'":o"."frame_id" = {frame}', f'":o"."node_id" = {node}']
+    ends = [
+        f'":o"."{name}" = {text}' for name, text in zip(("relation", "dst"), edge, strict=False)
+    ]
+    on += ends or ['":o"."relation" IS NULL']
+    on.append(f'":o"."attribute" = {literal(attribute.name)}')
+    rows = Select([f"any_value({value})"], ['"attribute" AS ":o"'], on)
     return f"({rows.text()})"
 
 

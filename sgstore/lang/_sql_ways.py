@@ -58,7 +58,7 @@ def _between_entities(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog)
     """The distance between two places, which need no stretches."""
     conditions = [
         condition
-        for alias, end in zip("ab", ends, strict=True)
+        for alias, end in zip((":a", ":b"), ends, strict=True)
         for condition in _kinds_of(end, alias, catalog)
     ]
     a, b = (end.node for end in ends)
@@ -67,12 +67,12 @@ def _between_entities(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog)
     return f"""(
     SELECT CASE WHEN {_BEHIND} IS NULL OR {_AHEAD} <= -{_BEHIND} THEN {_AHEAD} ELSE {_BEHIND} END
     FROM (
-      SELECT "r"."start" + (CAST("b"."along" AS DOUBLE) - CAST("a"."along" AS DOUBLE)) AS "way"
-      FROM "lane_state" AS "a", "lane_state" AS "b", "frame" AS "f", "map_reach" AS "r"
-      WHERE "a"."frame_id" = {frame} AND "a"."node_id" = {a} AND "a"."is_own"
-        AND "b"."frame_id" = {frame} AND "b"."node_id" = {b} AND "b"."is_own"
-        AND "f"."frame_id" = {frame} AND "r"."map_id" = "f"."map_id"
-        AND "r"."src" = "a"."lane" AND "r"."dst" = "b"."lane"{more}
+      SELECT ":r"."start" + (CAST(":b"."along" AS DOUBLE) - CAST(":a"."along" AS DOUBLE)) AS "way"
+      FROM "lane_state" AS ":a", "lane_state" AS ":b", "frame" AS ":f", "map_reach" AS ":r"
+      WHERE ":a"."frame_id" = {frame} AND ":a"."node_id" = {a} AND ":a"."is_own"
+        AND ":b"."frame_id" = {frame} AND ":b"."node_id" = {b} AND ":b"."is_own"
+        AND ":f"."frame_id" = {frame} AND ":r"."map_id" = ":f"."map_id"
+        AND ":r"."src" = ":a"."lane" AND ":r"."dst" = ":b"."lane"{more}
     ) AS "ways" WHERE "way" BETWEEN -200 AND 200
   )"""  # noqa: S608  columns that the compiler named
 
@@ -80,15 +80,15 @@ def _between_entities(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog)
 def _between(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog, *, parts: bool) -> str:
     """The distance from the end of one stretch to the start of the other, 0 where they overlap."""
     one, other = (_stretches(frame, end, catalog, parts=parts) for end in ends)
-    near = '"r"."start" + ("b"."first" - "a"."last")'
-    far = '"r"."start" + ("b"."last" - "a"."first")'
+    near = '":r"."start" + (":b"."first" - ":a"."last")'
+    far = '":r"."start" + (":b"."last" - ":a"."first")'
     return f"""(
     SELECT CASE WHEN {_BEHIND} IS NULL OR {_AHEAD} <= -{_BEHIND} THEN {_AHEAD} ELSE {_BEHIND} END
     FROM (
       SELECT CASE WHEN {near} >= 0 THEN {near} WHEN {far} < 0 THEN {far} ELSE 0 END AS "way"
-      FROM ({one}) AS "a", ({other}) AS "b", "frame" AS "f", "map_reach" AS "r"
-      WHERE "f"."frame_id" = {frame} AND "r"."map_id" = "f"."map_id"
-        AND "r"."src" = "a"."lane" AND "r"."dst" = "b"."lane"
+      FROM ({one}) AS ":a", ({other}) AS ":b", "frame" AS ":f", "map_reach" AS ":r"
+      WHERE ":f"."frame_id" = {frame} AND ":r"."map_id" = ":f"."map_id"
+        AND ":r"."src" = ":a"."lane" AND ":r"."dst" = ":b"."lane"
     ) AS "ways" WHERE "way" BETWEEN -200 AND 200
   )"""  # noqa: S608  columns that the compiler named
 
@@ -99,12 +99,12 @@ def _next_text(frame: str, end: WayEnd, what: str, catalog: Catalog) -> str:
     return f"""(
     SELECT min(CASE WHEN "near" < 0 THEN 0 ELSE "near" END)
     FROM (
-      SELECT "r"."start" + ("p"."start" - "a"."last") AS "near",
-        "r"."start" + ("p"."end" - "a"."first") AS "far"
-      FROM ({places}) AS "a", "frame" AS "f", "map_reach" AS "r", "map_place" AS "p"
-      WHERE "f"."frame_id" = {frame} AND "r"."map_id" = "f"."map_id"
-        AND "r"."src" = "a"."lane" AND "r"."start" >= 0
-        AND "p"."map_id" = "f"."map_id" AND "p"."lane" = "r"."dst" AND "p"."what" = {literal(what)}
+      SELECT ":r"."start" + (":p"."start" - ":a"."last") AS "near",
+        ":r"."start" + (":p"."end" - ":a"."first") AS "far"
+      FROM ({places}) AS ":a", "frame" AS ":f", "map_reach" AS ":r", "map_place" AS ":p"
+      WHERE ":f"."frame_id" = {frame} AND ":r"."map_id" = ":f"."map_id"
+        AND ":r"."src" = ":a"."lane" AND ":r"."start" >= 0
+        AND ":p"."map_id" = ":f"."map_id" AND ":p"."lane" = ":r"."dst" AND ":p"."what" = {literal(what)}
     ) AS "ways" WHERE "far" >= 0 AND "near" <= 200
   )"""  # noqa: S608  columns that the compiler named
 
@@ -114,22 +114,22 @@ def _stretches(frame: str, end: WayEnd, catalog: Catalog, *, parts: bool) -> str
     kinds, held = end.kinds.every, catalog.moving | catalog.fixed
     found: list[str] = []
     if kinds & entity_kinds() - _SIGNALS:
-        more = "".join(f" AND {one}" for one in _kinds_of(end, "s", catalog))
-        along = 'CAST("s"."along" AS DOUBLE)'
+        more = "".join(f" AND {one}" for one in _kinds_of(end, ":s", catalog))
+        along = 'CAST(":s"."along" AS DOUBLE)'
         found.append(
-            f'SELECT "s"."lane" AS "lane", {along} AS "first", {along} AS "last" FROM "lane_state" AS "s"'  # noqa: S608
-            f' WHERE "s"."frame_id" = {frame} AND "s"."node_id" = {end.node} AND "s"."is_own"{more}'
+            f'SELECT ":s"."lane" AS "lane", {along} AS "first", {along} AS "last" FROM "lane_state" AS ":s"'  # noqa: S608
+            f' WHERE ":s"."frame_id" = {frame} AND ":s"."node_id" = {end.node} AND ":s"."is_own"{more}'
         )
     if kinds & _SIGNALS & held:
         found.append(_controlled(frame, end.node, kinds & _SIGNALS & held))
     if parts or kinds & _SIGNALS & catalog.mapped:
         signs = ", ".join(map(literal, (*SIGNALS, "stop_line")))
-        more = "" if parts else f' AND "p"."what" IN ({signs})'
+        more = "" if parts else f' AND ":p"."what" IN ({signs})'
         found.append(
-            'SELECT "p"."lane" AS "lane", "p"."start" AS "first", "p"."end" AS "last"'  # noqa: S608
-            ' FROM "frame" AS "g", "map_place" AS "p"'
-            f' WHERE "g"."frame_id" = {frame} AND "p"."map_id" = "g"."map_id"'
-            f' AND "p"."node_id" = {end.node}{more}'
+            'SELECT ":p"."lane" AS "lane", ":p"."start" AS "first", ":p"."end" AS "last"'  # noqa: S608
+            ' FROM "frame" AS ":g", "map_place" AS ":p"'
+            f' WHERE ":g"."frame_id" = {frame} AND ":p"."map_id" = ":g"."map_id"'
+            f' AND ":p"."node_id" = {end.node}{more}'
         )
     nowhere = 'SELECT "lane", "start" AS "first", "end" AS "last" FROM "map_place" WHERE FALSE'
     return "\n        UNION ALL ".join(found or [nowhere])
@@ -137,15 +137,15 @@ def _stretches(frame: str, end: WayEnd, catalog: Catalog, *, parts: bool) -> str
 
 def _controlled(frame: str, node: str, kinds: frozenset[str]) -> str:
     """Places to wait on lanes that a light or a sign controls: as the map says, else at a junction."""
-    at = """coalesce("p"."start", CASE WHEN "m"."junction" IS NOT NULL THEN 0 ELSE "m"."length" END)"""
+    at = """coalesce(":p"."start", CASE WHEN ":m"."junction" IS NOT NULL THEN 0 ELSE ":m"."length" END)"""
     signals = ", ".join(literal(kind) for kind in SIGNALS if kind in kinds)
-    return f"""SELECT "c"."dst" AS "lane", {at} AS "first", {at} AS "last"
-        FROM "edge" AS "c" JOIN "bucket" AS "g" ON "g"."bucket" = "c"."bucket"
-          JOIN "map_node" AS "m" ON "m"."map_id" = "g"."map_id" AND "m"."node_id" = "c"."dst"
-          LEFT JOIN "map_place" AS "p" ON "p"."map_id" = "g"."map_id" AND "p"."lane" = "c"."dst"
-            AND "p"."what" = CAST("c"."src_kind" AS VARCHAR)
-        WHERE "c"."relation" = 'controlsTrafficOf' AND "c"."bucket" = {frame} >> 6 AND "c"."src" = {node}
-          AND "c"."src_kind" IN ({signals}) AND {in_mask('"c"', frame)}"""  # noqa: S608  columns that the compiler named
+    return f"""SELECT ":c"."dst" AS "lane", {at} AS "first", {at} AS "last"
+        FROM "edge" AS ":c" JOIN "bucket" AS ":g" ON ":g"."bucket" = ":c"."bucket"
+          JOIN "map_node" AS ":m" ON ":m"."map_id" = ":g"."map_id" AND ":m"."node_id" = ":c"."dst"
+          LEFT JOIN "map_place" AS ":p" ON ":p"."map_id" = ":g"."map_id" AND ":p"."lane" = ":c"."dst"
+            AND ":p"."what" = CAST(":c"."src_kind" AS VARCHAR)
+        WHERE ":c"."relation" = 'controlsTrafficOf' AND ":c"."bucket" = {frame} >> 6 AND ":c"."src" = {node}
+          AND ":c"."src_kind" IN ({signals}) AND {in_mask('":c"', frame)}"""  # noqa: S608  columns that the compiler named
 
 
 def _kinds_of(end: WayEnd, alias: str, catalog: Catalog) -> list[str]:
