@@ -171,6 +171,35 @@ def test_what_has_no_worse_side_is_no_measure_of_risk(measures: tuple[str, ...])
         PrioritySpec(measures=measures)
 
 
+def test_a_situation_is_that_of_whom_the_ego_could_meet_soonest(some: ChosenFrames) -> None:
+    sql = f"""
+      SELECT frame_id, closing_time, dce_3s, dst, dst_kind, abs(rel_heading), lat_gap, lon
+      FROM criticality WHERE {OTHERS}
+    """
+    soonest: dict[int, Any] = {}
+    for frame, *row in some.store.sql(sql).values:
+        key = [math.inf if value is None else value for value in row[:3]]
+        soonest[frame] = min(soonest.get(frame, (key, row)), (key, row), key=lambda one: one[0])
+    told: dict[int, str] = {}
+    for frame, (_, (*_, kind, turned, aside, along)) in soonest.items():
+        ways = {45: " of the same direction", 135: " that crosses", 181: " that comes towards it"}
+        way = next(words for most, words in ways.items() if turned <= most)
+        place = " in its way" if aside <= 0 else " beside its way"
+        told[frame] = f"{kind}{way}{place}, {'ahead' if along > 0 else 'behind'}"
+
+    found = prioritize(some, PrioritySpec(Priority.both))
+
+    frames = found.units.frame_id.tolist()
+    assert [found.names[code] for code in found.code.tolist()] == [
+        told.get(frame, "nobody") for frame in frames
+    ]
+    assert len(found.names) > 5
+    reasons = dict(zip(found.picked.tolist(), found.reasons(), strict=True))
+    unit = next(u for u in reasons if np.count_nonzero(found.code == found.code[u]) == 1)
+    assert reasons[unit].endswith(f"the only frame with {found.names[found.code[unit]]}")
+    assert "situations" in found.said[0]
+
+
 # How soon failures are found ----------------------------------------------------------------------
 
 

@@ -11,7 +11,6 @@ from typer import Option
 
 from sgstore.cli._coverage import PANEL, NoPayloads, chosen_frames, say_made
 from sgstore.cli._options import (
-    Abstraction,
     Parameters,
     PrintedRows,
     QueryLimits,
@@ -57,7 +56,14 @@ class OrderOptions:
     clip: Annotated[str, Option("--clip", metavar="TIME", help="Longest clip of --unit clip.")] = (
         "2s"
     )
-    abstraction: Abstraction = "RSV"
+    abstraction: Annotated[
+        str,
+        Option(
+            "--abstraction",
+            metavar="NAME",
+            help="Classes that are told apart: situations of the ego, or those of an abstraction.",
+        ),
+    ] = "situation"
     seed: Annotated[int, Option("--seed", min=0, max=(1 << 63) - 1, help="Random seed.")] = 0
 
     def spec(self) -> PrioritySpec:

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import ConfigError
-from sgstore.quoting import literal
-from sgstore.vocabulary import SIGNALS
+from sgstore.selection._situations import OTHERS, frames_in_parts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,10 +26,6 @@ if TYPE_CHECKING:
 
     Singles = NDArray[np.float32]
 
-_FIXED: Final = (*SIGNALS, "building", "pole", "barrier", "vegetation")
-OTHERS: Final = f"src_is_ego AND dst_kind NOT IN ({', '.join(map(literal, _FIXED))})"
-"""Pairs of the ego and those that it could meet: who drives below a traffic light does not meet it."""
-
 NEIGHBOURS: Final = 3
 _NUMBERS: Final = (
     *("gap", "closing_time", "ttc", "dce_3s", "ttce", "wttc"),
@@ -38,8 +33,8 @@ _NUMBERS: Final = (
 )
 _PARTS: Final = 5
 _THREADED: Final = 100_000
-_FRAMES: Final = 1 << 17
-"""Frames whose pairs are looked at together."""
+_TOGETHER: Final = 1 << 17
+"""Cases that are judged together by the plain model."""
 
 
 def boosted() -> bool:
@@ -70,8 +65,7 @@ def features_of(units: Units, rows: Ints) -> Singles:
     frames, place = np.unique(units.frame_id[rows], return_inverse=True)
     told = np.full((len(frames), NEIGHBOURS * wide + 2), np.nan, np.float32)
     told[:, -1] = 0
-    for start in range(0, len(frames), _FRAMES):
-        part = frames[start : start + _FRAMES]
+    for start, part in frames_in_parts(frames):
         found = units.chosen.store.file.arrays(_sql(), [int(part[0]), int(part[-1])])
         at = np.searchsorted(part, found["frame_id"].astype(np.int64))
         here = part[np.minimum(at, len(part) - 1)] == found["frame_id"].astype(np.int64)
@@ -200,7 +194,7 @@ def _logistic(x: Singles, failed: Bools, asked: Singles) -> Floats:
         weights -= step
         if np.abs(step).max() < 1e-9:
             break
-    parts = [asked[start : start + _FRAMES] for start in range(0, len(asked), _FRAMES)]
+    parts = [asked[start : start + _TOGETHER] for start in range(0, len(asked), _TOGETHER)]
     linear = np.concatenate([_ranked(part, columns) @ weights for part in parts])
     return 1 / (1 + np.exp(-np.clip(linear, -30, 30)))
 

@@ -7,7 +7,8 @@ critical, as ``rank()`` in SQL. A case of which a measure is not known comes aft
 expression of the query language is a measure, too, its least value being the worst:
 ``robustness(ego.speed < 10)``.
 
-For *diversity* the class of a case is that of its most critical frame in an abstraction. Cases come in rounds:
+For *diversity* the class of a case is the situation in its most critical frame, or its class in an
+abstraction. Cases come in rounds:
 one of each class, then a second one of each that has two, and so on. As each case brings one class, no order of
 the same cases has more classes in its first k cases, whatever k is.
 """
@@ -25,13 +26,8 @@ from sgstore.errors import ConfigError
 from sgstore.locks import lock_of
 from sgstore.pair_numbers import PAIR_FUNCTIONS
 from sgstore.selection._choose import BudgetTracker, names_of_units
-from sgstore.selection._learn import (
-    OTHERS,
-    cross_fitted,
-    features_of,
-    learned_elsewhere,
-    model_name,
-)
+from sgstore.selection._learn import cross_fitted, features_of, learned_elsewhere, model_name
+from sgstore.selection._situations import OTHERS, SITUATION, situations
 from sgstore.selection._units import Budget, SelectionUnit, units_of
 from sgstore.store import trace_of
 
@@ -74,7 +70,7 @@ class PrioritySpec:
     stride_s : float or None
         From the beginning of one clip to that of the next; ``None``: their length.
     abstraction : str
-        Whose classes are told apart.
+        Whose classes are told apart; ``situation``: whom the ego could meet soonest, from where, and where.
     budget : Budget or None
         What is ordered ends with it.
     seed : int
@@ -86,7 +82,7 @@ class PrioritySpec:
     unit: SelectionUnit = SelectionUnit.frame
     clip_s: float = 2.0
     stride_s: float | None = None
-    abstraction: str = "RSV"
+    abstraction: str = SITUATION
     budget: Budget | None = None
     seed: int = 0
 
@@ -177,6 +173,8 @@ class Prioritized:
         What a person must know of the order.
     chance : (U,) float64
         Probability of failure of each unit, where it was learned.
+    names : list of str
+        Of the classes, where they are situations.
     """
 
     spec: PrioritySpec
@@ -187,6 +185,7 @@ class Prioritized:
     code: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     said: list[str] = field(default_factory=list[str])
     chance: Floats = field(default_factory=lambda: np.zeros(0))
+    names: list[str] = field(default_factory=list[str])
 
     def reasons(self) -> list[str]:
         """Reasons for the place of each unit, in the order of :attr:`picked`."""
@@ -219,7 +218,8 @@ class Prioritized:
             code = int(self.code[unit]) if len(self.code) else UNKNOWN
             if code != UNKNOWN:
                 seen[code] = seen.get(code, 0) + 1
-                parts.append(_of_class(seen[code], int(many[code]), self.units.unit))
+                of = f"with {self.names[code]}" if self.names else "of its class"
+                parts.append(_of_class(seen[code], int(many[code]), self.units.unit, of))
             told.append("; ".join(parts) or "nothing is known of it")
         return told
 
@@ -282,8 +282,12 @@ def prioritize(
         risk = 1 - _places(total, rank) / len(units)
     order = np.lexsort((rank, total))
     code = np.zeros(0, np.int64)
+    names: list[str] = []
     if spec.by in {Priority.diverse, Priority.both}:
-        code = _classes(units, spec.abstraction)[key]
+        if spec.abstraction == SITUATION:
+            code, names = situations(units, key)
+        else:
+            code = _classes(units, spec.abstraction)[key]
         rounds = _in_rounds(order, code)
         order = _together(order, rounds) if spec.by is Priority.both else rounds
     picked = order
@@ -291,7 +295,7 @@ def prioritize(
         tracker = BudgetTracker.of(units, spec.budget.measure, spec.budget.most)
         picked = tracker.fitting(order)
     said = [_said(spec, units, picked, worst, code), *([lesson] if lesson else [])]
-    return Prioritized(spec, units, picked, risk, worst, code, said, chance)
+    return Prioritized(spec, units, picked, risk, worst, code, said, chance, names)
 
 
 def _learned(
@@ -328,7 +332,8 @@ def _said(
         told += f"; of {int(silent.sum()):,} none of these is known)" if silent.any() else ")"
     if len(code):
         many, here = (len(np.unique(some[some != UNKNOWN])) for some in (code, code[picked]))
-        told += f"; {here:,} of {many:,} classes in {spec.abstraction}"
+        kind = "situations" if spec.abstraction == SITUATION else f"classes in {spec.abstraction}"
+        told += f"; {here:,} of {many:,} {kind}"
     return told
 
 
@@ -455,10 +460,8 @@ def _reason(
     )
 
 
-def _of_class(turn: int, many: int, unit: str) -> str:
-    if many == 1:
-        return f"the only {unit} of its class"
-    return f"number {turn} of {many:,} {unit}s of its class"
+def _of_class(turn: int, many: int, unit: str, of: str) -> str:
+    return f"the only {unit} {of}" if many == 1 else f"number {turn} of {many:,} {unit}s {of}"
 
 
 def locked_order(
