@@ -96,7 +96,7 @@ class RerunClip:
     paths : set of str
         Entities that were written.
     losses : list of Loss
-        Channels that Rerun has no form for.
+        Pictures, videos and clouds that are not written.
     """
 
     def __init__(self, rerun: Any, export: Export, frames: ClipFrames) -> None:
@@ -252,14 +252,14 @@ class RerunClip:
             if not self._write_message(frame_id, topic):
                 odd[topic] = odd.get(topic, 0) + 1
         for topic, count in odd.items():
-            reason = f"{topic}: {count} messages are neither pictures nor points that Rerun shows"
+            reason = f"{topic}: {count} pictures or clouds have no form that is written for Rerun"
             self.losses.append(Loss(reason, 0, 0))
 
     def _write_message(self, frame_id: int, topic: str) -> bool:
         channel, schema, data = self._export.store.file.recorded(frame_id, topic)
         told = sensor_of(channel, schema)(data)
-        if told is None:
-            return False
+        if told is None:  # odometry and the like stay in the recording
+            return True
         if told.holds == "picture" and told.form in _KINDS_OF_PICTURES:
             shown = self._rerun.EncodedImage(contents=told.data, media_type=f"image/{told.form}")
             self._log(self._path("camera", topic), shown)
