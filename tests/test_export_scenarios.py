@@ -147,13 +147,14 @@ def frames() -> list[Any]:
 def test_a_scenario_has_everybody_where_the_recording_has_them(
     store: sgstore.Store, frames: list[Any], tmp_path: Path
 ) -> None:
-    """Twelve seconds in which vehicles and people come and leave; at each frame, and between two."""
-    low, high = 440, 560
+    """Seconds in which vehicles and people come and leave; at each frame, and between two."""
+    low, high = 440, (560 if LONG else 480)
     (file, road_map) = write_export(
         Export(store, (Clip("town", low * S // 10, high * S // 10),)), tmp_path / "out", "xosc"
     )
     found, _, end = played(file.file)
     tracks = tracks_of(frames)
+    z = {o.id.value: o.base.position.z for f in frames[low : high + 1] for o in f.moving_object}
     compared, absent = 0, 0
 
     assert file.losses == ()
@@ -174,8 +175,8 @@ def test_a_scenario_has_everybody_where_the_recording_has_them(
             expected = [track.x[rows].mean(), track.y[rows].mean(), z[track.ident]]
             assert np.abs(middle - expected).max() < 0.01, (one.properties, step)
             compared += 1
-    assert compared > 3000
-    assert absent > 500
+    assert compared > 900
+    assert absent > 100
     assert (
         road_map.file.read_text()
         == decoded(SAMPLE)[1]["ground_truth_map"][0].open_drive_xml_content
@@ -222,7 +223,7 @@ def test_lights_show_what_they_showed(
 
 
 def test_matches_of_the_library_are_valid_scenarios(store: sgstore.Store, tmp_path: Path) -> None:
-    wanted, clips = (20 if LONG else 2), []
+    wanted, clips = (20 if LONG else 1), []
     for pattern in patterns().values():
         if pattern.kind == "scenario" and len(clips) < wanted:
             clips += list(store.find(pattern.written()).clips(1, 1))[:1]
