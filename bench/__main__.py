@@ -15,6 +15,7 @@ TITLES = {
     "roads": "Road maps: reading, and asking which lanes footprints touch",
     "store": "The store: size, and columns beside rows",
     "sharing": "A store that stays open: small questions, and writers beside readers",
+    "cluster": "A collection of stores, beside one store",
     "patterns": "Patterns over a million frames",
     "real": "Real traffic: replicas of recordings of simulators",
     "temporal": "Time: formulas over columns, and frame by frame",

@@ -10,6 +10,7 @@ and :mod:`oracle_over_time`.
 from __future__ import annotations
 
 import math
+import random
 import sys
 import tempfile
 from collections import Counter
@@ -27,6 +28,8 @@ from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
+
+    import duckdb
 
 TRACES = 20
 BUNDLES = (1, 3, 20)
@@ -188,13 +191,26 @@ def worlds(
     path = folder / f"{seed}.sgstore"
     StoreFile.create(path)
     world = random_world(seed, traces=TRACES, frames=6 + seed % 5, maps=1 + seed % 2, path=path)
-    world.connection.close()
+    renamed(world.connection, seed)
     for number in bundles:
         size = -(-TRACES // number)
         done = pack(path, folder / f"{seed}-{number}", bundle_traces=size)
         assert len(done.bundles) == number
     places = [folder / f"{seed}-{number}" for number in bundles]
     return Store(path), [Collection(place, engine=engine) for place in places]
+
+
+def renamed(connection: duckdb.DuckDBPyConnection, seed: int) -> None:
+    """Give the traces of a store one another's names, and close it: as a rule ids are in another order."""
+    ids = [
+        number for (number,) in connection.execute("SELECT trace_id FROM inside.trace").fetchall()
+    ]
+    names = [f"trace{number}" for number in range(1, len(ids) + 1)]
+    random.Random(seed).shuffle(names)
+    rows = [list(row) for row in zip([f"{name}!" for name in names], ids, strict=True)]
+    connection.executemany("UPDATE inside.trace SET name = $1 WHERE trace_id = $2", rows)
+    connection.execute("UPDATE inside.trace SET name = rtrim(name, '!')")
+    connection.close()
 
 
 def texts(seed: int) -> Iterator[str]:

@@ -11,7 +11,7 @@ from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any, get_args
 
 import pytest
-from oracle_collection import compare, texts, worlds
+from oracle_collection import compare, renamed, texts, worlds
 from oracle_worlds import random_world
 from thorough import LONG, some
 
@@ -124,7 +124,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("one") / "one.sgstore"
     StoreFile.create(path)
     world = random_world(5, traces=TRACES, frames=50, maps=2, path=path)
-    world.connection.close()
+    renamed(world.connection, 5)
     return path
 
 
@@ -438,7 +438,9 @@ def test_two_traces_with_one_id_are_refused_by_name(path: Path, tmp_path: Path) 
     other = tmp_path / "other.sgstore"
     shutil.copy(path, other)
     with duckdb.connect(str(other)) as connection:
-        connection.execute("UPDATE inside.recording SET digest = 'another' WHERE digest = 't2'")
+        recording = "(SELECT recording_id FROM inside.trace WHERE name = 'trace2')"
+        sql = f"UPDATE inside.recording SET digest = 'another' WHERE recording_id = {recording}"
+        connection.execute(sql)
         connection.execute("UPDATE inside.trace SET name = 'stranger' WHERE name = 'trace2'")
     pack(path, tmp_path / "c")
 

@@ -137,7 +137,7 @@ def _several(query: Query, catalog: Catalog) -> bool:
 # two (``bucket.joined``). Frames of a mask that do not go on are the first of a run; those with which none goes
 # on are the last. So runs are found a bucket at a time, and only their ends are looked at as frames.
 
-FIRST, OWNER_KEY, TOP_OWNER = ":first", ":owner", ":top owner"
+FIRST, OWNER_KEY, TOP_OWNER = ":first frame", ":owner", ":top owner"
 """Columns of intervals that are keyed: the id of the first frame, and whose the nodes are of which samples,
 or the first ones, are taken."""
 

@@ -1,0 +1,121 @@
+"""Questions to a collection, beside the same questions to one store: processor time, bytes, opened bundles.
+
+::
+
+    python -m bench cluster [--quick]
+
+Replicas of the shared recordings, 1,000 traces in one compacted store (``--quick``: 60, where what a bundle
+takes anyway weighs more), packed into bundles of a quarter and of a tenth of them. 12 patterns, 2 sequences,
+3 checks; processor time, of which a loaded machine changes the ratios least.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING
+
+from bench.measure import Measure
+from bench.replicas import given, replicate, sources
+from sgstore.collection import Collection, pack
+from sgstore.query import Store
+from sgstore.store import StoreFile
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+PATTERNS = (
+    "MATCH (e:Ego)-[:near_coll]->(v:Vehicle) RETURN INTERVALS, v",
+    "MATCH (e:Ego)-[:near]->(v:Vehicle) WHERE e.speed > 5 RETURN trace.name, COUNT(*) AS n",
+    "MATCH (e:Ego)-[:near]->(v:Vehicle) RETURN v.kind AS kind, COUNT(*) AS n, AVG(v.speed) AS mean",
+    "MATCH (e:Ego), (v:Vehicle) WHERE dist(e, v) < 5 RETURN COUNT(*)",
+    "MATCH (e:Ego)-[:isIn]->(l:Lane)<-[:isIn]-(v:Vehicle) RETURN INTERVALS, v",
+    "MATCH (e:Ego)-[:near]->(v:Vehicle)-[:near]->(w:Vehicle) RETURN COUNT(DISTINCT w)",
+    "MATCH (v:Vehicle) RETURN v, v.speed ORDER BY v.speed DESC LIMIT 20",
+    "MATCH (e:Ego) WHERE e.accel < -3 RETURN CLIPS(-1s, +1s)",
+    "MATCH (e:Ego)-[:near]->(p:Person) RETURN FRAMES",
+    "MATCH (e:Ego) WHERE NOT EXISTS {(e)-[:near]->(:Vehicle)} RETURN INTERVALS",
+    "MATCH (v:Truck)-[:near]-(w:Car) RETURN INTERVALS, v, w",
+    "MATCH (e:Ego)-[:near]->(v:Vehicle) RETURN DISTINCT v.kind",
+)
+SEQUENCES = (
+    "MATCH (e:Ego)-[:near]->(v:Vehicle) THEN WITHIN 2s MATCH (e)-[:near_coll]->(v) RETURN INTERVALS, v",
+    "MATCH (e:Ego) WHERE e.speed > 5 FOR >= 1s THEN WITHIN 3s MATCH (e) WHERE e.speed < 1",
+)
+CHECKS = (
+    "CHECK calm: ALWAYS ego.speed < 30",
+    "CHECK stops: ALWAYS (ego.speed > 10 IMPLIES EVENTUALLY[0s, 20s] ego.speed < 10)",
+    "CHECK apart: FORALL (v:Vehicle) ALWAYS dist(ego, v) > 1",
+)
+NOTHING = "MATCH (e:Ego) WHERE e.speed > 1e6"
+AIMS = {4: 1.25, 10: 1.6}
+"""Bundles → at most so many times the processor time of one store."""
+EMPTY_MS, TASK_MS, BYTES = 25.0, 5.0, 1.10
+
+
+def questions(asked: Store | Collection) -> list[Callable[[], object]]:
+    finds = [partial(lambda text: asked.find(text).rows(), text) for text in PATTERNS + SEQUENCES]
+    return [*finds, *(partial(lambda text: list(asked.check(text)), text) for text in CHECKS)]
+
+
+def seconds(ask: Callable[[], object]) -> float:
+    """Seconds of processor that a question takes."""
+    start = time.process_time()
+    ask()
+    return time.process_time() - start
+
+
+def run(quick: bool) -> Iterator[Measure]:
+    with tempfile.TemporaryDirectory() as name:
+        os.environ["SGSTORE_CACHE"] = str(Path(name) / "cache")
+        yield from measures(Path(name), 60 if quick else 1_000, frames=120 if quick else None)
+
+
+def measures(folder: Path, traces: int, frames: int | None) -> Iterator[Measure]:
+    path = folder / "one.sgstore"
+    made = list(sources(given(), frames=frames))
+    written = replicate(StoreFile.create(path), made, traces)
+    StoreFile(path).compact()
+    yield Measure("one store", written, "frames", f"{traces} traces")
+    with Store(path) as store, store.file.snapshot():
+        for ask in questions(store):  # what is loaded once is loaded for all
+            ask()
+        one = [seconds(ask) for ask in questions(store)]
+    yield Measure("17 questions of one store", sum(one), "s", "processor time; the baseline")
+    for bundles, aim in AIMS.items():
+        place = folder / f"of-{bundles}"
+        pack(path, place, bundle_traces=-(-traces // bundles))
+        whole = Collection(place)
+        list(whole.find(NOTHING))  # each is looked at once whether it is what it was
+        took = [seconds(ask) for ask in questions(whole)]
+        label = f"the same of {bundles} bundles"
+        yield Measure(label, sum(took) / sum(one), "times", f"{sum(took):.3g} s; aim ≤ {aim}")
+        size = sum(one.stat().st_size for one in (place / "bundles").iterdir())
+        ratio = size / path.stat().st_size
+        aim_told = f"aim ≤ {BYTES}" if bundles == 4 else ""
+        yield Measure(f"bytes of {bundles} bundles", ratio, "times", aim_told)
+        nothing = partial(lambda of: list(of.find(NOTHING)), whole)
+        empty = median(seconds(nothing) for _ in range(5)) / bundles
+        yield Measure("a bundle that finds nothing", empty * 1e3, "ms", f"aim ≤ {EMPTY_MS:g}")
+    yield from of_ray(folder / "of-10")
+
+
+def of_ray(place: Path) -> Iterator[Measure]:
+    """What Ray adds to a task, where it is installed."""
+    if find_spec("ray") is None:
+        return
+    times: dict[str, float] = {}
+    for engine in ("local", "ray"):
+        whole = Collection(place, engine=engine)
+        list(whole.find(NOTHING))
+        start = time.perf_counter()
+        for _ in range(3):
+            list(whole.find(NOTHING))
+        times[engine] = (time.perf_counter() - start) / 3 / 10
+    more = (times["ray"] - times["local"] / (os.cpu_count() or 1)) * 1e3
+    yield Measure("a task of Ray, beside one here", more, "ms", f"wall time; aim ≤ {TASK_MS:g}")
