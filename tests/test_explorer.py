@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from sgstore.demo import RECORDING
 from sgstore.ingest import ingest
 from sgstore.query import Store
 from sgstore.serve import inline, report
@@ -46,7 +47,11 @@ def browser() -> Iterator[Any]:
     if program is None:
         pytest.skip("no Chromium: apt-get install chromium, or set SGSTORE_CHROMIUM")
     with sync.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        options = ["--no-sandbox", "--disable-dev-shm-usage"]
+        try:
+            browser = playwright.chromium.launch(executable_path=program, args=options)
+        except sync.Error as error:
+            pytest.skip(f"{program} does not start: {error.message.splitlines()[0]}")
         yield browser
         browser.close()
 
@@ -277,6 +282,29 @@ def keep_what_is_ticked(page: Any, written: Path, name: str) -> None:
     page.get_by_text("1 files in").wait_for()
     assert (written / f"{name}-mine.lock").exists()
     assert list((written / f"{name}-clips").glob("*.mcap"))
+
+
+def test_names_of_recordings_stay_text(
+    visit: Callable[..., Any], served: Callable[[Path], str], tmp_path: Path
+) -> None:
+    name = "<img src=x onerror=alert(1)><script>alert(2)"
+    recording = Path(shutil.copy(RECORDING, tmp_path / f"{name}.mcap"))
+    (outcome,) = ingest(tmp_path / "hostile.sgstore", [recording], rate=2.0)
+    assert outcome.error is None
+    page = visit(served(tmp_path / "hostile.sgstore"))
+    asked = list[str]()
+
+    def on_dialog(dialog: Any) -> None:
+        asked.append(dialog.message)
+        dialog.dismiss()
+
+    page.on("dialog", on_dialog)
+    search(page, NEAR)
+    assert name in page.locator(".group").inner_text()
+    open_first(page)
+    assert name in time_shown(page).inner_text()
+    assert page.locator("img[src=x], body script:not([src])").count() == 0
+    assert asked == []
 
 
 def test_coverage_is_shown_and_a_gap_is_a_query(page: Any) -> None:

@@ -348,6 +348,7 @@ def test_words_and_library(page: Page) -> None:
     words, library = page.get("/api/words").json(), page.get("/api/library").json()
 
     assert "near_coll" in words["relations"]
+    assert {"MATCH", "WHERE", "UNION", "CHECK", "WITHIN", "SUM"} <= {*words["keywords"]}
     assert "m/s" in next(a for a in words["attributes"]["node"] if a["name"] == "speed")["meaning"]
     assert any(one["drawing"] for one in library)
     assert all(page.find(one["text"])[0].keys() for one in library[:2])

@@ -59,6 +59,7 @@ from ._parts import Pruning as Pruning
 from ._parts import class_questions as class_questions
 from ._parts import parted as parted
 from ._parse import joined as joined
+from ._parse import keywords as keywords
 from ._parse import parse as parse
 from ._truth_parts import DrawnEdge as DrawnEdge
 from ._truth_parts import PatternPart as PatternPart
@@ -161,6 +162,7 @@ __all__ = [
     "for_people",
     "ir",
     "joined",
+    "keywords",
     "joined_rows",
     "looked_up",
     "node_of_kind",

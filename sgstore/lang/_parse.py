@@ -126,6 +126,13 @@ def tables() -> Tables:
     return _read_tables(plain)
 
 
+def keywords() -> list[str]:
+    """Words of the language that are written in capitals, in the order of the alphabet."""
+    terminals = tables().terminals.values()
+    written = [one.pattern.pattern if one.pattern else one.literal for one in terminals]
+    return sorted({word for text in written for word in re.findall("[A-Z]{2,}", text)})
+
+
 def made_from(grammar: str) -> dict[str, Any]:
     """The tables of a grammar as plain data, fit for JSON; the same text gives the same tables."""
     from lark import Lark

@@ -2,53 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
-from sgstore.lang import attributes_of, patterns
+from sgstore.lang import attributes_of, keywords, patterns
 from sgstore.pair_numbers import PAIR_FUNCTIONS
 from sgstore.vocabulary import KINDS, RELATIONS, labels
 
 if TYPE_CHECKING:
     from sgstore.lang import Catalog
-
-KEYWORDS: Final = (
-    *(
-        "MATCH",
-        "WHERE",
-        "RETURN",
-        "AND",
-        "OR",
-        "NOT",
-        "IN",
-        "IS NULL",
-        "IS NOT NULL",
-        "EXISTS",
-        "COUNT",
-    ),
-    *(
-        "THEN",
-        "WITHIN",
-        "FOR",
-        "UNTIL",
-        "ALWAYS",
-        "EVENTUALLY",
-        "PREVIOUS",
-        "ONCE",
-        "SINCE",
-        "LIMIT",
-    ),
-    *(
-        "ORDER BY",
-        "DISTINCT",
-        "USING",
-        "CHECK",
-        "FORALL",
-        "FORSOME",
-        "DEFINE PREDICATE",
-        "INTERVALS",
-    ),
-    *("CLIPS", "FRAMES", "SUBGRAPHS", "AVG", "MIN", "MAX", "SUM", "IMPLIES", "NEXT", "WEAK UNTIL"),
-)
 
 
 def words(catalog: Catalog) -> dict[str, Any]:
@@ -81,5 +42,5 @@ def words(catalog: Catalog) -> dict[str, Any]:
         "attributes": attributes,
         "functions": functions,
         "predicates": predicates,
-        "keywords": KEYWORDS,
+        "keywords": keywords(),
     }
