@@ -595,8 +595,6 @@ with sgstore.open(path) as store:
         below = f"criticality WHERE src_is_ego AND {name} <= {most}" if known else "criticality WHERE FALSE"
         found = store.sql(f"SELECT frame_id FROM {below} ORDER BY {name}, frame_id").values
         assert len(found) == known, name
-        least = f"min(ROW({name}, dst)) FILTER (WHERE {name} IS NOT NULL)"
-        store.sql(f"SELECT frame_id, {least} FROM criticality WHERE src_is_ego GROUP BY frame_id LIMIT 1")
     tests = " AND ".join(f"({name}(e, v) < 1e300 OR {name}(e, v) IS NULL)" for name in names)
     print(store.find(f"MATCH (e:Ego), (v:Car) WHERE {tests}").count())
     print(store.find("MATCH (e:Ego), (v:Car)").count())

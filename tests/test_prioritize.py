@@ -249,7 +249,7 @@ LEARNED = Priority.learned
 
 @pytest.fixture(params=["boosted trees", "plain"])
 def model(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Learn with each model; scikit-learn is not there for the plain one."""
+    """Name of each model to learn with; scikit-learn is not there for the plain one."""
     if request.param == "plain":
         monkeypatch.setitem(sys.modules, "sklearn", None)
     else:
@@ -285,10 +285,10 @@ def test_what_is_learned_finds_what_fails(some: ChosenFrames, model: str) -> Non
 
 
 def test_no_case_is_judged_by_a_model_that_knows_its_outcome(
-    some: ChosenFrames, model: str
+    some: ChosenFrames, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert some.frame_id is not None
-    assert model
+    monkeypatch.setitem(sys.modules, "sklearn", None)
     frames = some.frame_id.tolist()
     failed = {*frames[::3]}
     before = prioritize(some, PrioritySpec(LEARNED), named_outcomes(some, failed)).chance
@@ -300,9 +300,11 @@ def test_no_case_is_judged_by_a_model_that_knows_its_outcome(
     assert (after != before).any()
 
 
-def test_what_has_no_outcome_is_judged_by_all_that_have(some: ChosenFrames, model: str) -> None:
+def test_what_has_no_outcome_is_judged_by_all_that_have(
+    some: ChosenFrames, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert some.frame_id is not None
-    assert model
+    monkeypatch.setitem(sys.modules, "sklearn", None)
     half = len(some.frame_id) // 2
     known, asked = (
         ChosenFrames("part", some.store, part)
