@@ -127,7 +127,7 @@ class RerunClip:
             self._out.disconnect()
 
     def _view(self) -> Any:
-        """What the viewer shows first: the scene, and beside it the camera and the graph."""
+        """First view of the viewer: the scene, and beside it the camera and the graph."""
         views: Any = import_module("rerun.blueprint")
         return views.Blueprint(
             views.Horizontal(

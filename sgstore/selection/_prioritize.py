@@ -148,7 +148,7 @@ class WorstValues:
 
 
 def _sign(name: str) -> float:
-    """What makes the worst value of a measure the least one: 1, or −1."""
+    """Sign that makes the worst value of a measure the least one: 1, or −1."""
     return -1.0 if name in RANKED and RANKED[name].worse == "high" else 1.0
 
 

@@ -214,7 +214,7 @@ class StoreFile:
     def asked(
         self, step: Callable[[DuckDBPyConnection], T], given: Iterable[Given] = ()
     ) -> Generator[T]:
-        """What a step of ours makes with the connection, after what is made before."""
+        """Make what a step of ours makes with the connection, after what is made before."""
         with self._answered(lambda at, _: rows.interruptible(at, lambda: step(at)), given) as found:
             yield found
 

@@ -475,7 +475,7 @@ class CheckMonitor:
         self._values.forget((self._pulse.tick.number, *since))
 
     def _values_of(self, key: Partial, span: Span) -> dict[str, Any]:
-        """What is returned of a violation."""
+        """Values that are returned of a violation."""
         binding = dict(zip(self._variables, key, strict=True))
         start, end = (one.seq for one in span)
 
@@ -486,7 +486,7 @@ class CheckMonitor:
         return self._returned.told(part)
 
     def _violation(self, key: Partial, span: Span) -> dict[str, Any]:
-        """What is returned of a violation of a binding, also of one that has ended."""
+        """Values that are returned of a violation of a binding, also of one that has ended."""
         if not self._check.returns or span not in self._known.of(key).over:
             return self._values_of(key, span)
         wider = ((row, span) for row in self._known.lattice.wider(key))

@@ -741,7 +741,7 @@ class _Check:
     def _values_of(
         self, trace: TraceReader, binding: Keys, spans: Sequence[Violation]
     ) -> list[dict[str, Any]]:
-        """What is returned of the violations of a binding."""
+        """Values that are returned of the violations of a binding."""
         if not self._returned.parts:
             return [self._returned.told(lambda _: None) for _ in spans]
         values = PlanValues(self._values, trace, self._variables, binding)
