@@ -1,7 +1,7 @@
 """``editors/sgql.tmLanguage.json``: highlighting for editors that take TextMate grammars.
 
-Words, numbers, texts and durations are those of the terminals of the grammar; functions are those that the
-language knows::
+Words, numbers, texts and durations are those of the terminals of the grammar; a name before a bracket is a
+function::
 
     python tests/textmate_page.py
 """
@@ -13,11 +13,7 @@ import re
 from pathlib import Path
 from typing import Any, Final
 
-from sgstore.lang._functions import FUNCTIONS
 from sgstore.lang._parse import tables
-from sgstore.lang.ir import OF_MATCH
-from sgstore.lang.library import predicates
-from sgstore.pair_numbers import PAIR_FUNCTIONS
 
 PAGE: Final = Path(__file__).parents[1] / "editors" / "sgql.tmLanguage.json"
 _CONSTANTS: Final = {"TRUE", "FALSE", "NULL", "INF"}
@@ -47,10 +43,8 @@ def rule(name: str, match: str) -> dict[str, str]:
 def grammar() -> dict[str, Any]:
     """The grammar as TextMate has it: the first rule that fits takes a piece of text."""
     words, temporal = keywords(), terminal_words("TEMPORAL") | terminal_words("UNTIL_OP")
-    known = {*FUNCTIONS, *OF_MATCH, *PAIR_FUNCTIONS, *(one.name for one in predicates().values())}
     rest = words - _CONSTANTS - _LOGIC - _OF_TIME - temporal
     text = {"match": r"\\.", "name": "constant.character.escape.sgql"}
-    called = "|".join(sorted(known, key=lambda name: (-len(name), name)))
     patterns: list[dict[str, Any]] = [
         {"name": "comment.block.sgql", "begin": r"/\*", "end": r"\*/"},
         rule("comment.line.double-dash", r"--(?!>|\s*\(|\[).*$"),
@@ -67,12 +61,12 @@ def grammar() -> dict[str, Any]:
             },
         },
         rule("variable.other.property", r"(?<=\w\.)[A-Za-z_]\w*"),
-        rule("support.function", rf"(?i)\b(?:{called})(?=\s*\()"),
         rule("keyword.operator.temporal", any_of(temporal)),
         rule("keyword.control.sequence", any_of(_OF_TIME & words)),
         rule("keyword.operator.logical", any_of(_LOGIC & words)),
         rule("constant.language", any_of(_CONSTANTS)),
         rule("keyword.control", any_of(rest)),
+        rule("support.function", r"[A-Za-z_]\w*(?=\()"),
         rule("keyword.operator.arrow", r"<?-\[|\]->?|-->|<--"),
         rule("keyword.operator", r"=>|=~|<>|!=|<=|>=|[<>=+*/%-]"),
     ]
