@@ -176,12 +176,14 @@ def test_other_forms_are_those_of_one_store(store: Store, whole: Collection, tex
     expected, found = store.find(text), whole.find(text)
 
     assert found.count() == expected.count()
-    arrays, others = found.numpy(), expected.numpy()
-    assert [(n, a.tolist()) for n, a in arrays.items()] == [
-        (n, a.tolist()) for n, a in others.items()
-    ]
+    if not ("UNION" in text and "SUBGRAPHS" in text):  # these make no table
+        arrays, others = found.numpy(), expected.numpy()
+        assert {n: a.tolist() for n, a in arrays.items()} == {
+            n: a.tolist() for n, a in others.items()
+        }
     assert list(found.frames()) == list(expected.frames())
     assert list(found.intervals()) == list(expected.intervals())
+    assert list(found.intervals(bound=True)) == list(expected.intervals(bound=True))
     assert list(found.clips(0.5, 1)) == list(expected.clips(0.5, 1))
     assert list(found.limit(2)) == list(expected.limit(2))
     graphs = [(g.graph, sorted(g.nodes), sorted(g.edges)) for g in found.limit(3).subgraphs()]

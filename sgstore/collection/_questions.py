@@ -14,6 +14,7 @@ from copy import copy
 from dataclasses import replace
 from functools import cached_property, partial
 from heapq import merge
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -497,11 +498,12 @@ class PartedMatches(Tabular):
             about = dict(zip(layout.columns, values, strict=False))
             yield graph_of_records(nodes, edges, **about)
 
-    def intervals(self) -> Iterator[Interval]:
+    def intervals(self, *, bound: bool = False) -> Iterator[Interval]:
         """Maximal runs of consecutive frames in which the same holds; see :meth:`sgstore.Matches.intervals`."""
-        width = 8
-        names = parted(self._ready, "intervals").columns[width:]
-        for row in self._answered("intervals"):
+        form, width, result = "bound" if bound else "intervals", 8, self._ready.query.result
+        names = parted(self._ready, form).columns[width:]
+        most = result.limit if result.form == "intervals" else None
+        for row in islice(self._answered(form), most):
             yield Interval(*row[:width], values=dict(zip(names, row[width:], strict=True)))
 
     def clips(self, before: float = 0.0, after: float = 0.0) -> Iterator[Clip]:
@@ -609,6 +611,8 @@ class PartedUnion(UnionMatches):
 
     def numpy(self) -> dict[str, Any]:
         """All columns as arrays, masked where something is NULL."""
+        if self.graphs:
+            raise QueryError("a table has values, and SUBGRAPHS are graphs")
         with self._tables() as asked:
             return merged_arrays(*asked)
 

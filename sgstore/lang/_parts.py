@@ -117,8 +117,8 @@ def parted(compiled: Compiled, form: str = "rows", before: int = 0, after: int =
         Against the whole, or against a part: the questions are the same.
     form : str
         ``rows``: what the query asks for; ``apart``: the same, with columns that tell nodes of several traces
-        apart which have the same number; or, whatever ``RETURN`` says, ``frames``, ``intervals``, ``clips`` or
-        ``subgraphs``.
+        apart which have the same number; or, whatever ``RETURN`` says, ``frames``, ``intervals``, ``bound``
+        (intervals of bindings), ``clips`` or ``subgraphs``.
     before, after : int
         What is added to clips at both ends, unless the query says it; ns.
 
@@ -136,6 +136,8 @@ def parted(compiled: Compiled, form: str = "rows", before: int = 0, after: int =
             query = replace(query, result=with_owners(query.result))
         case "subgraphs":
             query = Layout.of(compiled.bound).query
+        case "bound":
+            query = with_bindings(query)
         case "intervals":
             query = _intervals(query, graphs=compiled.layout is not None)
         case "clips" if query.result.form != "clips":
