@@ -26,6 +26,8 @@ from sgstore.temporal import Monitor
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from sgstore.temporal import MonitorEvent
+
 
 def thinned(recording: Path, folder: Path, every: int) -> Drive:
     """A recording with one of so many of its frames; ``make oracle`` compares all of them."""
@@ -76,6 +78,26 @@ def test_a_recording_watched_meets_checks_by_as_much_as_in_a_store(town: Drive) 
 
 def test_values_over_matches_are_those_that_they_have_in_a_store(town: Drive) -> None:
     assert town.compare_values(VALUES) > 20
+
+
+def test_what_is_kept_of_an_open_match_does_not_grow_with_time() -> None:
+    monitor = Monitor(
+        "MATCH (v:Vehicle) WHERE v.speed > 5 AS a THEN MATCH (v) WHERE v.speed < 1 AS b"
+        " RETURN MIN(v.speed) OVER match AS low, AVG(v.speed) OVER a AS mean, ARGMAX(v.speed) OVER match AS at"
+    )
+    speeds = [*(6 + i % 7 / 8 for i in range(100)), *([2.0] * 100), 0.5]
+    found: list[MonitorEvent] = []
+    for i, speed in enumerate(speeds):
+        found += monitor.step(moving(i / 10, speed))
+        ((_, pattern, _),) = monitor._follows
+        courses = pattern._values._courses.values()
+        kept = [len(folds) for one in courses for _, folds in one._known.held.values()]
+        assert max(kept) <= 8
+
+    (event,) = found
+    assert event.values["low"] == 0.5
+    assert event.values["mean"] == pytest.approx(sum(speeds[:100]) / 100)
+    assert event.values["at"] == 0.6
 
 
 def test_by_how_much_a_check_is_met_so_far_is_known_at_any_time() -> None:

@@ -562,22 +562,32 @@ class SequenceMonitor:
         for key, one in first.items():
             if one.places:
                 one.places = self._kept(key, one.places)
-        oldest = min(
-            (
-                min([one.undecided, *(place.number for place in one.places[:1])])
-                for one in first.values()
-            ),
-            default=NEVER,
-        )
         if self._told:
             runs = min((one.oldest for one in first.values()), default=NEVER)
             self._told = {key: run for key, run in self._told.items() if run >= runs}
-        for held in self._held[1:]:
-            for one in held.values():
+        for number in range(1, len(self._held)):
+            oldest, shared = self._oldest(number)
+            for key, one in self._held[number].items():
+                begun = oldest.get(tuple(key[place] for place in shared), NEVER)
                 while one.places and one.places[0].number <= min(
-                    oldest - 1, self._pulse.tick.number - 2
+                    begun - 1, self._pulse.tick.number - 2
                 ):
                     one.places.pop(0)
+
+    def _oldest(self, number: int) -> tuple[dict[Key, int], list[int]]:
+        """The first frames in which a match may begin, by what the first step and another one both bind.
+
+        Also which columns of the other step these are.
+        """
+        names, columns = self._columns[0], self._columns[number]
+        common = [name for name in columns if name in names]
+        own = [names.index(name) for name in common]
+        found: dict[Key, int] = {}
+        for key, one in self._held[0].items():
+            begun = min([one.undecided, *(place.number for place in one.places[:1])])
+            both = tuple(key[place] for place in own)
+            found[both] = min(begun, found.get(both, NEVER))
+        return found, [columns.index(name) for name in common]
 
     def _kept(self, key: Key, places: list[StepFrame]) -> list[StepFrame]:
         if not self._query.links:
