@@ -35,14 +35,14 @@ if TYPE_CHECKING:
 
 NOT_ASKING = {
     *("ingest", "import", "rebuild", "derive", "remove", "verify", "info"),
-    *("doctor", "map", "monitor", "record", "demo", "mcp"),
+    *("doctor", "map", "monitor", "record", "demo", "mcp", "serve"),
     *("config", "translate", "patterns list", "patterns search", "patterns show", "payload"),
     *("lock list", "lock union", "lock intersect", "lock minus"),
     *(f"collection {verb}" for verb in ("pack", "commit", "unpack", "verify", "rebuild", "gc")),
 }
 """Verbs that write stores or tell of them, that read recordings, and that need no store at all.
 
-``mcp`` bounds each question of an assistant by itself.
+``mcp`` and ``serve`` bound each question by itself.
 """
 ASKING = [verb for verb in LINES if verb not in NOT_ASKING]
 OUTPUTS = {
@@ -50,7 +50,7 @@ OUTPUTS = {
     "prioritize": ["-o", "{new}.lock", "--no-payloads"],
     "timeline": ["-o", "{new}.svg"],
     "coverage growth": ["-o", "{new}.csv", "--picture", "{new}.png"],
-} | {verb: [] for verb in ("why-not", "show", "export")}
+} | {verb: [] for verb in ("why-not", "show", "export", "report")}
 """What verbs write beside what their lines say; the others rows."""
 
 MATCHES = (

@@ -70,6 +70,8 @@ LINES: dict[str, list[str]] = {
     "demo": ["{new}.demo"],
     "record": ["{new}.mcap"],
     "mcp": ["{store}"],
+    "serve": ["{store}", "--host", "192.0.2.1"],  # an address of documents (RFC 5737): nobody's
+    "report": ["{store}", "MATCH (e:Ego) WHERE e.speed > 9", "-o", "{new}.html"],
     "collection pack": ["{second}", "{new}.fleet"],
     "collection commit": ["{fleet}", "--json"],
     "collection unpack": ["{fleet}", "{new}.sgstore"],

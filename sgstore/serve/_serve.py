@@ -61,11 +61,11 @@ def serve(
         from sgstore.serve._app import Explorer, application
     except ImportError as error:
         raise MissingExtraError("the explorer", "ui") from error
-    listening = _listening(host, port)
+    explorer = Explorer(store, other=other, write_to=write_to)
     try:
-        explorer = Explorer(store, other=other, write_to=write_to)
+        listening = _listening(host, port)
     except BaseException:
-        listening.close()
+        explorer.close()
         raise
     number = listening.getsockname()[1]
     token = secrets.token_urlsafe(24)
