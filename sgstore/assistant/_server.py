@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import inspect
+import sys
 from functools import wraps
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
@@ -33,7 +34,15 @@ WRITING: Final = frozenset({"export_clips"})
 
 
 def serve(tools: StoreTools) -> None:
-    """Answer an assistant that speaks over stdin and stdout, until it ends."""
+    """Answer an assistant that speaks over stdin and stdout, until it ends.
+
+    Raises
+    ------
+    SgstoreError
+        If stdin cannot be read.
+    """
+    if sys.stdin is None or not sys.stdin.readable():
+        raise SgstoreError("stdin cannot be read: an assistant speaks there")
     server_of(tools).run(transport="stdio")
 
 
