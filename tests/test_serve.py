@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 import struct
 import time
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ from probes import PROBES
 from thorough import LONG
 
 from sgstore.query import Store
-from sgstore.serve import Explorer, application
+from sgstore.serve import Explorer, application, serve
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -85,6 +86,17 @@ def store(town_store: Path) -> Store:
 
 
 # Who is answered ---------------------------------------------------------------------------------------
+
+
+def test_an_address_that_is_told_can_be_connected_to(town_store: Path) -> None:
+    def told(address: str) -> None:
+        port = httpx.URL(address).port
+        assert port is not None
+        socket.create_connection(("127.0.0.1", port), timeout=5).close()
+        raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        serve(town_store, on_start=told)
 
 
 def test_the_token_in_the_address_becomes_a_cookie(page: Page) -> None:

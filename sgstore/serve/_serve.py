@@ -6,7 +6,7 @@ import secrets
 import socket
 import threading
 import webbrowser
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Final
 
 from sgstore.errors import ConfigError, MissingExtraError, SgstoreError
@@ -61,30 +61,28 @@ def serve(
         from sgstore.serve._app import Explorer, application
     except ImportError as error:
         raise MissingExtraError("the explorer", "ui") from error
-    explorer = Explorer(store, other=other, write_to=write_to)
-    try:
-        listening = _listening(host, port)
-    except BaseException:
-        explorer.close()
-        raise
-    number = listening.getsockname()[1]
-    token = secrets.token_urlsafe(24)
-    names = dict.fromkeys((f"[{host}]" if ":" in host else host, HOST, "localhost"))
-    hosts = tuple(f"{name}:{number}" for name in names)
-    app = application(explorer, token, hosts, f"sgstore-{number}")
-    config = uvicorn.Config(
-        app,
-        log_level="warning",
-        access_log=False,
-        server_header=False,
-        lifespan="on",
-        timeout_graceful_shutdown=1,  # a question under way does not keep the server
-    )
-    threading.Thread(target=_warm, args=(explorer,), daemon=True).start()
-    address = f"http://{hosts[0]}/?token={token}"
-    on_start(address)
-    if browse:
-        webbrowser.open(address)
+    with ExitStack() as unless_begun:
+        explorer = Explorer(store, other=other, write_to=write_to)
+        unless_begun.callback(explorer.close)
+        listening = unless_begun.enter_context(_listening(host, port))
+        number = listening.getsockname()[1]
+        token = secrets.token_urlsafe(24)
+        names = dict.fromkeys((f"[{host}]" if ":" in host else host, HOST, "localhost"))
+        hosts = tuple(f"{name}:{number}" for name in names)
+        config = uvicorn.Config(
+            application(explorer, token, hosts, f"sgstore-{number}"),
+            log_level="warning",
+            access_log=False,
+            server_header=False,
+            lifespan="on",  # at its end the explorer is closed
+            timeout_graceful_shutdown=1,  # a question under way does not keep the server
+        )
+        threading.Thread(target=_warm, args=(explorer,), daemon=True).start()
+        address = f"http://{hosts[0]}/?token={token}"
+        on_start(address)
+        if browse:
+            webbrowser.open(address)
+        unless_begun.pop_all()
     with suppress(KeyboardInterrupt):
         uvicorn.Server(config).run(sockets=[listening])
 
@@ -102,6 +100,7 @@ def _listening(host: str, port: int) -> socket.socket:
     try:
         found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         found.bind((host, port))
+        found.listen()  # who has the address waits in line until the server has begun
     except OSError as error:
         found.close()
         raise ConfigError(f"{host}:{port} cannot be listened on: {error.strerror}") from error
