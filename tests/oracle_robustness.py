@@ -189,7 +189,7 @@ def expressible(formula: Formula) -> bool:
 
 
 def of_rtamt(formula: Formula, word: Numbers) -> list[float]:
-    import rtamt  # of the group of peers
+    import rtamt
 
     spec = rtamt.StlDiscreteTimeOfflineSpecification()
     for name in [*NAMES, "out"]:
@@ -223,8 +223,6 @@ if __name__ == "__main__":
     there = find_spec("rtamt") is not None
     asked = sum(compare_rtamt(rng, rng.randint(1, 4)) for _ in range(count)) if there else 0
     peer = (
-        f"rtamt was asked {asked}"
-        if there
-        else "rtamt is not installed (pip install --group peers)"
+        f"rtamt was asked {asked}" if there else "rtamt is not installed (pip install --group dev)"
     )
     sys.stdout.write(f"no difference in {count} formulas, {seen} frames; {peer}\n")

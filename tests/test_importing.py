@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import networkx as nx
 import pytest
+from thorough import some
 
 import sgstore
 from sgstore.cli import run
@@ -414,7 +415,7 @@ BOMBS: dict[str, tuple[str, Iterable[bytes], str]] = {
 """What small files unpack to: the format, the content, and a word of the refusal."""
 
 
-@pytest.mark.parametrize("bomb", BOMBS)
+@pytest.mark.parametrize("bomb", some([*BOMBS], 3))
 def test_what_a_small_file_unpacks_to_is_refused_before_it_fills_the_memory(
     tmp_path: Path, bomb: str
 ) -> None:

@@ -29,7 +29,7 @@ def test_margins_of_random_formulas_are_what_their_definition_says() -> None:
 
 
 def test_margins_are_those_of_rtamt() -> None:
-    pytest.importorskip("rtamt")  # of the group of peers
+    pytest.importorskip("rtamt")
     rng = random.Random(6)
 
     assert sum(compare_rtamt(rng, rng.randint(1, 4)) for _ in range(150)) > 50
