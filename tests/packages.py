@@ -26,10 +26,7 @@ RECORDING = Path("sample") / "town.mcap"
 SHORT = (
     "test_cli_errors.py",
     "test_config.py",
-    "test_geometry.py",
-    "test_graph.py",
     "test_lang_parser.py",
-    "test_lang_sql.py",
     "test_pair_numbers.py",
     "test_query.py",
     "test_schema.py",
