@@ -15,6 +15,9 @@ from sgstore.cli._options import (
     NO_MATCH,
     Abstraction,
     AskOptions,
+    Budget,
+    CaseUnit,
+    LongestClip,
     Parameters,
     Picture,
     PrintedRows,
@@ -430,15 +433,9 @@ class ChoiceOptions:
     stratify: Annotated[
         str, Option("--stratify", metavar="EXPR", help="Strata by a value: 'ego.speed > 8'.")
     ] = ""
-    budget: Annotated[
-        str, Option("--budget", help="At most 600s, 10min, 5GB, 1000frames or 40units.")
-    ] = ""
-    unit: Annotated[
-        Literal["frame", "clip", "trace"], Option("--unit", help="Frames, clips, or whole traces.")
-    ] = "frame"
-    clip: Annotated[str, Option("--clip", metavar="TIME", help="Longest clip of --unit clip.")] = (
-        "2s"
-    )
+    budget: Budget = ""
+    unit: CaseUnit = "frame"
+    clip: LongestClip = "2s"
     stride: Annotated[
         str,
         Option(

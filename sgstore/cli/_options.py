@@ -10,7 +10,7 @@ from collections import Counter
 from dataclasses import fields, is_dataclass
 from functools import partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args, get_type_hints
 
 import typer
 from typer import Argument, Option
@@ -290,6 +290,11 @@ PatternNames = Annotated[
     list[str] | None,
     Option("--pattern", "-p", metavar="NAME", help="One of the library; repeatable."),
 ]
+Budget = Annotated[str, Option("--budget", help="At most 600s, 10min, 5GB, 1000frames or 40units.")]
+CaseUnit = Annotated[
+    Literal["frame", "clip", "trace"], Option("--unit", help="Frames, clips, or whole traces.")
+]
+LongestClip = Annotated[str, Option("--clip", metavar="TIME", help="Longest clip of --unit clip.")]
 Abstraction = Annotated[
     str, Option("--abstraction", metavar="NAME", help="Abstraction: E, EL, ER, RSV, …")
 ]

@@ -11,6 +11,9 @@ from typer import Option
 
 from sgstore.cli._coverage import PANEL, NoPayloads, chosen_frames, say_made
 from sgstore.cli._options import (
+    Budget,
+    CaseUnit,
+    LongestClip,
     Parameters,
     PrintedRows,
     QueryLimits,
@@ -47,15 +50,9 @@ class OrderOptions:
             show_default="closing_time, dce_3s",
         ),
     ] = None
-    budget: Annotated[
-        str, Option("--budget", help="At most 600s, 10min, 5GB, 1000frames or 40units.")
-    ] = ""
-    unit: Annotated[
-        Literal["frame", "clip", "trace"], Option("--unit", help="Frames, clips, or whole traces.")
-    ] = "frame"
-    clip: Annotated[str, Option("--clip", metavar="TIME", help="Longest clip of --unit clip.")] = (
-        "2s"
-    )
+    budget: Budget = ""
+    unit: CaseUnit = "frame"
+    clip: LongestClip = "2s"
     abstraction: Annotated[
         str,
         Option(
