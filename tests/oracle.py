@@ -665,24 +665,31 @@ WORLD = 50
 """Patterns that are tried on one world."""
 
 
+def with_worlds(first: int, count: int) -> Iterator[tuple[int, World]]:
+    """So many numbers, each with its random world; some numbers in a row share one."""
+    from oracle_worlds import random_world
+
+    for start in range(first, first + count, WORLD):
+        seed = start // WORLD
+        world = random_world(
+            start, traces=3, frames=6, static=seed % 2 == 0, maps=1 + seed // 2 % 2
+        )
+        world.connection.execute("SET threads = 1")
+        for number in range(start, min(start + WORLD, first + count)):
+            yield number, world
+
+
 def try_many(first: int, count: int) -> dict[str, int]:
     """Random queries on random worlds; how many, how many have a match, how many are refused.
 
     Of three queries one returns values. The frames are counted, too, of every fourth.
     """
     from oracle_patterns import Writer
-    from oracle_worlds import random_world
 
     from sgstore.errors import QueryError
 
     seen = Counter[str]()
-    for number in range(first, first + count):
-        if (number - first) % WORLD == 0:
-            seed = number // WORLD
-            world = random_world(
-                number, traces=3, frames=6, static=seed % 2 == 0, maps=1 + seed // 2 % 2
-            )
-            world.connection.execute("SET threads = 1")
+    for number, world in with_worlds(first, count):
         writer = Writer(number)
         text = writer.query()
         LINKS.clear()

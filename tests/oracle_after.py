@@ -11,7 +11,17 @@ import sys
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
-from oracle import FREE, LINKS, WORLD, Edge, Search, asked, assignments, identity, shown
+from oracle import (
+    FREE,
+    LINKS,
+    Edge,
+    Search,
+    asked,
+    assignments,
+    identity,
+    shown,
+    with_worlds,
+)
 from oracle_patterns import Writer
 
 from sgstore.lang import parse
@@ -311,18 +321,10 @@ def disagreement_after(text: str, world: World, *, in_order: bool = True) -> tup
 
 def try_many_after(first: int, count: int) -> Counter[str]:
     """Random queries on random worlds."""
-    from oracle_worlds import random_world
-
     from sgstore.errors import QueryError
 
     seen = Counter[str]()
-    for number in range(first, first + count):
-        if (number - first) % WORLD == 0:
-            seed = number // WORLD
-            world = random_world(
-                number, traces=3, frames=6, static=seed % 2 == 0, maps=1 + seed // 2 % 2
-            )
-            world.connection.execute("SET threads = 1")
+    for number, world in with_worlds(first, count):
         writer = AfterWriter(number)
         text = writer.query()
         text += writer.after()
