@@ -408,9 +408,8 @@ def improved(family: SetFamily, cover: Ints, nodes: int) -> tuple[Ints, float, i
         return cover, 0.0, 0
     import highspy  # pyright: ignore[reportMissingImports, reportMissingTypeStubs]
 
-    solver = highspy.Highs()
+    solver = _silent()
     options = {
-        "output_flag": False,
         "threads": 1,
         "mip_rel_gap": 0.0,
         "mip_abs_gap": ROUNDING / 10,
@@ -436,6 +435,18 @@ def improved(family: SetFamily, cover: Ints, nodes: int) -> tuple[Ints, float, i
     low = float(info.mip_dual_bound)
     low = low - ROUNDING * max(abs(low), 1) if math.isfinite(low) else 0.0
     return cover, math.ceil(low) if family.whole else max(low, 0.0), used
+
+
+def _silent() -> Any:
+    """Return a solver that writes nothing: since version 1.15 a new one writes its name to stdout."""
+    import highspy  # pyright: ignore[reportMissingImports, reportMissingTypeStubs]
+
+    class Silent(highspy.Highs):
+        def enableCallbacks(self) -> None:  # noqa: N802 - its constructor calls this first, and that writes
+            self.setOptionValue("output_flag", False)  # noqa: FBT003
+            super().enableCallbacks()
+
+    return Silent()
 
 
 def _run(solver: Any) -> None:
