@@ -118,7 +118,7 @@ def info(number: int, frames: int) -> TraceInfo:
         path=Path(f"drive-{number:05}.mcap"),
         size=0,
         mtime_ns=0,
-        digest=f"{number:032x}{frames:032x}"[::-1],
+        digest=f"{frames:032x}{number:032x}"[::-1],  # the first digits tell recordings apart
         flavour="osi",
         channels=(Channel(1, "/truth", "osi3.GroundTruth", "protobuf", "protobuf", frames, "ground_truth"),),
         ego="0",
