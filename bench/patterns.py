@@ -303,10 +303,10 @@ def run(quick: bool = False) -> list[Measure]:
             spent, graphs = built(path, frames)
             table.append(Measure("built", frames / spent, "frames/s", f"{frames:,} frames"))
             table.append(Measure("  the scene graphs of it", frames / graphs, "frames/s"))
-        store = Store(path)
-        frames = store.sql("SELECT count(*) FROM frames").values[0][0]
-        table += _sizes(store, folder, frames)
-        table += _compared(store, folder, frames)
+        frames, measures = _sizes(path, folder)
+        table += measures
+        with Store(path) as store:
+            table += _compared(store, folder, frames)
         table.append(
             Measure(
                 "peak memory, all questions", peak_mb(path), "MB", f"aim {PEAK_MB:,}, of a process"
@@ -315,24 +315,31 @@ def run(quick: bool = False) -> list[Measure]:
     return table
 
 
-def _sizes(store: Store, folder: Path, frames: int) -> Iterator[Measure]:
-    nodes = store.sql("SELECT sum(bit_count(mask)) FROM inside.node").values[0][0]
-    nodes += store.sql("SELECT count(*) FROM inside.state").values[0][0]
-    edges = store.sql("SELECT sum(bit_count(mask)) FROM inside.edge").values[0][0]
-    yield Measure(
-        "nodes, and edges without the map's",
-        nodes / frames,
-        "a frame",
-        f"{edges / frames:.1f} edges",
-    )
-    yield Measure("whole store", store.file.path.stat().st_size / frames, "B/frame")
-    tables = list(sizes(store.file.path, folder))
+def _sizes(path: Path, folder: Path) -> tuple[int, list[Measure]]:
+    """Number of frames, and what the store and its tables take."""
+    with Store(path) as store:
+        ((frames,),) = store.sql("SELECT count(*) FROM frames").values
+        ((nodes,),) = store.sql("SELECT sum(bit_count(mask)) FROM inside.node").values
+        ((states,),) = store.sql("SELECT count(*) FROM inside.state").values
+        ((edges,),) = store.sql("SELECT sum(bit_count(mask)) FROM inside.edge").values
+    tables = list(sizes(path, folder))  # by a connection of its own: not while the store is open
     structure = sum(size for label, size, _ in tables if label in {"edge", "node", "frame"})
-    yield Measure("edges, nodes and frames", structure / frames, "B/frame", f"aim {BYTES}")
+    table = [
+        Measure(
+            "nodes, and edges without the map's",
+            (nodes + states) / frames,
+            "a frame",
+            f"{edges / frames:.1f} edges",
+        ),
+        Measure("whole store", path.stat().st_size / frames, "B/frame"),
+        Measure("edges, nodes and frames", structure / frames, "B/frame", f"aim {BYTES}"),
+    ]
     for label, size, rows in tables:
-        yield Measure(f"  {label}", size / frames, "B/frame", f"{rows / frames:.2f} rows a frame")
+        note = f"{rows / frames:.2f} rows a frame"
+        table.append(Measure(f"  {label}", size / frames, "B/frame", note))
         if label == "state":
-            yield Measure("  one object in state", size / rows, "B")
+            table.append(Measure("  one object in state", size / rows, "B"))
+    return frames, table
 
 
 def _compared(store: Store, folder: Path, frames: int) -> Iterator[Measure]:
