@@ -89,8 +89,10 @@ EDGES := coverage coverage_docs derive derive_using like locks selection selecti
 tests-of = $(foreach name,$(1),tests/test_$(name).py)
 
 # A file of tests at a time in each process: what its tests share is made once. The longest come first
-# (tests/slow.py), so that no process is left alone with one of them.
-PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --durations 25 --durations-min 3
+# (tests/slow.py), so that no process is left alone with one of them. One process more than there are
+# processors: many tests wait for a process or a time that they started.
+WORKERS ?= $(shell expr $$(nproc 2>/dev/null || echo 2) + 1)
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 5 --dist loadfile --no-loadscope-reorder --durations 25 --durations-min 3
 tests: $(VENV)/.dev
 	$(PYTEST) $(addprefix --ignore=,$(call tests-of,$(EDGES) $(UI)))
 
@@ -148,7 +150,7 @@ viewers: $(VENV)/.base
 # Files of tests that try more where SGSTORE_LONG is set (tests/thorough.py).
 LONG := collection collection_landing collection_ray collection_spark temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \
   lang_after lang_attributes lang_counting lang_match lang_oracle lang_subgraphs doors frozen importing ingest_data ingest_hardship \
-  export_scenarios monitor notebook assistant online parts serve sgg_traces store_transactions tolerance lane_places
+  export_scenarios monitor store_verify notebook assistant online parts serve sgg_traces store_transactions tolerance lane_places
 oracle: $(VENV)/.dev
 	$(BIN)/python tests/oracle_temporal.py 100000
 	$(BIN)/python tests/oracle_monitor.py 100000

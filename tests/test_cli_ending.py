@@ -552,7 +552,7 @@ def test_signals_end_a_run_in_order_and_leave_nothing_behind(
     assert not list(begun.temporary.iterdir())
 
 
-@pytest.mark.parametrize("verb", ["ingest --jobs", "find", "show", "export"])
+@pytest.mark.parametrize("verb", thorough.some(["ingest --jobs", "find", "show", "export"], 3))
 def test_what_a_killed_run_left_is_removed_by_the_next_start(
     verb: str, begun: Any, town_store: Path
 ) -> None:

@@ -272,9 +272,9 @@ def started(*arguments: object) -> subprocess.CompletedProcess[bytes]:
 
 
 @pytest.mark.parametrize(
-    "name", [b"mon\xffday.mcap", b"fold\xe9/drive.mcap", b"a/\x80/b/drive.mcap"]
+    ("name", "jobs"),
+    [(b"mon\xffday.mcap", 1), (b"fold\xe9/drive.mcap", 2), (b"a/\x80/b/drive.mcap", 1)],
 )
-@pytest.mark.parametrize("jobs", [1, 2])
 def test_a_recording_whose_name_is_no_utf_8_is_refused_and_the_others_come_in(
     name: bytes, jobs: int, tmp_path: Path
 ) -> None:

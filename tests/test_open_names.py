@@ -146,11 +146,16 @@ def attributed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
         yield store
 
 
+@pytest.fixture(scope="module")
+def graphs(attributed: Store) -> dict[int, nx.MultiDiGraph[Any]]:
+    return {n: attributed.graph(f"genome#{n}") for n in range(12)}
+
+
 @pytest.mark.parametrize("condition", OWN)
 def test_attributes_of_a_client_are_asked_for_in_patterns(
-    attributed: Store, condition: str
+    attributed: Store, graphs: dict[int, nx.MultiDiGraph[Any]], condition: str
 ) -> None:
-    fits, graphs = OWN[condition], {n: attributed.graph(f"genome#{n}") for n in range(12)}
+    fits = OWN[condition]
     single = {(n, i) for n, g in graphs.items() for i, x in g.nodes(data=True) if fits(x)}
     ends = {(n, a) for n, g in graphs.items() for a, b in g.edges() if (n, b) in single}
     pattern = f"MATCH (x) WHERE {condition} RETURN frame.seq, x.id"
@@ -170,11 +175,13 @@ def test_attributes_of_a_client_are_asked_for_in_patterns(
 
 
 @pytest.mark.parametrize("condition", OWN)
-def test_attributes_of_edges_are_asked_for_in_patterns(attributed: Store, condition: str) -> None:
+def test_attributes_of_edges_are_asked_for_in_patterns(
+    attributed: Store, graphs: dict[int, nx.MultiDiGraph[Any]], condition: str
+) -> None:
     fits, asked = OWN[condition], condition.replace("x.", "r.")
     edges, near = set[Any](), set[Any]()
-    for n in range(12):
-        for a, b, r in attributed.graph(f"genome#{n}").edges(data=True):
+    for n, graph in graphs.items():
+        for a, b, r in graph.edges(data=True):
             if fits(r):
                 edges.add((n, a, b, r["relation"], text_of(r.get("color"))))
                 near |= {(n, a)} if r["relation"] == "near" else set()
@@ -193,8 +200,9 @@ def test_attributes_of_edges_are_asked_for_in_patterns(attributed: Store, condit
         attributed.find(f"MATCH (a)-[r]-(b) WHERE {asked}")
 
 
-def test_attributes_of_a_client_are_returned(attributed: Store) -> None:
-    graphs = {n: attributed.graph(f"genome#{n}") for n in range(12)}
+def test_attributes_of_a_client_are_returned(
+    attributed: Store, graphs: dict[int, nx.MultiDiGraph[Any]]
+) -> None:
     nodes = [(n, i, x) for n, g in graphs.items() for i, x in g.nodes(data=True)]
     rows = attributed.find("MATCH (x) RETURN frame.seq, x.id, x.color, x.weight, x.is_new, x.mixed")
     names = ("color", "weight", "isNew")
@@ -393,6 +401,14 @@ def test_a_store_opens_whatever_its_names_look_like_and_exact_text_decides(tmp_p
         assert list(store.find(f"MATCH (x:{word}) RETURN COUNT(*) AS n")) == [count], word
 
 
+@pytest.fixture(scope="module")
+def two_stores(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A store, and one with names of its own."""
+    folder = tmp_path_factory.mktemp("two")
+    names = {"relation": ["charms"], "kind": ["unicorn"], "light_state": ["purple"]}
+    return with_names(folder / "plain.sgstore"), with_names(folder / "other.sgstore", **names)
+
+
 @pytest.mark.parametrize(
     "text",
     [
@@ -406,10 +422,10 @@ def test_a_store_opens_whatever_its_names_look_like_and_exact_text_decides(tmp_p
         "MATCH (a:charms)-[:unicorn]->(b)",
     ],
 )
-def test_names_that_one_store_brought_change_no_error_of_another(tmp_path: Path, text: str) -> None:
-    plain = with_names(tmp_path / "plain.sgstore")
-    names = {"relation": ["charms"], "kind": ["unicorn"], "light_state": ["purple"]}
-    other = with_names(tmp_path / "other.sgstore", **names)
+def test_names_that_one_store_brought_change_no_error_of_another(
+    two_stores: tuple[Path, Path], text: str
+) -> None:
+    plain, other = two_stores
 
     def error() -> str:
         with pytest.raises(QueryError) as raised:
