@@ -2,11 +2,10 @@
 
 OpenDRIVE text → tables of elements, in bounded time and memory.
 
-The parser is the standard library's expat, fed once, without a tree: each element that a map reader can
+The text is fed once to :mod:`sgstore.markup`, without a tree: each element that a map reader can
 use becomes a row in the table of its kind, with the row of its parent; everything else is passed over.
-Document type declarations, and with them entities, are refused, so that nothing can expand; depth, size,
-number of elements and of attributes are bounded. What an attribute *means* is decided later, by
-:class:`ElementTable`, which turns a whole column into numbers and blames the road of each one that is none.
+What an attribute *means* is decided later, by :class:`ElementTable`, which turns a whole column into numbers
+and blames the road of each one that is none.
 """
 
 from __future__ import annotations
@@ -14,11 +13,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
-from xml.parsers import expat
 
 import numpy as np
 
 from sgstore.errors import MapError
+from sgstore.markup import MarkupError, MarkupParser
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -28,8 +27,6 @@ if TYPE_CHECKING:
 
 MAX_CHARACTERS: Final = 256 << 20
 MAX_ELEMENTS: Final = 3_000_000
-MAX_DEPTH: Final = 64
-MAX_ATTRIBUTES: Final = 64
 MAX_MAGNITUDE: Final = 1e12
 """Greatest absolute value of a number; what is larger is taken for a defect."""
 
@@ -284,19 +281,11 @@ class _Builder:
         self._skip = skip
         self._levels: list[dict[str, _Node]] = [root]
         self._rows: list[int] = [-1]
-        self._elements = 0
         self._roads = 0
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
         """An element starts: it becomes a row, stands for the one around it, or is passed over."""
         levels, rows = self._levels, self._rows
-        self._elements += 1
-        if (
-            len(levels) > MAX_DEPTH
-            or len(attributes) > MAX_ATTRIBUTES
-            or self._elements > MAX_ELEMENTS
-        ):
-            raise MapError(_bound_passed(len(levels), len(attributes)), element=tag[:80])
         node = levels[-1].get(tag)
         if node is None:
             if len(levels) == 1:
@@ -321,10 +310,6 @@ class _Builder:
         self._levels.pop()
         self._rows.pop()
 
-    def doctype(self, *_: object) -> None:
-        """A document type declaration starts."""
-        raise MapError("a document type declaration is refused: maps need none")
-
     def _next_road_is_wanted(self) -> bool:
         number = self._roads
         self._roads += 1
@@ -336,26 +321,11 @@ class _Builder:
 
 def _parse(text: str, skip: frozenset[int]) -> tuple[dict[str, ElementTable], list[int]]:
     builder = _Builder(skip)
-    parser = expat.ParserCreate()
-    parser.StartElementHandler = builder.start
-    parser.EndElementHandler = builder.end
-    parser.StartDoctypeDeclHandler = builder.doctype
     try:
-        parser.Parse(text, True)  # noqa: FBT003 (expat takes no keywords)
-    except expat.ExpatError as error:
-        where = f"line {error.lineno}, column {error.offset + 1}"
-        raise MapError(f"not XML: {expat.ErrorString(error.code)} at {where}") from error
-    except UnicodeEncodeError as error:
-        raise MapError(f"not text: lone surrogate at character {error.start}") from error
+        MarkupParser(builder.start, builder.end, most=MAX_ELEMENTS).feed(text, last=True)
+    except MarkupError as error:
+        raise MapError(str(error), element=error.element or None) from error
     return builder.tables, builder.ordinals
-
-
-def _bound_passed(depth: int, attributes: int) -> str:
-    if depth > MAX_DEPTH:
-        return f"nested more than {MAX_DEPTH} levels deep"
-    if attributes > MAX_ATTRIBUTES:
-        return f"{attributes} attributes; an element may have {MAX_ATTRIBUTES}"
-    return f"more than {MAX_ELEMENTS:,} elements"
 
 
 def _floats(texts: list[str]) -> Floats:

@@ -1,0 +1,93 @@
+"""XML of strangers, element by element, in bounded time and memory.
+
+The parser is the standard library's expat, without a tree. Document type declarations, and with them entities,
+are refused, so that nothing can expand; depth, and the numbers of elements and attributes, are bounded.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+from xml.parsers import expat
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+MAX_DEPTH: Final = 64
+MAX_ATTRIBUTES: Final = 64
+
+
+class MarkupError(ValueError):
+    """A text is no XML, or more than is read; ``element`` is the tag at which a bound was passed."""
+
+    def __init__(self, reason: str, element: str = "") -> None:
+        self.element = element
+        super().__init__(reason)
+
+
+class MarkupParser:
+    """XML that is fed in pieces; starts and ends of elements are told as they come.
+
+    Parameters
+    ----------
+    start : callable
+        Called with the tag and the attributes of each element that begins.
+    end : callable
+        Called with the tag of each that ends.
+    most : int or None
+        Elements that there may be; ``None``: any number, as in a stream that is not kept.
+    whose : str
+        Who needs no document type declaration, for the message: ``maps``.
+    """
+
+    def __init__(
+        self,
+        start: Callable[[str, dict[str, str]], None],
+        end: Callable[[str], None],
+        *,
+        most: int | None,
+        whose: str = "maps",
+    ) -> None:
+        self._start, self._end = start, end
+        self._most, self._whose = most, whose
+        self._depth = self._elements = 0
+        self._parser = expat.ParserCreate()
+        self._parser.StartElementHandler = self._begins
+        self._parser.EndElementHandler = self._ends
+        self._parser.StartDoctypeDeclHandler = self._doctype
+
+    def feed(self, data: str | bytes, *, last: bool = False) -> None:
+        """Take the next piece of the text.
+
+        Raises
+        ------
+        MarkupError
+            It is no XML, has a document type declaration, or passes a bound. What the callables raise
+            passes through.
+        """
+        try:
+            self._parser.Parse(data, last)
+        except expat.ExpatError as error:
+            where = f"line {error.lineno}, column {error.offset + 1}"
+            raise MarkupError(f"not XML: {expat.ErrorString(error.code)} at {where}") from error
+        except UnicodeEncodeError as error:
+            raise MarkupError(f"not text: lone surrogate at character {error.start}") from error
+
+    def _begins(self, tag: str, attributes: dict[str, str]) -> None:
+        self._depth += 1
+        self._elements += 1
+        most = self._most
+        if self._depth > MAX_DEPTH:
+            raise MarkupError(f"nested more than {MAX_DEPTH} levels deep", tag[:80])
+        if len(attributes) > MAX_ATTRIBUTES:
+            reason = f"{len(attributes)} attributes; an element may have {MAX_ATTRIBUTES}"
+            raise MarkupError(reason, tag[:80])
+        if most is not None and self._elements > most:
+            raise MarkupError(f"more than {most:,} elements", tag[:80])
+        self._start(tag, attributes)
+
+    def _ends(self, tag: str) -> None:
+        self._depth -= 1
+        self._end(tag)
+
+    def _doctype(self, *_: object) -> None:
+        raise MarkupError(f"a document type declaration is refused: {self._whose} need none")
