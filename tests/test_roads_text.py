@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from opendrive_maps import a_map, a_road, line
 
-import sgstore.roads._lanes as lanetext
+import sgstore.roads._lane_text as lanetext
 from sgstore.errors import MapError
 from sgstore.opendrive import parse_map, read_map
 from sgstore.roads import PlainLane, RoadMap, lane_text

@@ -74,7 +74,7 @@ def read_map(text: str, name: str, signs: Signs = SIGNS) -> RoadMap:
     Parameters
     ----------
     text : str
-        The text of an ``.xodr`` file, or plain lanes (:mod:`sgstore.roads._lanes`). Untrusted: time and
+        The text of an ``.xodr`` file, or plain lanes (:mod:`sgstore.roads._lane_text`). Untrusted: time and
         memory are bounded by its length.
     name : str
         What people call it; empty: the name in its header, or the first digits of its digest.

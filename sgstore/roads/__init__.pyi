@@ -14,18 +14,22 @@ from ._lane_lines import LaneLine as LaneLine
 from ._lane_lines import about_lanes as about_lanes
 from ._lane_lines import middle_between as middle_between
 from ._lane_lines import plain_lanes as plain_lanes
+from ._lane_lines import with_junctions as with_junctions
 from ._lane_lines import with_shared_borders as with_shared_borders
-from ._lanes import MAX_NAME as MAX_NAME
-from ._lanes import OF_LANES as OF_LANES
+from ._lane_text import MAX_NAME as MAX_NAME
+from ._lane_text import OF_LANES as OF_LANES
+from ._lane_text import is_lane_text as is_lane_text
+from ._lane_text import lane_text as lane_text
+from ._lane_text import read_lane_text as read_lane_text
 from ._lanes import Edge as Edge
 from ._lanes import PlainLane as PlainLane
+from ._lanes import PlainCrosswalk as PlainCrosswalk
 from ._lanes import PlainSignal as PlainSignal
 from ._lanes import edges_of as edges_of
-from ._lanes import is_lane_text as is_lane_text
-from ._lanes import lane_text as lane_text
 from ._lanes import plain_nodes as plain_nodes
-from ._lanes import read_lane_text as read_lane_text
 from ._lanes import ribbons_of as ribbons_of
+from ._lanes import sections_between as sections_between
+from ._lanes import thinned as thinned
 from ._map import OFF_ROAD as OFF_ROAD
 from ._map import STOREY as STOREY
 from ._map import LaneChanges as LaneChanges
@@ -63,6 +67,7 @@ __all__ = [
     "MapPlaces",
     "OFF_ROAD",
     "OF_LANES",
+    "PlainCrosswalk",
     "PlainLane",
     "PlainSignal",
     "Ribbons",
@@ -85,9 +90,12 @@ __all__ = [
     "read_lane_text",
     "ribbons_of",
     "run_of",
+    "sections_between",
     "summary",
+    "thinned",
     "turn_words",
     "turned",
+    "with_junctions",
     "with_shared_borders",
     "within",
     "DrawnOutlines",

@@ -31,6 +31,7 @@ from sgstore.roads._lanes import (
     thinned,
     way_between,
 )
+from sgstore.roads._map import STOREY
 from sgstore.vocabulary import DRIVING, TRAFFIC
 
 if TYPE_CHECKING:
@@ -113,6 +114,8 @@ class LaneLine:
         As :class:`~sgstore.roads.MapNodes` has them; without a road it is one of the lanes side by side.
     junction : str or None
         ``None``: it lies in a junction that has no name.
+    speed_limit : float
+        m/s; NaN where there is none.
     """
 
     ident: str
@@ -132,6 +135,7 @@ class LaneLine:
     section: int = 0
     number: int = 0
     junction: str | None = ""
+    speed_limit: float = np.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,6 +231,7 @@ def plain_lanes(
                 right_beside=tuple(sorted(right)),
                 against=tuple(sorted(against)),
                 changes=tuple(_changes(network, row, beside[row], against)),
+                speed_limit=line.speed_limit,
             )
         )
     return lanes, network.warnings
@@ -762,3 +767,56 @@ def _share(one: tuple[float, float, bool], other: tuple[float, float, bool]) -> 
     common = min(one[1], other[1]) - max(one[0], other[0])
     shorter = min(one[1] - one[0], other[1] - other[0])
     return one[2] != other[2] and common > max(_SHARED * shorter, APART)
+
+
+# Junctions of maps that know of none: lanes that lie on others' ways ---------------------------------
+
+_ON_ANOTHER: Final = 0.5
+"""Least length of a centre line in another lane with which the two lie in a junction; m."""
+_ASKED_AT_ONCE: Final = 100
+
+
+def with_junctions(lines: Sequence[LaneLine]) -> list[LaneLine]:
+    """The same lanes, those of motor traffic whose centre lines run through others of them in junctions.
+
+    So they do where they cross, part and merge; lanes on different storeys do not. Lanes without sections
+    are left as they are.
+
+    Raises
+    ------
+    MapError
+        Too many lanes lie on one another.
+    """
+    rows = [row for row, line in enumerate(lines) if line.type in DRIVING and line.sections]
+    sections = [one for row in rows if (one := lines[row].sections)]
+    outlines: Any = shapely.make_valid(
+        [shapely.Polygon(np.concatenate((one.right, one.left[::-1]))) for one in sections]
+    )
+    centres: Any = np.array([shapely.LineString(one.middle) for one in sections], object)
+    tree = shapely.STRtree(outlines)
+    inside: set[int] = set()
+    pairs = 0
+    for start in range(0, len(rows), _ASKED_AT_ONCE):
+        one, other = tree.query(centres[start : start + _ASKED_AT_ONCE], predicate="intersects")
+        pairs += len(one)
+        if pairs > MAX_RELATED:
+            raise MapError(f"more than {MAX_RELATED:,} lanes on one another", element="lane")
+        one = one + start
+        one, other = one[one != other], other[one != other]
+        common: Any = shapely.intersection(centres[one], outlines[other])
+        long = shapely.length(common) > _ON_ANOTHER
+        for lane, crossed, part in zip(one[long], other[long], common[long], strict=True):
+            place = shapely.point_on_surface(part)
+            heights = [_height(sections[row], centres[row], place) for row in (lane, crossed)]
+            if abs(heights[0] - heights[1]) <= STOREY:
+                inside |= {rows[lane], rows[crossed]}
+    return [
+        replace(line, junction=None) if row in inside and line.junction == "" else line
+        for row, line in enumerate(lines)
+    ]
+
+
+def _height(sections: Sections, centre: Any, place: Any) -> float:
+    return float(
+        np.interp(shapely.line_locate_point(centre, place), run_of(sections.middle), sections.z)
+    )

@@ -1,4 +1,4 @@
-"""Plain lanes → ``RoadMap`` or text, and their cross sections from lines.
+"""Plain lanes → ``RoadMap``, and their cross sections from lines.
 
 A plain lane is its cross sections in the direction of travel and the lanes that it is related to. All else
 that a :class:`~sgstore.roads.RoadMap` holds follows: roads, junctions, turns, conflicts, lengths and widths.
@@ -6,8 +6,6 @@ that a :class:`~sgstore.roads.RoadMap` holds follows: roads, junctions, turns, c
 
 from __future__ import annotations
 
-import json
-import math
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
@@ -16,10 +14,9 @@ import numpy as np
 import shapely
 
 from sgstore.columns import chained
-from sgstore.errors import MapError
 from sgstore.roads._map import STOREY, LaneChanges, MapEdges, MapNodes, RoadMap, turn_words
 from sgstore.roads._ribbons import Ribbons, conflicts, mean_widths, turned, wrapped
-from sgstore.vocabulary import DRIVING, RELATION_CODE, SIGNALS
+from sgstore.vocabulary import DRIVING, RELATION_CODE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -88,6 +85,14 @@ class PlainSignal:
         Where it stands and faces; m, rad. NaN: not known.
     lanes : tuple of int
         Lanes that it applies to, by their number.
+    stops : tuple of (int, float)
+        Lanes on which it has a place, as the line before which one waits, and where along them; m.
+    is_stop_line : bool
+        Whether it is a line painted on the road.
+    line : (n, 2) float64
+        Its own line; m. Empty: it is a place.
+    speed_limit : float
+        m/s; NaN where it tells none.
     """
 
     name: str
@@ -97,17 +102,40 @@ class PlainSignal:
     z: float = np.nan
     heading: float = np.nan
     lanes: tuple[int, ...] = ()
+    stops: tuple[tuple[int, float], ...] = ()
+    is_stop_line: bool = False
+    line: Floats = field(default_factory=lambda: np.zeros((0, 2)))
+    speed_limit: float = np.nan
+
+
+@dataclass(frozen=True, slots=True)
+class PlainCrosswalk:
+    """A place where people cross.
+
+    Attributes
+    ----------
+    name : str
+    outline : (n, 2) float64
+        Corners all around; m. Three at least.
+    z : float
+        Its height; m.
+    """
+
+    name: str
+    outline: Floats
+    z: float
 
 
 def road_map_of(
     lanes: Sequence[PlainLane],
     signals: Sequence[PlainSignal] = (),
+    crosswalks: Sequence[PlainCrosswalk] = (),
     *,
     name: str,
     text: str,
     warnings: Iterable[str] = (),
 ) -> RoadMap:
-    """The road map that plain lanes and signals make; ``text`` is what they were read from.
+    """The road map that plain lanes, signals and crosswalks make; ``text`` is what they were read from.
 
     Raises
     ------
@@ -118,17 +146,32 @@ def road_map_of(
     surfaces = plain_nodes(lanes, ribbons)
     roads, junctions = _road_nodes(lanes, ribbons), _junction_nodes(lanes)
     off_road = MapNodes.of("off_road", ["off_road"])
-    nodes = chained([off_road, surfaces, roads, junctions, _signal_nodes(signals)])
+    before = [off_road, surfaces, roads, junctions, _crosswalk_nodes(crosswalks)]
+    nodes = chained([*before, _signal_nodes(signals)])
+    first = sum(map(len, before))
+    shapes = np.full(len(nodes), None, object)
+    outlines = [shapely.Polygon(crosswalk.outline) for crosswalk in crosswalks]
+    lines = [shapely.LineString(s.line) if len(s.line) > 1 else None for s in signals]
+    shapes[first - len(outlines) :] = [*outlines, *lines]
     return RoadMap(
         name=name,
         text=text,
         nodes=nodes,
-        edges=_edges(lanes, ribbons, roads, junctions, signals),
+        edges=_edges(lanes, ribbons, roads, junctions, signals, first),
         ribbons=ribbons,
-        shapes=np.full(len(nodes), None, object),
+        shapes=shapes,
         lane_changes=_lane_changes(lanes),
         warnings=warnings,
+        stops=_stops(signals, first),
+        stop_lines=np.array([first + r for r, s in enumerate(signals) if s.is_stop_line], np.int64),
     )
+
+
+def _stops(signals: Sequence[PlainSignal], first: int) -> tuple[Ints, Ints, Floats]:
+    """Signals, as columns among the nodes, lanes on which they have a place, and where."""
+    rows = [(first + row, *stop) for row, signal in enumerate(signals) for stop in signal.stops]
+    column, lane = np.array([one[:2] for one in rows], np.int64).reshape(-1, 2).T
+    return column, lane, np.array([along for *_, along in rows], np.float64)
 
 
 def ribbons_of(lanes: Sequence[PlainLane]) -> Ribbons:
@@ -240,10 +283,17 @@ def _junction_nodes(lanes: Sequence[PlainLane]) -> MapNodes:
     return MapNodes.of("junction", names, junction=names)
 
 
+def _crosswalk_nodes(crosswalks: Sequence[PlainCrosswalk]) -> MapNodes:
+    middles = np.array([one.outline.mean(axis=0) for one in crosswalks]).reshape(-1, 2)
+    z = np.array([one.z for one in crosswalks], np.float64)
+    names = [one.name for one in crosswalks]
+    return MapNodes.of("crosswalk", names, x=middles[:, 0], y=middles[:, 1], z=z)
+
+
 def _signal_nodes(signals: Sequence[PlainSignal]) -> MapNodes:
     columns = {
         name: np.array([getattr(signal, name) for signal in signals], np.float64)
-        for name in ("x", "y", "z", "heading")
+        for name in ("x", "y", "z", "heading", "speed_limit")
     }
     kinds = [signal.kind for signal in signals]
     return MapNodes.of(kinds, [signal.name for signal in signals], **columns)
@@ -255,6 +305,7 @@ def _edges(
     roads: MapNodes,
     junctions: MapNodes,
     signals: Sequence[PlainSignal],
+    first_signal: int,
 ) -> MapEdges:
     first_road = _FIRST_LANE + len(lanes)
     first_junction = first_road + len(roads)
@@ -285,7 +336,6 @@ def _edges(
     }
     parts = {"isIn": np.array(within, np.int64).reshape(-1, 2)}
     parts |= {relation: _FIRST_LANE + pairs for relation, pairs in among_lanes.items()}
-    first_signal = first_junction + len(junctions)
     controls = [
         (first_signal + row, _FIRST_LANE + lane)
         for row, signal in enumerate(signals)
@@ -323,256 +373,6 @@ def _lane_changes(lanes: Sequence[PlainLane]) -> LaneChanges:
     return LaneChanges(
         np.array(lane, np.int64), np.array(to, np.int64), np.array(start), np.array(end)
     )
-
-
-# Plain lanes as text, and back: what a store keeps of a map that is no OpenDRIVE ----------------
-# The text is JSON, one lane a line, so that people can read it and tools can compare it::
-#
-#     {"format": "sgstore lanes", "version": 1, "warnings": [], "lanes": [
-#     {"name": "1/0/-1", "type": "driving", …, "left": [x, y, x, y, …], "right": […], "z": […], "onto": [1]},
-#     …
-#     ], "signals": [{"name": "7", "kind": "traffic_light", "x": 1.5, "y": -3.0, "lanes": [0]}]}
-#
-# ``signals`` is left out where there are none. Lengths are rounded to a tenth of a millimetre when the text is
-# written, and the map is always made from the text: what is read back is what was there before. Texts come from
-# files, so nothing in them is trusted.
-
-FORMAT: Final = "sgstore lanes"
-VERSION: Final = 1
-
-MAX_CHARACTERS: Final = 128 << 20
-MAX_LANES: Final = 100_000
-MAX_SIGNALS: Final = 100_000
-MAX_SECTIONS: Final = 4_000_000
-"""Greatest number of cross sections of all lanes."""
-MAX_COORDINATE: Final = 1e8
-"""Greatest distance from the origin; m."""
-MAX_NAME: Final = 200
-MAX_RELATED: Final = 1_000
-"""Greatest number of lanes that a lane can be related to in one way."""
-OF_LANES: Final = " (lanes)"
-"""What the names of such maps end in: they are less than the OpenDRIVE of the same name."""
-DIGITS: Final = 4
-"""Digits that are kept of a length in metres."""
-
-_NAMES: Final = ("name", "type", "road", "junction")
-_POSE: Final = ("x", "y", "z", "heading")
-_RELATED: Final = ("onto", "left_beside", "right_beside", "against")
-
-
-def is_lane_text(text: str) -> bool:
-    """Return whether a text can be a map of plain lanes, and no OpenDRIVE: it begins as a JSON object."""
-    return text[:100].lstrip("\ufeff \t\r\n").startswith("{")
-
-
-def lane_text(
-    lanes: Sequence[PlainLane],
-    warnings: Iterable[str] = (),
-    signals: Sequence[PlainSignal] = (),
-) -> str:
-    """The text of plain lanes and signals; ``warnings`` are kept in it."""
-    head = {"format": FORMAT, "version": VERSION, "warnings": list(warnings)}
-    rows = ",\n".join(_dumps(_fields(lane)) for lane in lanes)
-    more = ",\n".join(_dumps(_signal_fields(signal)) for signal in signals)
-    more = f', "signals": [\n{more}\n]' if more else ""
-    return f'{_dumps(head)[:-1]}, "lanes": [\n{rows}\n]{more}}}\n'
-
-
-def read_lane_text(text: str, name: str) -> RoadMap:
-    """The road map that a text of plain lanes describes.
-
-    Raises
-    ------
-    MapError
-        It is no such text, is of another version, or something in it is not what it must be.
-    """
-    if len(text) > MAX_CHARACTERS:
-        raise MapError(f"{len(text):,} characters; a text of lanes may have {MAX_CHARACTERS:,}")
-    try:
-        document = json.loads(text.lstrip("\ufeff"), parse_constant=_no_number)
-    except (ValueError, RecursionError) as error:
-        raise MapError(f"neither OpenDRIVE nor a text of lanes: {error}") from error
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise MapError(f"neither OpenDRIVE nor a text of lanes: no format {FORMAT!r}")
-    if document.get("version") != VERSION:
-        raise MapError(
-            f"a text of lanes of version {document.get('version')!r}; expected {VERSION}"
-        )
-    rows, warnings = document.get("lanes"), document.get("warnings", [])
-    if not isinstance(rows, list) or not rows or len(rows) > MAX_LANES:
-        raise MapError(f"expected a list of 1 to {MAX_LANES:,} lanes", element="lanes")
-    if not isinstance(warnings, list) or not all(isinstance(w, str) for w in warnings):
-        raise MapError("expected a list of texts", element="warnings")
-    lanes = [_lane(row, number, len(rows)) for number, row in enumerate(rows)]
-    if sum(len(lane.z) for lane in lanes) > MAX_SECTIONS:
-        raise MapError(f"more than {MAX_SECTIONS:,} cross sections", element="lanes")
-    return road_map_of(
-        lanes, _read_signals(document, len(lanes)), name=name, text=text, warnings=warnings
-    )
-
-
-def _dumps(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=False, allow_nan=False)
-
-
-def _no_number(text: str) -> None:
-    raise ValueError(f"{text} is no number")
-
-
-def _fields(lane: PlainLane) -> dict[str, Any]:
-    """A lane as JSON has it; what is missing or empty is left out."""
-    fields: dict[str, Any] = {key: getattr(lane, key) for key in _NAMES}
-    fields |= {"section": lane.section, "number": lane.number}
-    fields |= {
-        key: np.round(getattr(lane, key), DIGITS).ravel().tolist() for key in ("left", "right", "z")
-    }
-    fields |= {key: list(getattr(lane, key)) for key in _RELATED}
-    fields["changes"] = [
-        [to, round(start, DIGITS), round(end, DIGITS)] for to, start, end in lane.changes
-    ]
-    if math.isfinite(lane.speed_limit):
-        fields["speed_limit"] = lane.speed_limit
-    return {key: value for key, value in fields.items() if value not in ("", [])}
-
-
-def _signal_fields(signal: PlainSignal) -> dict[str, Any]:
-    """A signal as JSON has it; what is missing is left out."""
-    places = {key: round(getattr(signal, key), DIGITS) for key in _POSE}
-    told = {key: place for key, place in places.items() if math.isfinite(place)}
-    return {"name": signal.name, "kind": signal.kind, **told, "lanes": list(signal.lanes)}
-
-
-def _read_signals(document: dict[str, Any], lanes: int) -> list[PlainSignal]:
-    rows = document.get("signals", [])
-    if not isinstance(rows, list) or len(rows) > MAX_SIGNALS:
-        raise MapError(f"expected a list of at most {MAX_SIGNALS:,} signals", element="signals")
-    found: list[PlainSignal] = []
-    for number, row in enumerate(rows):
-        if not isinstance(row, dict):
-            raise MapError(f"signal {number} is no object", element="signals")
-        fields: dict[str, Any] = row
-        found.append(_TextRow(fields, number, lanes, "signal").signal())
-    return found
-
-
-def _lane(row: Any, number: int, lanes: int) -> PlainLane:
-    if not isinstance(row, dict):
-        raise MapError(f"lane {number} is no object", element="lanes")
-    fields: dict[str, Any] = row
-    return _TextRow(fields, number, lanes).lane()
-
-
-class _TextRow:
-    """A lane or signal; whatever is asked of it is what it must be, or a :class:`MapError` says what is not."""
-
-    def __init__(self, fields: dict[str, Any], number: int, lanes: int, what: str = "lane") -> None:
-        self._fields = fields
-        self._what = what
-        self._number = number
-        self._lanes = lanes
-
-    def lane(self) -> PlainLane:
-        left, right = (self._floats(key).reshape(-1, 2) for key in ("left", "right"))
-        z = self._floats("z")
-        if not len(left) == len(right) == len(z) >= 2:
-            raise self._wrong("z", "as many cross sections on both sides, two at least")
-        return PlainLane(
-            name=self._text("name"),
-            type=self._text("type"),
-            road=self._text("road"),
-            junction=self._text("junction"),
-            section=self._whole("section"),
-            number=self._whole("number"),
-            left=left,
-            right=right,
-            z=z,
-            onto=self._related("onto"),
-            left_beside=self._related("left_beside"),
-            right_beside=self._related("right_beside"),
-            against=self._related("against"),
-            changes=self._changes(),
-            speed_limit=self._speed(),
-        )
-
-    def signal(self) -> PlainSignal:
-        if self._fields.get("kind") not in SIGNALS:
-            raise self._wrong("kind", f"one of {', '.join(SIGNALS)}")
-        return PlainSignal(
-            self._text("name"),
-            self._text("kind"),
-            lanes=self._related("lanes"),
-            **{key: self._place(key) for key in _POSE},
-        )
-
-    def _wrong(self, key: str, expected: str) -> MapError:
-        reason = f"{self._what} {self._number}: expected {expected}"
-        return MapError(reason, element=f"{self._what}s/{key}")
-
-    def _place(self, key: str) -> float:
-        value = self._fields.get(key, math.nan)
-        if key in self._fields and (
-            type(value) not in {int, float} or not abs(value) < MAX_COORDINATE
-        ):
-            raise self._wrong(key, f"a number below {MAX_COORDINATE:.0e}")
-        return float(value)
-
-    def _text(self, key: str) -> str:
-        value = self._fields.get(key, "")
-        if not isinstance(value, str) or len(value) > MAX_NAME:
-            raise self._wrong(key, f"a text of at most {MAX_NAME} characters")
-        return value
-
-    def _whole(self, key: str) -> int:
-        value = self._fields.get(key, 0)
-        if type(value) is not int or abs(value) > 1 << 31:
-            raise self._wrong(key, "a whole number")
-        return value
-
-    def _floats(self, key: str) -> Floats:
-        values = self._fields.get(key)
-        expected = "numbers, an even number of them" if key != "z" else "numbers"
-        if not isinstance(values, list) or (key != "z" and len(values) % 2):
-            raise self._wrong(key, expected)
-        if not set(map(type, values)) <= {int, float}:
-            raise self._wrong(key, expected)
-        try:
-            array = np.array(values, np.float64)
-        except OverflowError as error:
-            raise self._wrong(key, expected) from error
-        if not (np.abs(array) < MAX_COORDINATE).all():
-            raise self._wrong(key, f"no place farther than {MAX_COORDINATE:.0e} m from the origin")
-        return array
-
-    def _related(self, key: str) -> tuple[int, ...]:
-        values = self._fields.get(key, [])
-        if not isinstance(values, list) or len(values) > MAX_RELATED:
-            raise self._wrong(key, f"at most {MAX_RELATED} numbers of lanes")
-        if not all(type(v) is int and 0 <= v < self._lanes for v in values):
-            raise self._wrong(key, f"numbers of lanes, 0 to {self._lanes - 1}")
-        return tuple(values)
-
-    def _changes(self) -> tuple[tuple[int, float, float], ...]:
-        values = self._fields.get("changes", [])
-        expected = f"at most {MAX_RELATED} stretches [lane, start, end]"
-        if not isinstance(values, list) or len(values) > MAX_RELATED:
-            raise self._wrong("changes", expected)
-        changes: list[tuple[int, float, float]] = []
-        for value in values:
-            if not isinstance(value, list) or list(map(type, value))[:1] != [int]:
-                raise self._wrong("changes", expected)
-            if len(value) != 3 or not {*map(type, value)} <= {int, float}:
-                raise self._wrong("changes", expected)
-            to, start, end = value
-            if not (0 <= to < self._lanes and 0 <= start <= end < MAX_COORDINATE):
-                raise self._wrong("changes", expected)
-            changes.append((to, float(start), float(end)))
-        return tuple(changes)
-
-    def _speed(self) -> float:
-        value = self._fields.get("speed_limit", math.nan)
-        if type(value) not in {int, float} or value <= 0 or value > 1000:
-            raise self._wrong("speed_limit", "a speed in m/s")
-        return float(value)
 
 
 # Cross sections of lanes that are told as lines: a centre line and its borders --------------------
@@ -651,6 +451,39 @@ class Feet:
     at: Floats
     along: Floats
     is_end: Bools
+
+
+def sections_between(left: Floats, right: Floats) -> Sections:
+    """Cross sections of a lane from its two borders, by shares of their lengths, at every point of both.
+
+    Parameters
+    ----------
+    left, right : (n, 3) and (m, 3) float64
+        In the direction of the lane, thinned; two points at least.
+
+    Notes
+    -----
+    Points of both that lie across from one another, to :data:`APART`, are the ends of one cross section, so
+    that the outline of the lane is that of its borders.
+    """
+    runs = run_of(left), run_of(right)
+    shares = [run / run[-1] for run in runs]
+    near = APART / max(runs[0][-1], runs[1][-1])
+    here = there = 0
+    pairs: list[tuple[float, float]] = []
+    while here < len(left) or there < len(right):
+        one = shares[0][here] if here < len(left) else np.inf
+        other = shares[1][there] if there < len(right) else np.inf
+        both = abs(one - other) <= near
+        pairs.append((one if both else min(one, other), other if both else min(one, other)))
+        here += bool(both or one < other)
+        there += bool(both or other < one)
+    at = np.maximum.accumulate(np.array(pairs), axis=0).T
+    ends = [
+        np.column_stack([np.interp(along, share, column) for column in line.T])
+        for along, share, line in zip(at, shares, (left, right), strict=True)
+    ]
+    return Sections(ends[0][:, :2], ends[1][:, :2], (ends[0][:, 2] + ends[1][:, 2]) / 2)
 
 
 def feet(places: Floats, lines: Sequence[Floats]) -> Feet:
