@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: help demo check test tests test-edges test-ui test-wheel test-versions lint format bench fuzz kill mutants soak pyg viewers oracle patterns sample clean duckdb-versions fuzz-queries frozen house api vendor cluster
+.PHONY: help demo check test tests test-edges test-ui test-wheel test-versions lint format bench fuzz kill mutants soak pyg viewers maps oracle patterns sample clean duckdb-versions fuzz-queries frozen house api vendor cluster
 
 help:
 	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
@@ -26,6 +26,7 @@ help:
 	@echo "make soak    one writer and eight readers on one store for ten minutes"
 	@echo "make pyg     PyTorch Geometric reads what is exported for it, and a small network learns from it (downloads torch)"
 	@echo "make viewers  Rerun's reader looks at what is exported for it (downloads Rerun)"
+	@echo "make maps    the package lanelet2 beside what we make of its example map (downloads it)"
 	@echo "make oracle  100,000 random patterns and formulas against exhaustive search, 12,000 pairs of graphs against networkx (hours)"
 	@echo "make cluster  1,000 random questions of collections; S3, Ray, Spark, and faults of all (an hour; installs ray, pyspark, obstore, moto)"
 	@echo "make duckdb-versions  every construct of the language under DuckDB 1.5 and 2.0: equal answers (minutes)"
@@ -146,6 +147,12 @@ viewers: $(VENV)/.base
 	@test -x build/viewers/bin/python || $(BIN)/python -m venv build/viewers || $(BIN)/python -m virtualenv -q build/viewers
 	@build/viewers/bin/python -m pip install -q --disable-pip-version-check -e '.[rerun,viz,arrow]' pytest hypothesis foxglove-schemas-protobuf
 	build/viewers/bin/python -m pytest tests/test_export_rerun.py tests/test_export_viewers.py
+
+# Likewise: readers of maps and simulators, each the oracle of what we read of it.
+maps: $(VENV)/.base
+	@test -x build/maps/bin/python || $(BIN)/python -m venv build/maps || $(BIN)/python -m virtualenv -q build/maps
+	@build/maps/bin/python -m pip install -q --disable-pip-version-check -e . lanelet2==1.2.3
+	build/maps/bin/python tests/oracle_lanelet2.py
 
 # Files of tests that try more where SGSTORE_LONG is set (tests/thorough.py).
 LONG := collection collection_landing collection_ray collection_spark temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \

@@ -271,8 +271,8 @@ def ingest(  # noqa: PLR0913  as many options as there are ways to read
     traces : sequence of str or Path
         Files; :func:`sgstore.ingest.recordings` finds them in folders and by patterns.
     road_map : str or Path, optional
-        An OpenDRIVE file for the recordings that carry no map of their own, or a folder of files ``NAME.xodr``
-        for those that say what their map is called.
+        An OpenDRIVE or Lanelet2 file for the recordings that carry no map of their own, or a folder of such
+        files for those that say what their map is called.
     config : Config, optional
     egos : sequence of str, optional
         Ids, roles or names of several egos, each of which makes a trace of its own; ``all``: every vehicle.

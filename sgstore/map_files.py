@@ -7,12 +7,14 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final
 
 from sgstore.errors import MapError
+from sgstore.lanelet2 import lanelet2_text, read_projector_info
 from sgstore.mcap import Loss
 from sgstore.opendrive import SIGNS, read_map
 from sgstore.roads import OF_LANES
 
 if TYPE_CHECKING:
     from sgstore.config import Signs
+    from sgstore.lanelet2 import Projection
     from sgstore.roads import RoadMap
     from sgstore.world import TraceInfo
 
@@ -25,16 +27,28 @@ NO_MAP: Final = "no road map: without road nodes and without relations that need
 _SHOWN_WARNINGS: Final = 5
 """Defects of a road map that are named; the others are counted."""
 
+PROJECTOR_INFO: Final = "map_projector_info.yaml"
+"""The file of Autoware beside a Lanelet2 map that says how it is projected."""
+
+AUTOWARE_MAP: Final = "lanelet2_map.osm"
+"""The file of Autoware's folders of a map."""
+
+_LOOKED_AT: Final = 4096
+_LANELETS: Final = re.compile(r"<osm[\s>/]")
+
 _ENCODING: Final = re.compile(rb"""\s*<\?xml[^>]{0,100}\sencoding=["']([A-Za-z0-9._-]{1,40})["']""")
 
 
 def read_map_file(path: str | Path, signs: Signs = SIGNS) -> RoadMap:
-    """The road map in an OpenDRIVE file; ``signs`` as in :func:`sgstore.opendrive.read_map`.
+    """The road map in an OpenDRIVE or Lanelet2 file; ``signs`` as in :func:`sgstore.opendrive.read_map`.
+
+    Points of a Lanelet2 map lie where ``local_x`` and ``local_y`` say. Else ``map_projector_info.yaml`` beside
+    it tells how latitude and longitude become metres, as Autoware has it; else they are those of UTM.
 
     Raises
     ------
     MapError
-        There is no such file, or it is no OpenDRIVE map.
+        There is no such file, or it is no road map.
     """
     path = Path(path)
     try:
@@ -45,9 +59,26 @@ def read_map_file(path: str | Path, signs: Signs = SIGNS) -> RoadMap:
         reason = getattr(error, "strerror", None) or error
         raise MapError(f"{path}: cannot be read as an OpenDRIVE map: {reason}") from error
     try:
+        if _LANELETS.search(text[:_LOOKED_AT]):
+            text = lanelet2_text(text, _projection(path.with_name(PROJECTOR_INFO)))
         return read_map(text, path.name, signs)
     except MapError as error:
         raise MapError(f"{path}: {error}") from error
+
+
+def _projection(path: Path) -> Projection | None:
+    """The projection that a file beside a map tells; ``None``: there is none."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")[:_LOOKED_AT]
+    except FileNotFoundError:
+        return None
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise MapError(f"{path.name} beside it cannot be read: {reason}") from error
+    try:
+        return read_projector_info(text)
+    except MapError as error:
+        raise MapError(f"{path.name} beside it: {error}") from error
 
 
 def _decoded(content: bytes) -> str:
@@ -64,8 +95,8 @@ class Maps:
     Parameters
     ----------
     given : Path or None
-        A file, for the recordings that carry no OpenDRIVE of their own; or a folder of files ``NAME.xodr``,
-        for those that name their map.
+        A file, for the recordings that carry no OpenDRIVE of their own; or a folder of files ``NAME.xodr`` or
+        ``NAME.osm``, for those that name their map; or Autoware's folder of a map, with ``lanelet2_map.osm``.
     signs : Signs
         How their signals are read.
 
@@ -78,6 +109,8 @@ class Maps:
     def __init__(self, given: Path | None, signs: Signs = SIGNS) -> None:
         self._signs = signs
         self._read: dict[str, RoadMap | MapError] = {}
+        if given is not None and (given / AUTOWARE_MAP).is_file():
+            given = given / AUTOWARE_MAP
         self._folder = given if given is not None and given.is_dir() else None
         one_file = given is not None and not self._folder
         self._given = read_map_file(given, signs) if given is not None and one_file else None
@@ -118,8 +151,10 @@ class Maps:
         if self._folder is None:
             return None
         stem = PurePosixPath(name.replace("\\", "/")).name.removesuffix(OF_LANES)
-        stem = stem.removesuffix(".xodr")
+        stem = stem.removesuffix(".xodr").removesuffix(".osm")
         path = self._folder / f"{stem}.xodr"
+        if not path.is_file():
+            path = path.with_suffix(".osm")
         if not stem or not path.is_file():
             wanted = (
                 f"no map {stem!r} in {self._folder}" if stem else "it does not name its road map"

@@ -525,7 +525,7 @@ class ReadingOptions(GraphOptions):
         Path | None,
         Option(
             "--map",
-            help="OpenDRIVE file, or folder of NAME.xodr, for recordings that carry no map of their own.",
+            help="OpenDRIVE or Lanelet2 file, or folder of them, for recordings without a map of their own.",
         ),
     ] = None
 

@@ -192,7 +192,11 @@ def _write_derived(done: list[Derivation], out: PrintedRows) -> int:
 @app.command("map", rich_help_panel=PANEL)
 def map_(
     file: Annotated[
-        Path, Argument(metavar="FILE", help="OpenDRIVE (.xodr), or a recording that carries roads.")
+        Path,
+        Argument(
+            metavar="FILE",
+            help="OpenDRIVE (.xodr), Lanelet2 (.osm), or a recording that carries roads.",
+        ),
     ],
     picture: Annotated[
         Path | None, Option("--output", "-o", help="Draw it there, north up: .png or .svg.")

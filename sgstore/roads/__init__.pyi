@@ -26,6 +26,7 @@ from ._lanes import PlainLane as PlainLane
 from ._lanes import PlainCrosswalk as PlainCrosswalk
 from ._lanes import PlainSignal as PlainSignal
 from ._lanes import edges_of as edges_of
+from ._lanes import painted_across as painted_across
 from ._lanes import plain_nodes as plain_nodes
 from ._lanes import ribbons_of as ribbons_of
 from ._lanes import sections_between as sections_between
@@ -84,6 +85,7 @@ __all__ = [
     "lanes_ref",
     "mean_widths",
     "middle_between",
+    "painted_across",
     "plain_lanes",
     "plain_nodes",
     "point_shapes",

@@ -643,3 +643,37 @@ def way_between(
     half = (width0 + share * (width1 - width0))[:, None] / 2
     to_left = np.column_stack((-slope[:, 1], slope[:, 0]))
     return Sections(place + to_left * half, place - to_left * half, z0 + share * (z1 - z0))
+
+
+# Lines painted across lanes ----------------------------------------------------------------------
+
+_ON_LANE: Final = 0.1
+"""How far a stop line may be from the centre line of a lane to lie on it; m."""
+_AT_START: Final = 0.5
+"""A line this close to the start of a lane belongs to the lane before, if it lies on it too; m."""
+
+
+def painted_across(lanes: Sequence[PlainLane], lines: Sequence[Floats]) -> list[dict[int, float]]:
+    """The lanes of motor traffic on which each of some lines (n, 2 or 3) lies, and where along them; m.
+
+    Where one lane ends and the next begins a line lies on the first.
+    """
+    found: list[dict[int, float]] = [{} for _ in lines]
+    rows = [row for row, lane in enumerate(lanes) if lane.type in DRIVING]
+    long = [number for number, line in enumerate(lines) if len(line) > 1]
+    if not rows or not long:
+        return found
+    centres: Any = np.array(
+        [shapely.LineString((lanes[row].left + lanes[row].right) / 2) for row in rows], object
+    )
+    painted: Any = np.array([shapely.LineString(lines[one][:, :2]) for one in long], object)
+    line, lane = shapely.STRtree(centres).query(painted, predicate="dwithin", distance=_ON_LANE)
+    nearest: Any = shapely.shortest_line(centres[lane], painted[line])
+    places: Any = shapely.line_locate_point(centres[lane], shapely.get_point(nearest, 0))
+    for one, row, along in zip(line.tolist(), lane.tolist(), places.tolist(), strict=True):
+        found[long[one]][rows[row]] = along
+    for places in found:
+        onward = {to for row in places for to in lanes[row].onto}
+        for row in [row for row, at in places.items() if at < _AT_START and row in onward]:
+            del places[row]
+    return found
