@@ -427,6 +427,9 @@ class SceneGraph:
         :class:`EdgeColumns`.
     reach : LaneDistances, optional
         Of the map that it lies on. Without it nothing is known of ways along lanes.
+    events : mapping of str to sequence of pairs
+        What has happened in the frame: kind → to whom, and with whom. Of a kind that is missing the trace does
+        not say whether it has.
     """
 
     frame_id: int
@@ -437,6 +440,11 @@ class SceneGraph:
     nodes: dict[int, dict[str, Any]]
     edges: Sequence[tuple[int, str, int, dict[str, Any]]]
     reach: LaneDistances | None = field(default=None, compare=False, repr=False)
+    events: Mapping[str, Sequence[tuple[int | None, int | None]]] = field(
+        default_factory=dict[str, "Sequence[tuple[int | None, int | None]]"],
+        compare=False,
+        repr=False,
+    )
 
     def __repr__(self) -> str:
         size = f"{len(self.nodes)} nodes, {len(self.edges)} edges"

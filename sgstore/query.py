@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
     from sgstore.lang import Catalog, FrameView, Pattern, WhyNot, WhyNotSteps
-    from sgstore.lang.ir import FrameAttribute
+    from sgstore.lang.ir import Query
     from sgstore.matches import Interval, Matches
     from sgstore.segments import TraceOutcome
     from sgstore.store import Rows, SimilarFrames, StoredTrace
@@ -729,7 +729,6 @@ class Store:
         """
         from sgstore.lang import (
             WhyNot,
-            looked_up,
             why_not,  # with numpy: only for who asks
         )
 
@@ -745,7 +744,7 @@ class Store:
                     {},
                     "such relations are unknown of it (no road map, perhaps)",
                 )
-            view = self._view(ref, looked_up(compiled.bound))
+            view = self._view(ref, compiled.bound)
             return why_not(compiled.bound, view, compiled.text)
 
     def parts(
@@ -801,10 +800,11 @@ class Store:
                     found.setdefault(key, ids[name])
         return found
 
-    def _view(self, frame: FrameRef, asked: Sequence[FrameAttribute]) -> FrameView:
-        """A frame as patterns in memory see it, with the attributes that only the store knows."""
-        from sgstore.lang import FrameView
+    def _view(self, frame: FrameRef, query: Query) -> FrameView:
+        """A frame as a pattern in memory sees it, with what it asks that only the store knows."""
+        from sgstore.lang import FrameView, events_in, looked_up
 
+        asked = looked_up(query)
         trace = self.file.trace(frame.trace_id)
         about = {f.name: getattr(frame, f.name) for f in fields(frame)} | {"id": frame.frame_id}
         if asked:
@@ -821,7 +821,8 @@ class Store:
         for node, *values in constants.values:
             if node in graph.nodes:
                 graph.nodes[node].update(zip(constants.columns[1:], values, strict=True))
-        return FrameView(graph, about, whole, classes, roles)
+        events = events_in(query, frame.frame_id, lambda sql, at: self.file.rows(sql, at).values)
+        return FrameView(graph, about, whole, classes, roles, events)
 
 
 def matches_of(

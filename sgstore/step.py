@@ -8,7 +8,9 @@ from __future__ import annotations
 import gc
 import math
 from collections import OrderedDict
+from dataclasses import replace
 from functools import cache, partial
+from itertools import chain
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import numpy as np
@@ -24,6 +26,7 @@ from sgstore.graph import (
 )
 from sgstore.vocabulary import (
     ENTITY_KINDS,
+    EVENT_KINDS,
     KIND_CODE,
     KINDS,
     LIGHT_STATE_CODE,
@@ -42,6 +45,7 @@ from sgstore.world import (
     MessageRefs,
     Origin,
     States,
+    nearest_frames,
     number,
     origin_of,
     quantize,
@@ -53,12 +57,12 @@ if TYPE_CHECKING:
     from sgstore.graph import GraphBlock, LaneGaps, LaneStates, SceneGraph, Whole
     from sgstore.roads import RoadMap
     from sgstore.vocabulary import TypeMeaning
-    from sgstore.world import Codes, Floats, Ints
+    from sgstore.world import Codes, Event, Floats, Ints
 
     Attributes = dict[str, Any]
     Edge = tuple[int, str, int, Attributes]
 
-__all__ = ["REMEMBERED", "Entity", "Frame", "Replay", "Stepper", "check_entities"]
+__all__ = ["REMEMBERED", "Entity", "Frame", "Replay", "Stepper", "check_entities", "replayed"]
 
 
 _NAN: Final = math.nan
@@ -111,14 +115,20 @@ class Frame:
         Empty: none.
     entities : list of Entity
         In the order in which they were added.
+    events : list of (str, str, str)
+        What has happened: its kind, to whom, and with whom; empty: nobody, or not known.
+    recorded : frozenset of str
+        Kinds of events that would be among them if they had happened. Of others nothing is known.
     """
 
-    __slots__ = ("ego", "entities", "time_ns")
+    __slots__ = ("ego", "entities", "events", "recorded", "time_ns")
 
     def __init__(self, time_ns: int, ego: str | int | None = None) -> None:
         self.time_ns = int(time_ns)
         self.ego = "" if ego is None else str(ego)
         self.entities: list[Entity] = []
+        self.events: list[tuple[str, str, str]] = []
+        self.recorded = frozenset(EVENT_KINDS)
 
     def __len__(self) -> int:
         return len(self.entities)
@@ -128,6 +138,7 @@ class Frame:
         if not types:
             return self
         frame = Frame(self.time_ns, self.ego)
+        frame.events, frame.recorded = self.events, self.recorded
         frame.entities = [
             entity.meant(types.get(entity.type_name.lower())) for entity in self.entities
         ]
@@ -135,6 +146,25 @@ class Frame:
 
     def __repr__(self) -> str:
         return f"Frame({self.time_ns}, ego={self.ego!r}, {len(self)} entities)"
+
+    def happened(self, kind: str, ident: str | int = "", other: str | int = "") -> None:
+        """Take note of something that has happened: ``HAPPENS kind(a, b)`` is true of this frame.
+
+        Parameters
+        ----------
+        kind : str
+            ``collision``, ``lane_invasion`` or ``environment``.
+        ident, other : str or int
+            Ids of the entities to which it has; empty: nobody, or not known.
+
+        Raises
+        ------
+        ValueError
+            There are no such events.
+        """
+        self.events.append(
+            (_one_of("kind of event", kind, tuple(EVENT_KINDS)), str(ident), str(other))
+        )
 
     def add(  # noqa: PLR0913  an entity has as many properties
         self,
@@ -270,6 +300,48 @@ def _one_of(what: str, name: str, known: Sequence[str]) -> str:
     like = suggestion(name, known)
     hint = f"did you mean {like!r}?" if like else f"known: {', '.join(known)}"
     raise ValueError(f"unknown {what} {name!r}; {hint}")
+
+
+def replayed(blocks: Iterable[FrameBlock], recorded: Iterable[str] = ()) -> Iterator[Frame]:
+    """Frames of a recording one after the other, each with what happened in it.
+
+    Parameters
+    ----------
+    blocks : iterable of FrameBlock
+        Of a whole trace.
+    recorded : iterable of str
+        Kinds of events of which the recording would tell. Of others it does from the first one on.
+
+    Yields
+    ------
+    Frame
+        The last one of a block when the next block has come: what is told later may belong to it.
+    """
+    replay, known = Replay(), set(recorded)
+    last: list[Frame] = []
+    clock, waiting = np.zeros((2, 0), np.int64), list["Event"]()
+    for block in blocks:
+        clock = np.hstack([clock[:, -1:], np.stack([block.time_ns, block.log_time_ns])])
+        waiting += block.events
+        places = nearest_frames(waiting, *clock).tolist()
+        happened: list[list[Event]] = [[] for _ in clock[0]]
+        for event, place in zip(waiting, places, strict=True):
+            happened[place].append(event)
+        waiting = happened[-1]
+        for events, frame in zip(happened, chain(last, replay.frames(block)), strict=True):
+            last = [frame]
+            if events is not waiting:
+                yield _recording(frame, events, known)
+    for frame in last:
+        yield _recording(frame, waiting, known)
+
+
+def _recording(frame: Frame, events: Iterable[Event], known: set[str]) -> Frame:
+    """The frame of a recording, with what happened in it: of which kinds such a recording tells from now on."""
+    frame.events += [(event.kind, event.ident, event.other) for event in events]
+    known.update(kind for kind, _, _ in frame.events)
+    frame.recorded = frozenset(known)
+    return frame
 
 
 class Replay:
@@ -598,8 +670,23 @@ class Stepper:
             ident, _ = self._moving.popitem(last=False)
             self._inner.pop(ident, None)
         known = {self._moving[e.ident].node: self._moving[e.ident] for e in moving}
+        happened = self._happened(frame)
         with GcPaused():
-            return [self._records.graph(graph, self._outer, known) for graph in graphs]
+            found = [self._records.graph(graph, self._outer, known) for graph in graphs]
+            return [replace(one, events=happened) for one in found]
+
+    def _happened(self, frame: Frame) -> dict[str, list[tuple[int | None, int | None]]]:
+        """Events of a frame by kind, of nodes instead of ids; of what is recorded an entry anyway."""
+        found: dict[str, list[tuple[int | None, int | None]]] = {k: [] for k in frame.recorded}
+        for kind, *idents in frame.events:
+            a, b = (self._node_of(ident) for ident in idents)
+            found.setdefault(kind, []).append((a, b))
+        return found
+
+    def _node_of(self, ident: str) -> int | None:
+        if ident in self._standing:
+            return self._standing[ident][1].node
+        return self._moving[ident].node if ident in self._moving else None
 
     def _met(self, frame: Frame) -> tuple[list[Entity], list[Entity]]:
         """Entities of a frame that move, and those that stand and were not known.

@@ -46,6 +46,9 @@ OWN_ENTITY_KINDS: Final = (
 MAP_KINDS: Final = ("lane", "road", "junction", "crosswalk", "off_road", "waypoint")
 """Kinds of the parts of a road map. ``off_road`` is a single node: whatever is not a driving lane."""
 
+EVENT_KINDS: Final = {"collision": 2, "lane_invasion": 1, "environment": 0}
+"""Kinds of events that recordings tell of, and to how many each happens; environment: weather, light."""
+
 OWN_KINDS: Final = OWN_ENTITY_KINDS + MAP_KINDS
 """Kinds of this package, the parts of the map behind the entities."""
 

@@ -20,7 +20,9 @@ from sgstore.mcap import Findings
 from sgstore.records import dataclass
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
+    from typing import Any
 
     from numpy.typing import NDArray
 
@@ -386,6 +388,24 @@ class Event:
     other: str = ""
     value: float | None = None
     detail: str = ""
+
+
+FAR_NS: Final = 1_000_000_000
+"""An event whose simulation time is farther than this from all frames near it goes by log time instead."""
+_PIECE: Final = 4096
+
+
+def nearest_frames(events: Sequence[Event], time_ns: Any, log_time_ns: Any) -> Ints:
+    """For each event the row of the nearest frame; of two that are as near the first."""
+    found: list[Ints] = [np.zeros(0, np.int64)]
+    for start in range(0, len(events), _PIECE):
+        some = events[start : start + _PIECE]
+        apart = np.abs(np.array([event.time_ns for event in some])[:, None] - time_ns)
+        row = apart.argmin(axis=1)
+        far = apart[np.arange(len(row)), row] > FAR_NS
+        logged = np.abs(np.array([event.log_time_ns for event in some])[:, None] - log_time_ns)
+        found.append(np.where(far, logged.argmin(axis=1), row))
+    return np.concatenate(found)
 
 
 @dataclass(slots=True)

@@ -60,7 +60,7 @@ TESTS = {
     "serve": "serve report explorer sandbox_pool",
     "step": "online",
     "store": "store store_* doors events",
-    "temporal": "temporal monitor over_time robustness windows tolerance",
+    "temporal": "temporal monitor over_time happens robustness windows tolerance",
     "trace_parts": "ingest",
     "truth_lanes": "parts timeline",
     "vocabulary": "kinds",

@@ -241,6 +241,16 @@ class Search:
                 return None if value is None else -value
             case s.Call():
                 return self.call(e, binding)
+            case s.HappensExpression(kind=kind, arguments=arguments):
+                nodes = [self.value(argument, binding) for argument in arguments]
+                told = [
+                    (a, b)
+                    for what, *pair in self.frame.events
+                    if what == kind
+                    for a, b in (pair, pair[::-1])
+                ]
+                happened = any([*pair[: len(nodes)]] == nodes for pair in told)
+                return happened or (False if kind in self.frame.trace.records else None)
             case s.Case(branches=branches, otherwise=otherwise):
                 for branch in branches:
                     if self.value(branch.condition, binding) is True:

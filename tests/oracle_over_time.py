@@ -578,8 +578,15 @@ ATOMS = (
     "EXISTS {(e)-[:isIn]->(:Lane)}",
     "NOT EXISTS {(e)-[:near]->(:Car)}",
     "COUNT {(e)-[:visible]->()} > 1",
+    "HAPPENS collision(e)",
 )
-PAIRS = ("v.speed > 0.5", "dist(e, v) < 6", "EXISTS {(e)-[:near]->(v)}", "v.speed < e.speed")
+PAIRS = (
+    "HAPPENS collision(e, v)",
+    "v.speed > 0.5",
+    "dist(e, v) < 6",
+    "EXISTS {(e)-[:near]->(v)}",
+    "v.speed < e.speed",
+)
 COURSES = (
     "prev(e.speed) < e.speed",
     "delta(e.x, 0.2s) > 0",
@@ -801,7 +808,11 @@ def graph_of(frame: Frame) -> SceneGraph:
         for src, dst, relation, data in frame.graph.edges(keys=True, data=True)
     ]
     about = frame.frame_id, frame.trace.name, frame.seq, frame.time_ns, frame.ego
-    return SceneGraph(*about, dict(frame.graph.nodes(data=True)), edges)
+    graph = SceneGraph(*about, dict(frame.graph.nodes(data=True)), edges)
+    events: dict[str, list[Any]] = {kind: [] for kind in frame.trace.records}
+    for kind, a, b in frame.events:
+        events[kind].append((a, b))
+    return replace(graph, events=events)
 
 
 def part_of(e: Any) -> tuple[str, str]:

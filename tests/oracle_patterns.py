@@ -196,6 +196,8 @@ class Writer:
             lambda: f"{self.rng.choice(OF_ONE)}({a}.y) {self.rng.choice('<>')} {number}",
             lambda: f"{self.rng.choice(('pow', 'atan2'))}({a}.y, {b}.x) > {number}",
             lambda: f"{a}.width IS {self.rng.choice(('', 'NOT '))}KNOWN",
+            lambda: f"HAPPENS collision({a if a == b else f'{a}, {b}'})",
+            lambda: f"HAPPENS {self.rng.choice((f'lane_invasion({a})', 'environment()'))}",
         ]
         if self.edges and self.rng.random() < 0.3:
             return f"type({self.rng.choice(self.edges)}) {self.rng.choice(('=', '<>'))} 'near'"

@@ -122,6 +122,7 @@ class Frame:
     states: dict[int, dict[str, Any]]
     present: set[int]
     edges: list[tuple[int, str, int, dict[str, Any]]]
+    events: list[tuple[str, int | None, int | None]] = field(default_factory=list)
 
     @cached_property
     def graph(self) -> nx.MultiDiGraph[int]:
@@ -162,6 +163,8 @@ class Trace:
     entities: dict[int, dict[str, Any]]
     frames: list[Frame] = field(default_factory=list)
     map_id: int = 3
+    records: set[str] = field(default_factory=set)
+    """Kinds of events of which it tells."""
 
     @property
     def hero(self) -> str:
@@ -322,7 +325,28 @@ def random_trace(
     for seq in range(first, first + frames):
         time_ns += rng.choice((100, 100, 100, 900)) * 1_000_000
         trace.frames.append(random_frame(rng, trace, seq, time_ns))
+    something_happens(trace, random.Random(f"{time_ns} {count}"))
     return trace
+
+
+def something_happens(trace: Trace, rng: random.Random) -> None:
+    """Events of some frames, and whether others would have been told."""
+    nodes = [*trace.entities, None]
+    for frame in trace.frames:
+        for kind, chance in (("collision", 0.3), ("lane_invasion", 0.2), ("environment", 0.1)):
+            if rng.random() < chance and not (kind == "collision" and trace.trace_id % 3 == 2):
+                a = None if kind == "environment" else rng.choice(nodes)
+                b = rng.choice(nodes) if kind == "collision" else None
+                frame.events.append((kind, a, b))
+                trace.records.add(kind)
+    trace.records |= {kind for kind in SCHEMAS if rng.random() < 0.3}
+
+
+SCHEMAS = {
+    "collision": "carla_msgs/msg/CarlaCollisionEvent",
+    "lane_invasion": "carla_msgs/msg/CarlaLaneInvasionEvent",
+}
+"""Schemas of the channels that tell of events."""
 
 
 def random_frame(rng: random.Random, trace: Trace, seq: int, time_ns: int) -> Frame:
@@ -476,6 +500,24 @@ def store_trace(connection: duckdb.DuckDBPyConnection, trace: Trace, rng: random
         for name, some in parted(rows, rng).items():
             insert(connection, f"{table}_{name}", some)
     store_masks(connection, trace, rng)
+    channels = [kind for kind in SCHEMAS if kind in trace.records]
+    rows = [
+        {"trace_id": trace.trace_id, "channel_id": n, "schema": SCHEMAS[kind]}
+        for n, kind in enumerate(channels)
+    ]
+    insert(connection, "channel", rows)
+    insert(connection, "event", [row for frame in trace.frames for row in event_rows(frame)])
+
+
+def event_rows(frame: Frame) -> list[dict[str, Any]]:
+    def ident(node: int | None) -> str | None:
+        return None if node is None else frame.trace.entities[node]["ident"]
+
+    about = {"trace_id": frame.trace.trace_id, "frame_id": frame.frame_id}
+    about |= {"time_ns": frame.time_ns, "log_time_ns": frame.time_ns}
+    return [
+        about | {"kind": kind, "ident": ident(a), "other": ident(b)} for kind, a, b in frame.events
+    ]
 
 
 def parted(rows: list[dict[str, Any]], rng: random.Random) -> dict[str, list[dict[str, Any]]]:

@@ -44,6 +44,8 @@ from ._external import relation as relation
 from ._external import traces_with as traces_with
 from ._external import with_places as with_places
 from ._compile import for_people as for_people
+from ._formulas import recorded_events as recorded_events
+from ._formulas import told_events as told_events
 from ._functions import FUNCTIONS as FUNCTIONS
 from ._needs import MOTION as MOTION
 from ._needs import Need as Need
@@ -87,6 +89,7 @@ from ._union import joined_rows as joined_rows
 from ._union import union_parts as union_parts
 from ._why_not import WhyNot as WhyNot
 from ._why_not import WhyNotSteps as WhyNotSteps
+from ._why_not import events_in as events_in
 from ._why_not import looked_up as looked_up
 from ._why_not import why_not as why_not
 from .library import NamedPattern as NamedPattern
@@ -157,6 +160,7 @@ __all__ = [
     "compile_query",
     "each_match",
     "entities",
+    "events_in",
     "expression",
     "extents",
     "for_people",
@@ -165,6 +169,8 @@ __all__ = [
     "keywords",
     "joined_rows",
     "looked_up",
+    "recorded_events",
+    "told_events",
     "node_of_kind",
     "notes_on",
     "of_check",

@@ -16,7 +16,7 @@ from sgstore.lang._bind_expressions import BINDERS, edge_attribute, node_attribu
 from sgstore.lang._bind_match_values import over_match
 from sgstore.lang._bind_temporal import StepScope, bind_sequence, settled, tense, timespan
 from sgstore.lang._catalog import TRACE_ATTRIBUTES, Catalog, Type
-from sgstore.lang._functions import FUNCTIONS, call
+from sgstore.lang._functions import FUNCTIONS, call, happens
 from sgstore.lang._symbols import (
     RESERVED,
     THE_EGO,
@@ -316,6 +316,7 @@ _BINDERS: Final[Binders] = {
     s.BlockExpression: _block,
     s.Call: call,
     s.Duration: timespan,
+    s.HappensExpression: happens,
     s.OverExpression: over_match,
     s.Temporal: tense,
 }

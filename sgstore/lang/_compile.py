@@ -43,6 +43,7 @@ from sgstore.lang.ir import (
     EdgeRelation,
     FrameAttribute,
     GroupKey,
+    Happened,
     Kinds,
     LabelTest,
     Node,
@@ -488,6 +489,8 @@ def _leaf(value: Bound) -> str:
             text = f"type({edge})"
         case PairNumber(function=function, a=a, b=b):
             text = as_written(function, a, b)
+        case Happened(kind=kind, nodes=nodes):
+            text = f"HAPPENS {kind}({', '.join(nodes)})"
         case LabelTest(node=node, kinds=kinds):
             text = f"{node} is {kinds_text(kinds)}"
         case _:

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 
 Attributes = Mapping[str, Any]
+NodePair = tuple["int | None", "int | None"]
+"""To whom something happens, and with whom."""
 
 
 @dataclass
@@ -46,6 +48,9 @@ class FrameView:
         Without it classes are not known.
     roles : callable, optional
         Gives what lanes are to the ego, by node id; asked as classes are.
+    events : mapping, optional
+        What has happened in the frame, and to whom: by kind, or by the name of a user's own table. By default
+        what the graph says.
     """
 
     graph: SceneGraph
@@ -53,6 +58,7 @@ class FrameView:
     trace: Attributes = field(default_factory=dict[str, Any])
     classes: Callable[[str], str | None] | None = None
     roles: Callable[[], Mapping[int, str]] | None = None
+    events: Mapping[str, Sequence[NodePair]] | None = None
 
     @cached_property
     def nodes(self) -> Mapping[int, Attributes]:
@@ -113,6 +119,15 @@ class FrameView:
     @cached_property
     def _roles(self) -> Mapping[int, str]:
         return self.roles() if self.roles else {}
+
+    def happens(self, asked: b.Happened, nodes: tuple[int, ...]) -> bool | None:
+        """Tell whether something happens to some nodes; ``None``: the trace does not say such things."""
+        told = (self.graph.events if self.events is None else self.events).get(asked.kind)
+        if told is None:
+            return None
+        if asked.table or not nodes:
+            return any(pair[: len(nodes)] == nodes for pair in told)
+        return any(nodes in {pair[: len(nodes)], pair[::-1][: len(nodes)]} for pair in told)
 
     def is_one(self, node: int, kinds: b.Kinds) -> bool:
         """Tell whether a node is of these kinds."""
@@ -263,6 +278,8 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
             return lambda at: at.view.trace.get(name)
         case b.PairNumber(function=function, a=one, b=other):
             return lambda at: at.view.pair(function, at.nodes[one], at.nodes[other])
+        case b.Happened(nodes=nodes):
+            return lambda at: at.view.happens(expression, tuple(at.nodes[one] for one in nodes))
         case b.BlockValue():
             return blocks(expression)
         case b.Choices(items=items):

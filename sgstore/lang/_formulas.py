@@ -17,6 +17,7 @@ from sgstore.lang.ir import (
     EdgeRelation,
     FrameAttribute,
     GroupKey,
+    Happened,
     LabelTest,
     NodeAttribute,
     NodeValue,
@@ -387,6 +388,79 @@ def _weather_text(word_: str, frame: str) -> str:
     return f"({last.text()})"
 
 
+# What is recorded as having happened -------------------------------------------------------------
+
+
+def happened_rows(happened: Happened) -> str:
+    """The statement for the frames in which something happens: ``frame_id``, and to whom: ``:0``, ``:1``."""
+    if happened.table:
+        return _rows_of_table(happened)
+    told, ends = [literal(happened.kind)], ('"node_id"', '"other"')
+    ways = [ends, ends[::-1]][: 1 + bool(happened.nodes)]  # of two it is told of either
+    rows: list[str] = []
+    for way in ways:
+        columns = [f'{end} AS ":{n}"' for n, end in enumerate(way[: len(happened.nodes)])]
+        rows.append(Select(['"frame_id"', *columns], ['"events"'], [f'"kind" = {told[0]}']).text())
+    return "\nUNION ALL\n".join(rows)
+
+
+def _rows_of_table(happened: Happened) -> str:
+    select = Select(['"u"."frame_id" AS "frame_id"'], [f'{quoted(happened.kind)} AS "u"'])
+    for place, name in enumerate(happened.table[: len(happened.nodes)]):
+        column = f'"u".{quoted(name)}'
+        if name.lower() in {"node_id", "other"}:
+            select.columns.append(f'TRY_CAST({column} AS BIGINT) AS ":{place}"')
+            continue
+        alias = quoted(f"e{place}")
+        on = [f'{alias}."trace_id" = "u"."frame_id" >> 24']
+        on.append(f'{alias}."ident" = CAST({column} AS VARCHAR)')
+        select.join(f'"entity" AS {alias}', on, "LEFT JOIN")
+        select.columns.append(f'{alias}."node_id" AS ":{place}"')
+    return select.text()
+
+
+def happened_text(happened: Happened, frame: str, nodes: Sequence[str]) -> str:
+    """Return the SQL of whether something happens in a frame to some nodes; NULL where nobody records it."""
+    where = [f'":e"."frame_id" = {frame}']
+    where += [f'":e".":{place}" = {node}' for place, node in enumerate(nodes)]
+    there = Select(["1"], [nested(happened_rows(happened), ":e")], where)
+    if happened.table:
+        return f"EXISTS ({there.text()})"
+    told = f"{frame} >> 24 IN ({told_events(happened.kind)})"
+    return f"CASE WHEN EXISTS ({there.text()}) THEN TRUE WHEN {told} THEN FALSE END"
+
+
+def happened_in_frame(happened: Happened) -> str:
+    """The statement for those to whom something happens in a frame: two columns, NULL where there is nobody."""
+    told = [f'":{place}"' for place in range(len(happened.nodes))]
+    columns = [*told, "NULL", "NULL"][:2]
+    rows = nested(happened_rows(happened), ":e")
+    return Select(columns, [rows], ['"frame_id" = $1']).text()
+
+
+EVENT_SCHEMAS: Final = {
+    "collision": "CarlaCollisionEvent",
+    "lane_invasion": "CarlaLaneInvasionEvent",
+}
+"""Ends of the names of the schemas of channels that tell of events: such a recording says if there are none."""
+
+
+def told_events(kind: str) -> str:
+    """The statement for the traces that record events of a kind: there is one, or a channel for them."""
+    events = Select(['"trace_id"'], ['"event"'], [f'"kind" = {literal(kind)}'])
+    if kind not in EVENT_SCHEMAS:
+        return events.text()
+    end = literal(f"%{EVENT_SCHEMAS[kind]}")
+    channels = Select(['"trace_id"'], ['"channel"'], [f'"schema" LIKE {end}'])
+    return f"{events.text()}\nUNION\n{channels.text()}"
+
+
+def recorded_events(schemas: Iterable[str]) -> frozenset[str]:
+    """Kinds of events that a recording with channels of some schemas records."""
+    names = tuple(schemas)
+    return frozenset(k for k, end in EVENT_SCHEMAS.items() if any(n.endswith(end) for n in names))
+
+
 # Expressions ---------------------------------------------------------------------------------------
 
 Leaf = (
@@ -397,6 +471,7 @@ Leaf = (
     | FrameAttribute
     | TraceAttribute
     | PairNumber
+    | Happened
     | BlockValue
     | GroupKey
 )
@@ -515,6 +590,8 @@ def column_of(leaf: Leaf) -> str:
             owner, name = "trace", attribute.name
         case PairNumber(function=function, a=a, b=b):
             return f"{function}({a}, {b})"
+        case Happened(kind=kind, nodes=nodes):
+            return f"happens {kind}({', '.join(nodes)})"
         case BlockValue(number=number):
             return f"block {number}"
         case GroupKey(name=name):

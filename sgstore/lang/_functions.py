@@ -17,10 +17,12 @@ from sgstore.lang._operators import EXTREMES, NUMERIC, OF_TEXT, OF_TWO
 from sgstore.lang._symbols import CLASSES, Symbol, SymbolTable, abstraction_named, class_count
 from sgstore.lang.library import pattern_named, patterns, predicates
 from sgstore.pair_numbers import LANE_DIST, NEXT_PARTS, PAIR_FUNCTIONS, PART_DIST
-from sgstore.vocabulary import entity_kinds, normalize_name, relation_named
+from sgstore.vocabulary import EVENT_KINDS, entity_kinds, normalize_name, relation_named
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from sgstore.lang._catalog import TableFacts
 
 
 _OTHERS: Final = frozenset(
@@ -271,6 +273,97 @@ def _class_count(e: s.Call, names: SymbolTable) -> b.FrameAttribute:
 def _after_in(e: s.Call, names: SymbolTable) -> b.Bound:
     names.session.refuse(
         f"{e.name}() may stand after IN only", e.span, f"write frame.class IN {e.name}('train')"
+    )
+
+
+# What is recorded as having happened ------------------------------------------------------------------
+
+
+def happens(e: s.HappensExpression, names: SymbolTable) -> b.Happened:
+    """Whether the recording, or a table of a user's own, says that something has happened in the frame.
+
+    Raises
+    ------
+    QueryNameError
+        There are no such events, and no such table.
+    QueryError
+        It does not happen to so many, or not to such nodes.
+    """
+    session, wanted = names.session, normalize_name(e.kind)
+    kind = next((one for one in EVENT_KINDS if normalize_name(one) == wanted), None)
+    table = session.tables.get(e.kind)
+    if table is None and kind is None:
+        session.unknown("event", e.kind, e.kind_span, (*EVENT_KINDS, *session.tables), _no_event(e))
+    nodes = tuple(_to_whom(e, argument, names) for argument in e.arguments)
+    if len(set(nodes)) < len(nodes):
+        session.refuse("what happens between two happens to two nodes", e.span)
+    if table is not None:
+        return b.Happened(table.name, nodes, _columns_of(table, e, names))
+    assert kind is not None  # noqa: S101 - it was refused above
+    if len(nodes) > EVENT_KINDS[kind]:
+        most = {0: "to nobody: it is of the frame", 1: "to one node", 2: "to two nodes at most"}
+        session.refuse(
+            f"{kind} happens {most[EVENT_KINDS[kind]]}, found {len(nodes)}",
+            e.span,
+            f"write HAPPENS {kind}({', '.join('ev'[: EVENT_KINDS[kind]])})",
+        )
+    return b.Happened(kind, nodes)
+
+
+def _no_event(e: s.HappensExpression) -> str | None:
+    """Return a hint for what is no event, but may be told of frames otherwise; ``None``: no idea."""
+    word = normalize_name(e.kind)
+    if word in predicates() or relation_named(e.kind) or word in map(normalize_name, FUNCTIONS):
+        called = ", ".join(a.name if isinstance(a, s.Variable) else "a" for a in e.arguments)
+        how = (
+            f"EXISTS {{(a)-[:{e.kind}]->(b)}}" if relation_named(e.kind) else f"{e.kind}({called})"
+        )
+        return f"it is no event that is recorded, but a condition: {how}"
+    return None
+
+
+def _to_whom(e: s.HappensExpression, argument: s.Expression, names: SymbolTable) -> str:
+    """The key of a node to whom something happens."""
+    found = names.bind(argument)
+    if not isinstance(found, b.NodeValue):
+        names.session.refuse(
+            f"{e.kind} happens to nodes, and this is a {found.type.value}",
+            argument.span,
+            f"write HAPPENS {e.kind}(v)",
+        )
+    kinds = names.scope.kinds(found.node).every
+    if not kinds & entity_kinds():
+        names.session.refuse(
+            f"{e.kind} happens to entities, and this is a {' or '.join(sorted(kinds))}",
+            argument.span,
+        )
+    return found.node
+
+
+_WHOM: Final = (("node_id", "other"), ("ident", "other_ident"))
+"""Columns of a table of a user's own that say to whom something happens: node ids, or the simulator's ids."""
+
+
+def _columns_of(table: TableFacts, e: s.HappensExpression, names: SymbolTable) -> tuple[str, ...]:
+    """The columns that say to whom what a table tells of happens; an empty one if nobody is asked for."""
+    if not table.joins:
+        names.session.refuse(
+            f"the rows of {table.name} belong to no frames",
+            e.kind_span,
+            "it needs frame_id, or trace and one of seq, time_ns, t",
+        )
+    if len(e.arguments) > len(_WHOM[0]):
+        names.session.refuse(f"{table.name} happens to two nodes at most", e.span)
+    there = {name.lower(): name for name in table.columns}
+    for known in _WHOM:
+        chosen = known[: len(e.arguments)]
+        if all(name in there for name in chosen):
+            return tuple(there[name] for name in chosen) or ("",)
+    return names.session.refuse(
+        f"{table.name} does not say to whom: it has no column"
+        f" {' or '.join(' and '.join(known[: len(e.arguments)]) for known in _WHOM)}",
+        e.span,
+        f"of the frame it says: HAPPENS {e.kind}()",
     )
 
 

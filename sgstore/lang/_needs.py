@@ -227,15 +227,20 @@ class Need:
         What it may be.
     attribute : Attribute or None
         That must be known of it in some frame, if there is one; ``None``: that there is one.
+    event : str
+        The kind of event that it must tell of; else empty.
     """
 
     node: str
     kinds: b.Kinds | None
     attribute: Attribute | None
+    event: str = ""
 
     @property
     def reason(self) -> str:
         """Message about a trace that does not meet it."""
+        if self.event:
+            return f"it does not record events of the kind {self.event}"
         if self.attribute is None:
             return "it has no ego"
         of = "" if self.kinds is None else f" of {self.node}"
@@ -267,13 +272,15 @@ def of_query(query: b.Query) -> tuple[Need, ...]:
         found |= {Need(k, n.kinds, None) for k, n in scope.nodes.items() if n.kinds.one_a_frame}
         found |= _of_each([*scope.where, *when], scope.nodes, strict=False)
     # One ego is as good as another.
-    egos = {need.kinds: need for need in found if need.attribute is None}
-    return _ordered({need for need in found if need.attribute is not None} | {*egos.values()})
+    egos = {need.kinds: need for need in found if need.attribute is None and not need.event}
+    others = {need for need in found if need.attribute is not None or need.event}
+    return _ordered(others | {*egos.values()})
 
 
 def _ordered(needs: set[Need]) -> tuple[Need, ...]:
-    def rank(need: Need) -> tuple[bool, str, str]:
-        return need.attribute is not None, need.node, need.attribute.name if need.attribute else ""
+    def rank(need: Need) -> tuple[bool, str, str, str]:
+        name = need.attribute.name if need.attribute else ""
+        return need.attribute is not None, need.node, name, need.event
 
     return tuple(sorted(needs, key=rank))
 
@@ -323,6 +330,8 @@ def _needed(  # noqa: C901, PLR0911 - a case each
             DisplayUnit.clock,
         }:
             return {Need("", None, attribute)}
+        case b.Happened(kind=kind, table=()):
+            return {Need("", None, None, kind)}
         case b.BlockValue(scope=scope, value=value):
             inner = [*scope.where, *([value] if value is not None else [])]
             return _of_each(

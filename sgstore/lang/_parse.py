@@ -512,7 +512,7 @@ def _listed(machine: Tables, names: list[str]) -> str:
     if left >= _STARTS:
         said += ["a value", "a condition"]
         left -= _STARTS | {"NAME", "LPAR", "LSQB", "COUNT", "AGGREGATE", "DURATION", "TEMPORAL"}
-        left -= {"CASE"}
+        left -= {"CASE", "HAPPENS"}
         left -= {"SIGN", "NOT"}
     elif {"SIGN", "STAR"} <= left:
         said.append("an operator")

@@ -18,6 +18,7 @@ from sgstore.lang.ir import (
     Bound,
     EdgeAttribute,
     EdgeRelation,
+    Happened,
     NodeAttribute,
     NodeValue,
     Operation,
@@ -109,6 +110,8 @@ class Phases:
         Edge → conditions on its attributes alone: by masks.
     direct : list
         On node ids, relations and constants: where the edges are joined.
+    happened : list of Happened
+        What must have happened: joined as edges are.
     trace : list
         On the trace alone: on the bucket.
     rest : list
@@ -123,6 +126,7 @@ class Phases:
     single: dict[str, list[Bound]] = field(default_factory=dict[str, list[Bound]])
     lane: dict[str, list[Bound]] = field(default_factory=dict[str, list[Bound]])
     direct: list[Bound] = field(default_factory=list[Bound])
+    happened: list[Happened] = field(default_factory=list[Happened])
     trace: list[Bound] = field(default_factory=list[Bound])
     rest: list[Bound] = field(default_factory=list[Bound])
     late: set[str] = field(default_factory=set[str])
@@ -139,7 +143,8 @@ def phases_of(scope: Scope, query: Query, catalog: Catalog) -> Phases:
         parts.rest += parts.single.pop(key)
     parts.rest += [c for c in parts.direct if nodes_of(c) & parts.late]
     parts.direct = [c for c in parts.direct if not nodes_of(c) & parts.late]
-    first = scope.outer or scope.edges or parts.blocks or set(scope.nodes) - parts.late
+    tied = scope.outer or scope.edges or parts.blocks or parts.happened
+    first = tied or set(scope.nodes) - parts.late
     parts.empty = bool(parts.late) and not first
     if parts.empty:
         parts.rest += parts.trace + parts.direct
@@ -150,6 +155,9 @@ def phases_of(scope: Scope, query: Query, catalog: Catalog) -> Phases:
 def _file(condition: Bound, parts: Phases) -> None:
     if is_masked(condition):
         parts.blocks.append(condition)
+        return
+    if isinstance(condition, Happened):
+        parts.happened.append(condition)
         return
     found = set(leaves(condition))
     if all(_is_direct(leaf) for leaf in found):
@@ -208,6 +216,7 @@ def _late(scope: Scope, parts: Phases, query: Query, catalog: Catalog) -> Iterat
     To bind them by their presence would mean to group all states into masks, and to expand these again.
     """
     bound_nodes = {key for edge in scope.edges for key in (edge.src, edge.dst)}
+    bound_nodes |= {key for one in parts.happened for key in one.nodes}
     compared = {key for condition in parts.rest for key in nodes_of(condition)}
     alone = scope is query.scope and len(scope.nodes) == 1
     spoken_of = blocked(query)

@@ -23,6 +23,7 @@ from sgstore.lang._formulas import (
     edge_table,
     expression_text,
     frame_text,
+    happened_text,
     is_position,
     lane_text,
     leaves,
@@ -61,6 +62,7 @@ from sgstore.lang.ir import (
     EdgeRelation,
     FrameAttribute,
     GroupKey,
+    Happened,
     NodeAttribute,
     NodeValue,
     Operation,
@@ -718,6 +720,8 @@ def _value_text(  # noqa: PLR0911 - a case each
             return frame_text(leaf, FRAME, TRACE, MAP)
         case BlockValue():
             return _of_block(sql, join, given, leaf)
+        case Happened(nodes=nodes):
+            return happened_text(leaf, join.frame, [join.nodes[key] for key in nodes])
         case PairNumber():  # along lanes; the others are computed in layers
             return _of_ways(sql, join, scope, leaf)
         case GroupKey():  # which stands above groups only

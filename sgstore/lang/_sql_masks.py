@@ -20,6 +20,7 @@ from sgstore.lang._formulas import (
     columns_of,
     edge_table,
     expression_text,
+    happened_rows,
     is_constant,
     is_position,
     lane_text,
@@ -47,6 +48,7 @@ from sgstore.lang._rewrite import (
 from sgstore.lang.ir import (
     Bound,
     Edge,
+    Happened,
     Node,
     NodeAttribute,
     Scope,
@@ -465,6 +467,8 @@ def base_rows(
     for edge in scope.edges:
         _join_edge(sql, base, scope, edge)
     single = dict(parts.single)
+    for number, happened in enumerate(parts.happened):
+        _join_happened(sql, base, happened, f":happened {number}")
     for key in scope.nodes:
         if key not in parts.late and key not in base.present:
             _join_presence(sql, base, key, scope.kinds(key), single.pop(key, []))
@@ -533,6 +537,18 @@ def _join_edge(sql: SqlBuilder, base: Base, scope: Scope, edge: Edge) -> None:
             base.tie(f'"map_edge" AS {alias}', ends, on)
         else:
             base.join(f'"edge" AS {alias}', alias, ends, on)
+
+
+def _join_happened(sql: SqlBuilder, base: Base, happened: Happened, name: str) -> None:
+    """The frames in which something happens; that those to whom it does are there is another matter."""
+    keys = [quoted(f":{place}") for place in range(len(happened.nodes))]
+    rows, alias = happened_rows(happened), quoted(name)
+    inner = Select(['"frame_id"', *keys], [nested(rows, ":events")], sql.within('"frame_id"', 64))
+    inner.where.append('"frame_id" IS NOT NULL')
+    ends = {key: f"{alias}.{column}" for key, column in zip(happened.nodes, keys, strict=True)}
+    there = set(base.present)
+    base.join(nested(folded(inner.text(), keys), name), alias, ends)
+    base.present = there
 
 
 def told_kinds(sql: SqlBuilder, scope: Scope, parts: Phases) -> frozenset[str]:

@@ -135,6 +135,11 @@ def _call_of_distinct(span: TextSpan, children: Children) -> s.Call:
     return s.Call(name.text, arguments, distinct=True, name_span=name.span, span=span)
 
 
+def _happens(span: TextSpan, children: Children) -> s.HappensExpression:
+    _, kind, arguments = children
+    return s.HappensExpression(kind.text, arguments or (), kind.span, span)
+
+
 def _count_all(span: TextSpan, _: Children) -> s.CountAll:
     return s.CountAll(span)
 
@@ -633,6 +638,7 @@ BUILDERS: Final[dict[str, Callable[[TextSpan, Children], Any]]] = {
     "variable": _variable,
     "call": _call,
     "call_of_distinct": _call_of_distinct,
+    "happens": _happens,
     "count_all": _count_all,
     "count_values": _count_values,
     "exists": partial(_block_expression, "EXISTS"),

@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.lang import ir as b
 from sgstore.lang._catalog import FRAME_ATTRIBUTES, DisplayUnit
-from sgstore.lang._evaluate import Binding, FrameView
-from sgstore.lang._formulas import leaves
+from sgstore.lang._evaluate import Binding, FrameView, NodePair
+from sgstore.lang._formulas import happened_in_frame, leaves, told_events
 from sgstore.lang._operators import INFIX
+from sgstore.lang._plan import TRACE_OF_FRAME
 from sgstore.lang._search import ScopeSearch, expression
 from sgstore.pair_numbers import as_written
-from sgstore.vocabulary import KINDS, RELATIONS, SUPER_KINDS, entity_kinds
+from sgstore.vocabulary import EVENT_KINDS, KINDS, RELATIONS, SUPER_KINDS, entity_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -183,6 +184,8 @@ class Writer:
                 text = f"type({self.edge_name(edge)})"
             case b.PairNumber(function=function, a=one, b=other):
                 text = as_written(function, self.name(one), self.name(other))
+            case b.Happened(kind=kind, nodes=nodes):
+                text = f"HAPPENS {kind}({', '.join(map(self.name, nodes))})"
             case b.TraceAttribute(attribute=attribute):
                 text = f"trace.{attribute.name}"
             case b.FrameAttribute():
@@ -422,6 +425,50 @@ def looked_up(query: b.Query) -> list[b.FrameAttribute]:
                     look(leaf.scope)
                 elif isinstance(leaf, b.FrameAttribute) and leaf.attribute.of_store:
                     found[leaf.attribute.name] = leaf
+
+    for scope in (query.scope, *(step.scope for step in query.steps)):
+        look(scope)
+    return list(found.values())
+
+
+def events_in(query: b.Query, frame_id: int, ask: Ask) -> dict[str, list[NodePair]]:
+    """Events of a frame of which a query speaks, by kind: to whom they happen.
+
+    Parameters
+    ----------
+    query : Query
+    frame_id : int
+    ask : function
+        Gives the rows of a statement with its values.
+
+    Returns
+    -------
+    dict
+        Kind, or the name of a user's own table → nodes. A kind that the trace does not record is left out.
+    """
+    found: dict[str, list[NodePair]] = {}
+    for one in _happened_anywhere(query):
+        if one.table or frame_id >> TRACE_OF_FRAME in {
+            row[0] for row in ask(told_events(one.kind), [])
+        }:
+            pairs = ask(happened_in_frame(one), [frame_id])
+            found[one.kind] = [(pair[0], pair[1]) for pair in pairs]
+    return found
+
+
+def _happened_anywhere(query: b.Query) -> list[b.Happened]:
+    """Return what a query asks whether it has happened, each kind once, of as many nodes as may be."""
+    found: dict[str, b.Happened] = {}
+
+    def look(scope: b.Scope) -> None:
+        for leaf in (leaf for condition in scope.where for leaf in leaves(condition)):
+            if isinstance(leaf, b.BlockValue):
+                look(leaf.scope)
+            elif isinstance(leaf, b.Happened):
+                most = "" if leaf.table else "a" * EVENT_KINDS[leaf.kind]
+                wider = leaf if leaf.table else replace(leaf, nodes=tuple(most))
+                known = found.get(leaf.kind, wider)
+                found[leaf.kind] = max(known, wider, key=lambda one: len(one.nodes))
 
     for scope in (query.scope, *(step.scope for step in query.steps)):
         look(scope)

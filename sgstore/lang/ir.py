@@ -225,6 +225,27 @@ class PairNumber:
 
 
 @dataclass(frozen=True, slots=True)
+class Happened:
+    """Test that something is recorded as having happened in a frame.
+
+    Attributes
+    ----------
+    kind : str
+        Of the event: one of :data:`sgstore.vocabulary.EVENT_KINDS`; or the name of a table of a user's own.
+    nodes : tuple of str
+        To whom: none, one or two.
+    table : tuple of str
+        Of a table: the columns that say to whom, as many as there are nodes; for no node one that is empty.
+        Empty: it is an event of the recording, which says it of two in either order.
+    """
+
+    kind: str
+    nodes: tuple[str, ...]
+    table: tuple[str, ...] = ()
+    type: Type = Type.boolean
+
+
+@dataclass(frozen=True, slots=True)
 class Operation:
     """Anything that is computed of its operands: ``AND``, ``<``, ``+``, ``abs``, ``IN``, ``IS NULL``."""
 
@@ -383,6 +404,7 @@ Bound = (
     | FrameAttribute
     | TraceAttribute
     | PairNumber
+    | Happened
     | Operation
     | BlockValue
     | Aggregate
@@ -686,6 +708,8 @@ def nodes_of(expression: Bound) -> frozenset[str]:
                 found.add(node)
             case PairNumber(a=a, b=b):
                 found |= {a, b}
+            case Happened(nodes=nodes):
+                found |= set(nodes)
             case BlockValue(scope=scope):
                 found |= set(scope.outer)
             case _:

@@ -202,6 +202,16 @@ class OverExpression:
     span: TextSpan
 
 
+@dataclass(frozen=True, slots=True)
+class HappensExpression:
+    """``HAPPENS kind(arguments)``: whether something is recorded as having happened in the frame."""
+
+    kind: str
+    arguments: tuple[Expression, ...]
+    kind_span: TextSpan
+    span: TextSpan
+
+
 Expression = (
     Constant
     | Duration
@@ -221,6 +231,7 @@ Expression = (
     | Case
     | Temporal
     | OverExpression
+    | HappensExpression
 )
 
 

@@ -6,7 +6,7 @@ Which message of each channel belongs to a frame, and where it stands.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from sgstore.errors import StoreError
 from sgstore.store._columns import chained
 from sgstore.store._packing import frame_ids, texts
 from sgstore.vocabulary import suggestion
+from sgstore.world import nearest_frames
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -246,12 +247,8 @@ def _no_payload(connection: DuckDBPyConnection, frame: FrameRef, channel: str) -
 
 # Events of a trace → rows, each with the frame that is nearest in time --------------------------
 
-FAR_NS: Final = 1_000_000_000
-"""An event whose simulation time is farther than this from all frames near it goes by log time instead."""
 MOST_WAITING: Final = 10_000
 """Events that wait for the frames to come."""
-
-_PIECE: Final = 4096
 
 
 class Happenings:
@@ -279,7 +276,7 @@ class Happenings:
         known = np.hstack([self._last, np.stack([frames.time_ns, frames.log_time_ns, ids])])
         self._last = known[:, -1:]
         events = [*self._waiting, *frames.events]
-        frame = _nearest(events, known[0], known[1])
+        frame = nearest_frames(events, known[0], known[1])
         waits = frame == known.shape[1] - 1
         if len(events) > MOST_WAITING:
             waits[:] = False
@@ -291,19 +288,6 @@ class Happenings:
         """The same of events for which no other frame came."""
         events, self._waiting = self._waiting, []
         return _columns(events, self._last[2][np.zeros(len(events), np.intp)])
-
-
-def _nearest(events: Sequence[Event], time_ns: Any, log_time_ns: Any) -> Ints:
-    """For each event the row of the nearest frame; of two that are as near the first."""
-    found: list[Ints] = [np.zeros(0, np.int64)]
-    for start in range(0, len(events), _PIECE):
-        some = events[start : start + _PIECE]
-        apart = np.abs(np.array([event.time_ns for event in some])[:, None] - time_ns)
-        row = apart.argmin(axis=1)
-        far = apart[np.arange(len(row)), row] > FAR_NS
-        logged = np.abs(np.array([event.log_time_ns for event in some])[:, None] - log_time_ns)
-        found.append(np.where(far, logged.argmin(axis=1), row))
-    return np.concatenate(found)
 
 
 def _columns(events: Sequence[Event], frame_id: Ints) -> Columns:

@@ -26,12 +26,13 @@ from sgstore.lang import (
     of_check,
     of_query,
     parse,
+    recorded_events,
 )
 from sgstore.lang.syntax import CheckClause, Define, MatchClause, Parameter
 from sgstore.map_files import Maps, lost_lanes
 from sgstore.readers import on_map, open_trace
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.step import GcPaused, Replay
+from sgstore.step import GcPaused, replayed
 from sgstore.temporal._check_monitor import CheckMonitor
 from sgstore.temporal._checks import Verdict
 from sgstore.temporal._sequence_monitor import FrameTime, MonitorEvent, SequenceMonitor
@@ -110,9 +111,9 @@ def opened(
         told.losses += [loss.reason for loss in lost_lanes(trace.info, found)]
 
         def frames() -> Iterator[Frame]:
-            replay = Replay()
-            for block in trace.blocks():
-                yield from replay.frames(block)
+            yield from replayed(
+                trace.blocks(), recorded_events(c.schema for c in trace.info.channels)
+            )
             told.warnings += trace.report.warnings
             told.losses += [loss.reason for loss in trace.report.losses]
 
@@ -138,6 +139,7 @@ def _live(source: str, ego: str) -> FrameSource:
         while True:
             live.world.wait_for_tick()
             frame = live.frame()
+            frame.recorded = frozenset()  # its sensors are not asked
             told.warnings[:] = live.warnings
             yield frame
 
@@ -415,6 +417,8 @@ class _PendingEvents:
         return told
 
     def _told(self, need: Need, people: NodeNames) -> bool:
+        if need.event:
+            return people.records(need.event)
         if need.kinds is None:
             return False  # nobody tells it while a trace goes on
         present = people.of(need.kinds)

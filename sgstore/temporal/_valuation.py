@@ -238,6 +238,10 @@ class NodeNames:
         """An attribute of a node; ``None``: it is not known."""
         return self._view.nodes[node].get(attribute)
 
+    def records(self, kind: str) -> bool:
+        """Tell whether the trace says of events of a kind that they happen, or do not."""
+        return kind in self._view.graph.events
+
     def name(self, node: int) -> str:
         """Return the name of a node."""
         return str(self._view.nodes[node].get("name", node))
