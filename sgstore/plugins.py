@@ -95,6 +95,7 @@ READERS: Final = Registry(
         "readers",
         osi="osi._trace:OsiTrace",
         carla="carla._trace:CarlaTrace",
+        autoware="autoware._trace:AutowareTrace",
         foxglove="foxglove._trace:FoxgloveTrace",
     ),
     "flavour",

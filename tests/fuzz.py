@@ -32,6 +32,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from unittest import mock
 
+import autoware_recordings
 import carla_recordings
 import fuzz_texts
 import numpy as np
@@ -159,6 +160,7 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     "foxglove protobuf": lambda path: foxglove(path, "protobuf"),
     "foxglove json": lambda path: foxglove(path, "json"),
     "carla": lambda path: carla_recordings.drive(path, FRAMES, everything=True),
+    "autoware": lambda path: autoware_recordings.drive(path, FRAMES),
 }
 FLAVOURS = [*WRITERS, ".osi", ".osi.zst"]
 """Flavours of recordings."""

@@ -8,6 +8,7 @@ by the schemas of its channels, and reads it. ``docs/flavours.md`` says how to a
 from __future__ import annotations
 
 import inspect
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
@@ -177,14 +178,38 @@ def read_messages(
         yield _read_osi_message(path, chunk_offset=chunk_offset, offset=offset, length=length)
 
 
+_LOOKS: Final = (
+    (re.compile(r"(autoware|tier4)_"), "Autoware recording"),
+    (re.compile(r"carla_msgs/"), "recording of CARLA's ROS bridge"),
+    (re.compile(r"apollo\."), "Apollo recording"),
+    (re.compile(r"foxglove\."), "recording in Foxglove's schemas"),
+    (re.compile(r"osi3\."), "OSI recording"),
+    (re.compile(r"\w+/(msg/)?[A-Z]\w*$"), "ROS recording"),
+)
+"""How names of schemas begin → what a recording with one of them looks like; the first that fits."""
+_TELLS_OBJECTS: Final = re.compile(
+    r"object|track|detect|obstacle|truth|actor|entit|marker|scene", re.IGNORECASE
+)
+_HELP: Final = "docs/flavours.md says how a flavour of your own reads them, in one file"
+
+
 def _no_reader(recording: Recording) -> str:
-    """The reason why nothing recognises a recording: its channels."""
-    listed: list[str] = []
+    """The reason why nothing recognises a recording: what it looks like, and its channels.
+
+    Those that may tell objects come first.
+    """
+    listed: list[tuple[bool, str]] = []
+    schemas: list[str] = []
     for _, record in sorted(recording.channels.items()):
         schema = recording.schemas.get(record.schema_id)
-        listed.append(f"{record.topic!r} ({schema.name if schema else 'no schema'})")
+        name = schema.name if schema else "no schema"
+        schemas.append(name)
+        listed.append((not _TELLS_OBJECTS.search(name), f"{record.topic!r} ({name})"))
     more = f" and {len(listed) - 12} more" if len(listed) > 12 else ""
     known = ", ".join(reader.name for reader in READERS)
     if not listed:
         return f"no channel has any message; expected ground truth of a flavour known: {known}"
-    return f"no ground truth of a flavour known ({known}); its channels: {', '.join(listed[:12])}{more}"
+    looks = (look for begins, look in _LOOKS if any(map(begins.match, schemas)))
+    look = next((f"{look}: " for look in looks), "")
+    channels = ", ".join(text for _, text in sorted(listed, key=lambda one: one[0])[:12])
+    return f"{look}no ground truth of a flavour known ({known}); its channels: {channels}{more}; {_HELP}"

@@ -1,0 +1,5 @@
+"""Recordings of Autoware, in rosbag2's MCAP."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,273 @@
+"""The first reading of an Autoware recording: which objects lead, what they are, where the ego's pose is told.
+
+Topics are free and tell nothing; schemas do. The class of an object may change from message to message: it is
+what it is called most often.
+
+Source: autoware_msgs (message definitions), Autoware Foundation, Apache-2.0.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.errors import TraceError
+from sgstore.readers._base import Lead, Survey, ref_of
+from sgstore.readers._ros2 import ColumnReader, decode, parse_definition, records, short_name, text
+
+if TYPE_CHECKING:
+    from mcap.records import Channel, Schema
+
+    from sgstore.mcap import Messages, Recording
+    from sgstore.readers._base import Ref
+    from sgstore.readers._ros2 import Struct
+    from sgstore.world import Floats
+
+OBJECTS: Final = "objects"
+POSE_OF_EGO: Final = "pose"
+TRANSFORMS: Final = "transforms"
+LIGHTS: Final = "lights"
+GEAR: Final = "gear"
+INDICATORS: Final = "indicators"
+HAZARDS: Final = "hazards"
+
+_PACKAGES: Final = ("autoware_", "autoware_auto_")
+"""How names of packages begin; the second is that of releases before 2024."""
+_NAMES: Final = {
+    "perception_msgs/TrackedObjects": OBJECTS,
+    "perception_msgs/PredictedObjects": OBJECTS,
+    "perception_msgs/DetectedObjects": OBJECTS,
+    "perception_msgs/TrafficLightGroupArray": LIGHTS,
+    "perception_msgs/TrafficSignalArray": LIGHTS,
+    "localization_msgs/KinematicState": POSE_OF_EGO,
+    "vehicle_msgs/GearReport": GEAR,
+    "vehicle_msgs/TurnIndicatorsReport": INDICATORS,
+    "vehicle_msgs/HazardLightsReport": HAZARDS,
+}
+CONTENTS: Final = {
+    **{package + name: content for package in _PACKAGES for name, content in _NAMES.items()},
+    "nav_msgs/Odometry": POSE_OF_EGO,
+    "tf2_msgs/TFMessage": TRANSFORMS,
+}
+"""Schema → what its messages are."""
+RANK: Final = {"DetectedObjects": 1, "PredictedObjects": 2, "TrackedObjects": 3}
+"""The lists of objects; the greatest that has any leads."""
+
+EGO: Final = "ego"
+"""Id of the ego."""
+STATIC: Final = "tf_static"
+"""End of the topic of transforms that hold for ever, which is a constant of ROS itself."""
+MAP: Final = "map"
+_MOST_CLASSES: Final = 4
+_MOST_OBJECTS: Final = 100_000
+"""Objects of which the classes are counted; later ones are what they are called first."""
+_MOST_AXES: Final = 1000
+"""Axes whose parents are remembered."""
+LABELS: Final = (
+    *("unknown", "car", "truck", "bus", "trailer", "motorcycle", "bicycle", "pedestrian"),
+    *("animal", "hazard", "over_drivable", "under_drivable"),
+)
+"""``ObjectClassification.label``."""
+_UUID: Final = tuple(f"object_id.uuid[{i}]" for i in range(16))
+_CLASSES: Final = tuple(
+    f"classification[{i}].{field}"
+    for i in range(_MOST_CLASSES)
+    for field in ("label", "probability")
+)
+CLASS_COLUMNS: Final = (*_UUID, *_CLASSES)
+
+
+@dataclass(slots=True)
+class ObjectLead(Lead):
+    """A channel of objects; ``order``: of the kind of list; ``objects``: how many it tells in all."""
+
+    order: int = 0
+    objects: int = 0
+
+
+def content_of(recording: Recording, channel: int) -> str:
+    """Kind of content that the messages of a channel have; empty where the reader does not know them."""
+    record = recording.channels[channel]
+    schema = recording.schemas.get(record.schema_id)
+    if schema is None or not _is_ros(record, schema):
+        return ""
+    return CONTENTS.get(short_name(schema.name), "")
+
+
+def _is_ros(channel: Channel, schema: Schema) -> bool:
+    return channel.message_encoding == "cdr" and schema.encoding == "ros2msg"
+
+
+def idents_of(table: Floats) -> list[str]:
+    """Ids of objects as hexadecimal digits; empty: none. The columns begin with :data:`CLASS_COLUMNS`."""
+    uuids = table[:, : len(_UUID)]
+    known = np.all(np.isfinite(uuids), axis=1, keepdims=True)[:, 0]
+    rows = np.nan_to_num(uuids).astype(np.uint8)
+    return [row.tobytes().hex() if there else "" for row, there in zip(rows, known, strict=True)]
+
+
+def labels_of(table: Floats) -> list[str]:
+    """The most probable class of each object; columns as in :func:`idents_of`."""
+    classes = table[:, len(_UUID) : len(CLASS_COLUMNS)].reshape(len(table), _MOST_CLASSES, 2)
+    likely = np.argmax(np.nan_to_num(classes[:, :, 1], nan=-1.0), axis=1)
+    label = np.nan_to_num(classes[np.arange(len(table)), likely, 0]).astype(np.int64)
+    return [LABELS[one] if 0 <= one < len(LABELS) else LABELS[0] for one in label.tolist()]
+
+
+class AutowareSurvey(Survey[ObjectLead]):
+    """Findings of the first reading of a recording.
+
+    Attributes
+    ----------
+    contents : dict
+        Channel id → kind of content of its messages, such as :data:`OBJECTS`.
+    structures : dict
+        Channel id → structure of its messages.
+    pose_channel : int
+        The channel that tells the pose of the ego; -1: none does.
+    world, ego_axes : str
+        The axes that stand still, and those that move with the ego.
+    """
+
+    def __init__(self, recording: Recording, wanted: str) -> None:
+        super().__init__(recording, wanted)
+        self.contents: dict[int, str] = {}
+        self.structures: dict[int, Struct] = {}
+        self.pose_channel = -1
+        self.world, self.ego_axes = MAP, "base_link"
+        self._tables: dict[int, ColumnReader] = {}
+        self._poses: dict[int, tuple[str, str, int]] = {}
+        self._parents: dict[str, str] = {}
+        self._frames: dict[int, str] = {}
+        self._classes: dict[str, Counter[str]] = {}
+        self._static: list[Ref] = []
+        self._looks = 0
+
+    # What was found ----------------------------------------------------------------------------------
+
+    def rank(self, lead: ObjectLead) -> tuple[int, ...]:
+        """Order by whether there are objects at all, then by the kind of list, then by frames."""
+        return lead.objects > 0, lead.order, lead.frames
+
+    def label_of(self, ident: str, first: str) -> str:
+        """The class that an object is called most often; ``first``: the one that it is called now."""
+        counts = self._classes.get(ident)
+        return max(counts, key=counts.__getitem__) if counts else first
+
+    def no_frames(self) -> str:
+        """The reason why no channel leads."""
+        lost = self.lost.losses()
+        return lost[0].reason if lost else "no list of objects can be read"
+
+    def find_ego(self) -> str:
+        """Find the channel of the ego's pose and the axes, and return the ego's id."""
+        found = [
+            (parent == MAP, child == "base_link", count, -channel)
+            for channel, (parent, child, count) in self._poses.items()
+        ]
+        frame = self._frames.get(self.leading, "")
+        roots = set(self._parents.values()) - set(self._parents)
+        if found:
+            self.pose_channel = -max(found)[-1]
+            self.world, child, _ = self._poses[self.pose_channel]
+            self.ego_axes = child or self.ego_axes
+        elif MAP not in roots:
+            self.world = roots.pop() if len(roots) == 1 else frame or MAP
+        there = bool(found) or self.ego_axes in self._parents
+        if self.wanted and self.wanted != EGO and self.wanted not in self._classes:
+            raise TraceError(f"no object has the id {self.wanted!r}; the vehicle itself is {EGO!r}")
+        if not there and not self.wanted:
+            self.about_ego.append(
+                "neither a pose of the vehicle nor a transform of base_link: there is no ego"
+            )
+        return self.wanted or (EGO if there else "")
+
+    def role(self, channel: int) -> str:
+        """The role of a channel."""
+        static = self.contents.get(channel) == TRANSFORMS and self.topic(channel).endswith(STATIC)
+        return "lasting" if static else super().role(channel)
+
+    def context(self) -> list[Ref]:
+        """Messages that later ones depend on: transforms that hold for ever, calibrations."""
+        return [*self._static, *super().context()]
+
+    # Channels ----------------------------------------------------------------------------------------
+
+    def meet(self, channel: int) -> bool:
+        """Return whether the messages of a channel are objects, poses or transforms."""
+        return self._content(channel) in {OBJECTS, POSE_OF_EGO, TRANSFORMS}
+
+    def keeps(self, channel: int) -> bool:
+        """Return whether the frames need the messages of a channel."""
+        return bool(self._content(channel))
+
+    def _content(self, channel: int) -> str:
+        if channel not in self.contents:
+            self.contents[channel] = content = content_of(self.recording, channel)
+            if content:
+                try:
+                    self._learn(channel, content)
+                except TraceError as error:
+                    self.contents[channel] = ""
+                    self.lost.add(f"channel {self.topic(channel)!r}: {error.reason}", 0)
+        return self.contents[channel]
+
+    def _learn(self, channel: int, content: str) -> None:
+        record = self.recording.channels[channel]
+        schema = self.recording.schemas[record.schema_id]
+        found = self.structures[channel] = parse_definition(schema.name, schema.data)
+        if content == OBJECTS:
+            self._tables[channel] = ColumnReader(found, CLASS_COLUMNS, "objects")
+            order = RANK[short_name(schema.name).rpartition("/")[2]]
+            self.leads[channel] = ObjectLead(order=order)
+
+    # One message -------------------------------------------------------------------------------------
+
+    def look(self, run: Messages, row: int) -> None:
+        """Look at one message; what cannot be read is reported when the frames are read."""
+        channel = int(run.channel[row])
+        content = self.contents[channel]
+        if content == OBJECTS:
+            self.count(run, row, 0)
+        with suppress(TraceError):
+            if content == OBJECTS:
+                self._take_objects(channel, run.data(row))
+            elif content == POSE_OF_EGO:
+                self._take_pose(channel, run.data(row))
+            else:
+                self._take_transforms(channel, run, row)
+
+    def _take_objects(self, channel: int, data: memoryview) -> None:
+        head, table = self._tables[channel].read(data)
+        self._frames.setdefault(channel, text(head, "header.frame_id"))
+        self.leads[channel].objects += len(table)
+        for ident, label in zip(idents_of(table), labels_of(table), strict=True):
+            if ident and (ident in self._classes or len(self._classes) < _MOST_OBJECTS):
+                counts = self._classes.setdefault(ident, Counter())
+                counts[label] += 1
+
+    def _take_pose(self, channel: int, data: memoryview) -> None:
+        parent, child, count = self._poses.get(channel, ("", "", 0))
+        if not count:
+            told = decode(self.structures[channel], data)
+            parent, child = text(told, "header.frame_id"), text(told, "child_frame_id")
+        self._poses[channel] = parent, child, count + 1
+
+    def _take_transforms(self, channel: int, run: Messages, row: int) -> None:
+        static = self.topic(channel).endswith(STATIC)
+        self._looks += not static
+        if not static and self._looks > _MOST_AXES:
+            return  # what moves in what does not change
+        told: list[dict[str, Any]] = records(
+            decode(self.structures[channel], run.data(row)), "transforms"
+        )
+        for one in told[:_MOST_AXES]:
+            if len(self._parents) < _MOST_AXES:
+                child = text(one, "child_frame_id")
+                self._parents.setdefault(child, text(one, "header.frame_id"))
+        if static and len(self._static) < _MOST_AXES:
+            self._static.append(ref_of(run, row))
