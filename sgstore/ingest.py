@@ -23,7 +23,7 @@ from sgstore.errors import SgstoreError, StoreError, TraceError
 from sgstore.map_files import Maps
 from sgstore.mcap import METADATA, bag_folder, mark_of, parts_of
 from sgstore.processes import command
-from sgstore.readers import ENDINGS
+from sgstore.readers import ENDINGS, is_recording
 from sgstore.segments import Job, Progress, SegmentReader, TraceOutcome
 from sgstore.store import Folder, PresentError, Sealed, StoreFile
 from sgstore.trace_parts import TracePart
@@ -84,7 +84,7 @@ def _inside(folder: Path) -> Iterator[Path]:
     own = {part.path for bag in bags for part in _parts(bag)}
     yield from bags
     for path in folder.rglob("*"):
-        if path.name.lower().endswith(ENDINGS) and path.is_file() and path not in own:
+        if is_recording(path) and path.is_file() and path not in own:
             yield path
 
 

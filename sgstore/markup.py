@@ -33,6 +33,8 @@ class MarkupParser:
         Called with the tag and the attributes of each element that begins.
     end : callable
         Called with the tag of each that ends.
+    text : callable, optional
+        Called with pieces of the text of elements, in order.
     most : int or None
         Elements that there may be; ``None``: any number, as in a stream that is not kept.
     whose : str
@@ -44,6 +46,7 @@ class MarkupParser:
         start: Callable[[str, dict[str, str]], None],
         end: Callable[[str], None],
         *,
+        text: Callable[[str], None] | None = None,
         most: int | None,
         whose: str = "maps",
     ) -> None:
@@ -54,6 +57,9 @@ class MarkupParser:
         self._parser.StartElementHandler = self._begins
         self._parser.EndElementHandler = self._ends
         self._parser.StartDoctypeDeclHandler = self._doctype
+        if text is not None:
+            self._parser.buffer_text = True
+            self._parser.CharacterDataHandler = text
 
     def feed(self, data: str | bytes, *, last: bool = False) -> None:
         """Take the next piece of the text.

@@ -97,6 +97,7 @@ READERS: Final = Registry(
         carla="carla._trace:CarlaTrace",
         autoware="autoware._trace:AutowareTrace",
         foxglove="foxglove._trace:FoxgloveTrace",
+        commonroad="commonroad._trace:CommonRoadTrace",
     ),
     "flavour",
 )

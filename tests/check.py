@@ -49,7 +49,7 @@ TESTS = {
     "plugins": "plugins relations abstractions flavours",
     "query": "query api datasets",
     "quoting": "user_tables",
-    "readers": "osi osi_* carla carla_* carlasgg autoware foxglove cdr flavours",
+    "readers": "osi osi_* carla carla_* carlasgg autoware foxglove commonroad cdr flavours",
     "rebuild": "rebuilding",
     "relations": "relations relations_*",
     "roads": "roads roads_* lane_dist lane_places",

@@ -34,6 +34,7 @@ from unittest import mock
 
 import autoware_recordings
 import carla_recordings
+import commonroad_scenarios
 import fuzz_texts
 import numpy as np
 import recordings
@@ -120,9 +121,18 @@ def foxglove(path: Path, encoding: str) -> None:
             recorder.camera(t, 30)
 
 
+def commonroad(path: Path) -> None:
+    source = path.with_suffix(".xml")
+    source.write_text(commonroad_scenarios.scenario(frames=FRAMES + 9))
+    commonroad_scenarios.as_mcap(path, source)
+
+
 @cache
 def sample(flavour: str) -> Sample:
     """The sample of a flavour, as it is."""
+    if flavour == ".xml":
+        text = commonroad_scenarios.scenario(frames=FRAMES + 9).encode()
+        return Sample([Channel("", "xml", "", "", b"")], [Message(0, 0, text)], flavour)
     if flavour.startswith(".osi"):
         version = b"\x0a\x04\x08\x03\x10\x05"
         messages = [
@@ -161,8 +171,9 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     "foxglove json": lambda path: foxglove(path, "json"),
     "carla": lambda path: carla_recordings.drive(path, FRAMES, everything=True),
     "autoware": lambda path: autoware_recordings.drive(path, FRAMES),
+    "commonroad": commonroad,
 }
-FLAVOURS = [*WRITERS, ".osi", ".osi.zst"]
+FLAVOURS = [*WRITERS, ".osi", ".osi.zst", ".xml"]
 """Flavours of recordings."""
 KINDS = [*FLAVOURS, *fuzz_texts.LAWS]
 """All that is hurt."""
@@ -358,8 +369,48 @@ def hurt_bytes(data: bytes, draw: random.Random) -> bytes:
     return bytes(out)
 
 
+ODD_WORDS = [
+    b"",
+    b"nan",
+    b"inf",
+    b"-1",
+    b"1e308",
+    b"1e-308",
+    b"9999999999",
+    b"0",
+    b"2",
+    b"x",
+    b"<x/>",
+]
+ELEMENT = re.compile(rb"<(\w+)[^<>]*>[^<>]*</\1>")
+"""An element without others in it."""
+
+
+def hurt_xml(data: bytes, draw: random.Random) -> bytes:
+    """Hurt a text, an attribute or an element."""
+    found = [*ELEMENT.finditer(data)]
+    if not found or draw.random() < 0.1:
+        return hurt_bytes(data, draw)
+    one, other = draw.choice(found), draw.choice(found)
+    match draw.randrange(6):
+        case 0 | 1:
+            word = draw.choice(ODD_WORDS)
+            new = re.sub(rb">[^<>]*<", lambda _: b">" + word + b"<", one[0])
+        case 2:
+            new = other[0]
+        case 3:
+            new = one[0] * draw.choice([0, 2, 40])
+        case 4:
+            new = one[0].replace(one[1], draw.choice([other[1], b"y", b"point", b"circle"]))
+        case _:
+            at = draw.choice([*re.finditer(rb'="[^"]*"', data)])
+            word = b'="' + draw.choice(ODD_WORDS[:-1]) + b'"'
+            return data[: at.start()] + word + data[at.end() :]
+    return data[: one.start()] + new + data[one.end() :]
+
+
 HURT_DEFINITION = {"protobuf": hurt_protobuf, "ros2msg": hurt_ros2msg}
-HURT = {"protobuf": hurt_protobuf, "json": hurt_json, "cdr": hurt_cdr}
+HURT = {"protobuf": hurt_protobuf, "json": hurt_json, "cdr": hurt_cdr, "xml": hurt_xml}
 
 
 # Mutations of recordings ----------------------------------------------------------------------------------
@@ -440,7 +491,10 @@ def write(hurt: Sample, path: Path, draw: random.Random) -> None:
                 writer.add_message(ids[message.channel], at, message.data, at)
             writer.finish()
     else:
-        content = b"".join(struct.pack("<I", len(m.data)) + m.data for m in hurt.messages)
+        heads = hurt.ending != ".xml"
+        content = b"".join(
+            (struct.pack("<I", len(m.data)) if heads else b"") + m.data for m in hurt.messages
+        )
         if hurt.ending == ".osi.zst":
             cut = draw.choice([500, 1 << 20])
             compress = zstandard.ZstdCompressor(write_checksum=draw.random() < 0.5).compress

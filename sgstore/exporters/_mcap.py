@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
     from sgstore.exporters._labels import Export
     from sgstore.exporters._mcap_graphs import ClipMessage
-    from sgstore.readers import OsiFile
+    from sgstore.readers import CommonRoadFile, OsiFile
     from sgstore.store import StoredTrace
     from sgstore.world import MessageRefs
 
@@ -112,7 +112,9 @@ class _Surveyed:
     losses: list[Loss] = field(default_factory=list[Loss])
 
 
-def _survey(recording: McapFile | OsiFile, trace: StoredTrace, context: MessageRefs) -> _Surveyed:
+def _survey(
+    recording: McapFile | OsiFile | CommonRoadFile, trace: StoredTrace, context: MessageRefs
+) -> _Surveyed:
     digest = digest_of(trace.path)
     if trace.digest and digest != trace.digest:
         raise ExportError(f"{trace.path}: the file has changed since it was ingested")
@@ -163,7 +165,7 @@ class _Cutting:
 
     def __init__(
         self,
-        recording: McapFile | OsiFile,
+        recording: McapFile | OsiFile | CommonRoadFile,
         source: _Surveyed,
         clip: Clip,
         told: dict[str, str],

@@ -17,6 +17,7 @@ from ._media import record_reader as record_reader
 from ._registry import ENDINGS as ENDINGS
 from ._registry import READERS as READERS
 from ._registry import RecordingReader as RecordingReader
+from ._registry import is_recording as is_recording
 from ._registry import on_map as on_map
 from ._registry import open_recording as open_recording
 from ._registry import open_trace as open_trace
@@ -33,6 +34,7 @@ from .carla._live import SensorPicture as SensorPicture
 from .carla._live import SensorReading as SensorReading
 from .carla._live import Sensors as Sensors
 from .carla._live import load_sensors as load_sensors
+from .commonroad._file import CommonRoadFile as CommonRoadFile
 from .foxglove._messages import DERIVED as DERIVED
 from .osi._file import OsiFile as OsiFile
 from .osi._schema import add_fields as add_fields
@@ -40,6 +42,7 @@ from .osi._schema import descriptors as descriptors
 from .osi._schema import message_class as message_class
 
 __all__ = [
+    "CommonRoadFile",
     "DERIVED",
     "ENDINGS",
     "EntityTable",
@@ -65,6 +68,7 @@ __all__ = [
     "connect",
     "decode",
     "descriptors",
+    "is_recording",
     "load_sensors",
     "message_class",
     "on_map",

@@ -15,6 +15,9 @@ from typing import TYPE_CHECKING, Final, Protocol
 from sgstore import plugins
 from sgstore.errors import TraceError
 from sgstore.mcap import MAGIC, McapFile, messages_at
+from sgstore.readers.commonroad._file import ENDINGS as _SCENARIO_ENDINGS
+from sgstore.readers.commonroad._file import CommonRoadFile, is_scenario
+from sgstore.readers.commonroad._file import read_messages as _read_scenario_messages
 from sgstore.readers.osi._file import ENDINGS as _OSI_ENDINGS
 from sgstore.readers.osi._file import OsiFile
 from sgstore.readers.osi._file import read_message as _read_osi_message
@@ -28,8 +31,8 @@ if TYPE_CHECKING:
     from sgstore.roads import RoadMap
 
 
-ENDINGS: Final = (".mcap", *_OSI_ENDINGS)
-"""How the names of recordings end, where a folder is searched for them."""
+ENDINGS: Final = (".mcap", *_OSI_ENDINGS, *_SCENARIO_ENDINGS)
+"""How the names of recordings end, where a folder is searched for them; see :func:`is_recording`."""
 
 
 class RecordingReader(Protocol):
@@ -64,8 +67,16 @@ def readers() -> Iterator[RecordingReader]:
         yield reader
 
 
-def open_recording(path: str | Path) -> McapFile | OsiFile:
+def is_recording(path: Path) -> bool:
+    """Return whether a file in a folder is a recording, by its name; of an XML file by its beginning, too."""
+    name = path.name.lower()
+    return name.endswith(ENDINGS) and (not name.endswith(_SCENARIO_ENDINGS) or is_scenario(path))
+
+
+def open_recording(path: str | Path) -> McapFile | OsiFile | CommonRoadFile:
     """A file of messages: MCAP by how it begins, a single-channel OSI file by how its name ends.
+
+    A CommonRoad scenario, which is one XML document, is told as messages.
 
     Raises
     ------
@@ -73,6 +84,8 @@ def open_recording(path: str | Path) -> McapFile | OsiFile:
         There is no such file, or it is neither.
     """
     path = Path(path)
+    if is_scenario(path):
+        return CommonRoadFile(path)
     return OsiFile(path) if _is_single_channel(path) else McapFile(path)
 
 
@@ -171,6 +184,9 @@ def read_messages(
     TraceError
         As :func:`read_message`.
     """
+    if is_scenario(path):
+        yield from _read_scenario_messages(path, ((at, length) for _, at, length in places))
+        return
     if not _is_single_channel(path):
         yield from messages_at(path, places)
         return

@@ -1,0 +1,323 @@
+"""CommonRoad scenarios in the words of an MCAP file: a message for the road map, and one for each step.
+
+A scenario tells each obstacle with all of its states, one obstacle after another. So the file is read as a
+whole when it is first asked for, and its messages are made of that, always the same ones: JSON, of which the
+first one is the road map, as text of lanes, and each further one is all that the scenario tells of a step. In
+a clip these are the messages of an MCAP file, which is read like the scenario itself.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from functools import cache
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import numpy as np
+from mcap.records import Channel, Schema
+
+from sgstore.errors import MapError, TraceError
+from sgstore.mcap import MESSAGE_HEAD, Findings, Loss, Messages, open_regular
+from sgstore.readers.commonroad._document import (
+    MAX_BYTES,
+    ROOT,
+    Obstacle,
+    TrafficScenario,
+    read_scenario,
+)
+from sgstore.readers.commonroad._lanelets import light_place, map_text, meaning_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+    from pathlib import Path
+
+    from mcap.records import Metadata
+
+    from sgstore.mcap import RecordPlace
+
+ENDINGS: Final = (".xml",)
+"""How the names of such files end; :func:`is_scenario` tells them from others."""
+MAP: Final = "commonroad.Map"
+STEP: Final = "commonroad.Step"
+"""Schemas of the messages."""
+NAME: Final = "scenario"
+"""Key of the name of the scenario in the metadata of a channel."""
+
+_MAP_CHANNEL, _STEP_CHANNEL = 1, 2
+_HEAD: Final = 4096
+_RUN: Final = 256
+"""Messages that are handed on together."""
+
+
+def is_scenario(path: Path) -> bool:
+    """Return whether a file begins as a CommonRoad scenario does, by its name and its first element."""
+    if not path.name.lower().endswith(ENDINGS):
+        return False
+    try:
+        with path.open("rb") as file:
+            return f"<{ROOT}".encode() in file.read(_HEAD)
+    except OSError:
+        return False
+
+
+class CommonRoadFile:
+    """A CommonRoad scenario that is read once or more often, in the words of an MCAP file.
+
+    Parameters
+    ----------
+    path : Path
+
+    Attributes
+    ----------
+    path, size, mtime_ns
+        The file, its size in bytes, its time of change.
+    schemas, channels : dict
+        ``/commonroad/map`` and ``/commonroad/steps``, with their schemas.
+    counts : dict
+        Messages of each channel.
+    window : tuple of int
+        All log times there are.
+    profile, compression : str
+    metadata, attachments
+        What an MCAP file that holds the same has: no profile, zstd, nothing beside the messages.
+
+    Raises
+    ------
+    TraceError
+        The file cannot be opened, or is no scenario.
+    """
+
+    window = (0, (1 << 63) - 1)
+    profile, compression = "", "zstd"
+    metadata: Final[Mapping[RecordPlace, Metadata]] = MappingProxyType({})
+    attachments: tuple[RecordPlace, ...] = ()
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with open_regular(path) as file:
+            status = os.fstat(file.fileno())
+            self.size, self.mtime_ns = status.st_size, status.st_mtime_ns
+            if self.size > MAX_BYTES:
+                raise TraceError(
+                    f"larger than {MAX_BYTES:,} bytes, which no scenario is", path=path
+                )
+            data = file.read(MAX_BYTES + 1)
+        try:
+            self._scenario = read_scenario(data)
+            self._map = map_text(self._scenario).encode()
+        except (TraceError, MapError) as error:
+            raise TraceError(str(error), path=path) from error
+        self._steps = _steps(self._scenario)
+        self._standing = [one for one in self._scenario.obstacles.values() if one.static]
+        about = {NAME: self._scenario.name or path.stem}
+        self.schemas = {
+            number: Schema(id=number, data=_schema(name), encoding="jsonschema", name=name)
+            for number, name in ((_MAP_CHANNEL, MAP), (_STEP_CHANNEL, STEP))
+        }
+        self.channels = {
+            number: Channel(
+                id=number, topic=topic, message_encoding="json", metadata=about, schema_id=number
+            )
+            for number, topic in (
+                (_MAP_CHANNEL, "/commonroad/map"),
+                (_STEP_CHANNEL, "/commonroad/steps"),
+            )
+            if self._map or number != _MAP_CHANNEL
+        }
+        self.counts = {_STEP_CHANNEL: len(self._steps)}
+        if self._map:
+            self.counts[_MAP_CHANNEL] = 1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Nothing is open once the file was read."""
+
+    def pieces(self, place: RecordPlace) -> Iterator[memoryview]:
+        """The bytes of an attachment; there are none."""
+        del place
+        return iter(())
+
+    def walk(
+        self,
+        report: Findings,
+        wanted: Callable[[int], bool] | None = None,
+        keep: Callable[[int], bool] | None = None,
+    ) -> Iterator[Messages]:
+        """All messages: the map, then step after step; what was left out goes to ``report``.
+
+        ``offset`` of a message is its number. Nothing is read again, so ``keep`` changes nothing.
+        """
+        del keep
+        for reason in self._scenario.lost:
+            report.lose(Loss(reason, bytes=0))
+        if self._scenario.more_lost:
+            report.lose(Loss(f"{self._scenario.more_lost} more of the same kinds", bytes=0))
+        if wanted is not None and not wanted(-1):
+            return
+        total = len(self._steps) + 1
+        start = 0 if self._map else 1
+        while start < total:
+            stop = 1 if start == 0 else min(start + _RUN, total)
+            yield self._messages(range(start, stop))
+            start = stop
+
+    def message(self, number: int) -> bytes:
+        """The data of a message: the map is number 0, the steps follow.
+
+        Raises
+        ------
+        IndexError
+            There is none of this number.
+        """
+        if number == 0:
+            return self._map
+        return _step_message(self._scenario, self._steps[number - 1], self._first(number))
+
+    def _first(self, number: int) -> list[Obstacle]:
+        """What stands, which is told with the first step."""
+        return self._standing if number == 1 else []
+
+    def _messages(self, numbers: range) -> Messages:
+        held = {number: self.message(number) for number in numbers}
+        channels = [_STEP_CHANNEL if number else _MAP_CHANNEL for number in numbers]
+        times = [self._time(number) for number in numbers]
+        return Messages(
+            chunk_offset=-1,
+            channel=np.array(channels, np.int64),
+            sequence=np.array([max(number - 1, 0) for number in numbers], np.int64),
+            log_time_ns=np.array(times, np.int64),
+            publish_time_ns=np.array(times, np.uint64),
+            offset=np.array(numbers, np.int64),
+            length=np.array([len(data) for data in held.values()], np.int64),
+            read=lambda at, _length: memoryview(held[at - MESSAGE_HEAD.itemsize]),
+        )
+
+    def _time(self, number: int) -> int:
+        """The time of a message; that of the map is the one of the first step. ns."""
+        steps = self._steps
+        step = steps[max(number - 1, 0)] if steps else 0
+        return round(step * self._scenario.step * 1e9)
+
+
+def read_messages(path: Path, places: Iterator[tuple[int, int]]) -> Iterator[bytes]:
+    """The data of messages of a scenario: (offset, length) of each, as :meth:`CommonRoadFile.walk` tells them.
+
+    Raises
+    ------
+    TraceError
+        The file cannot be read, or there is no message of that length there: the file was replaced.
+    """
+    with CommonRoadFile(path) as recording:
+        for offset, length in places:
+            try:
+                data = recording.message(offset) if offset >= 0 else b""
+            except IndexError:
+                data = b""
+            if len(data) != length or not data:
+                reason = f"no message of {length} bytes at {offset} there: the file was replaced"
+                raise TraceError(reason, path=path)
+            yield data
+
+
+# Messages -----------------------------------------------------------------------------------------
+
+
+def _steps(scenario: TrafficScenario) -> list[int]:
+    """The steps at which anything is told, in order; a scenario of standing obstacles alone has one."""
+    moving = {step for one in scenario.obstacles.values() if not one.static for step in one.states}
+    if not moving and scenario.obstacles:
+        return [0]
+    return sorted(moving)
+
+
+def _step_message(scenario: TrafficScenario, step: int, standing: list[Obstacle]) -> bytes:
+    """All that a scenario tells of a step, as JSON; what is not told is left out."""
+    told = {
+        "time": round(step * scenario.step, 9),
+        "step": step,
+        "obstacles": [
+            _obstacle(one, step)
+            for one in scenario.obstacles.values()
+            if not one.static and step in one.states
+        ],
+    }
+    if scenario.lights:
+        lights = ((one, light_place(scenario, one)) for one in scenario.lights.values())
+        told["lights"] = [
+            {"id": light.ident, **_placed(place), "state": light.shows(step)}
+            for light, place in lights
+            if place is not None and light.ident not in scenario.obstacles
+        ]
+    if standing:
+        told["standing"] = [_obstacle(one, next(iter(one.states))) for one in standing]
+    if step == _steps_first(scenario):
+        told["signs"] = [
+            {"id": sign.ident, **_placed(sign.place), **_about(meaning_of(sign))}
+            for sign in scenario.signs.values()
+            if sign.place is not None and not sign.virtual and sign.ident not in scenario.obstacles
+        ]
+    return json.dumps(told, allow_nan=False, separators=(",", ":")).encode()
+
+
+def _steps_first(scenario: TrafficScenario) -> int:
+    return min(
+        (min(one.states) for one in scenario.obstacles.values() if not one.static), default=0
+    )
+
+
+def _obstacle(one: Obstacle, step: int) -> dict[str, Any]:
+    state, body = one.states[step], one.body
+    heading = state.heading
+    cos, sin = (1.0, 0.0) if math.isnan(heading) else (math.cos(heading), math.sin(heading))
+    moves = not math.isnan(heading)
+    across = 0.0 if math.isnan(state.across) else state.across
+    sideways = state.along * state.yaw_rate
+    sideways = 0.0 if math.isnan(sideways) else sideways
+    found = {
+        "x": state.x + body.ahead * cos - body.left * sin,
+        "y": state.y + body.ahead * sin + body.left * cos,
+        "z": state.z,
+        "heading": heading + body.turn,
+        "length": body.length,
+        "width": body.width,
+        "vx": state.along * cos - across * sin if moves else math.nan,
+        "vy": state.along * sin + across * cos if moves else math.nan,
+        "ax": state.acceleration * cos - sideways * sin if moves else math.nan,
+        "ay": state.acceleration * sin + sideways * cos if moves else math.nan,
+        "yaw_rate": state.yaw_rate,
+    }
+    told: dict[str, Any] = {"id": one.ident, "type": one.type}
+    told |= {key: value for key, value in found.items() if math.isfinite(value)}
+    if step in one.lights:
+        told["signals"] = list(one.lights[step])
+    return told
+
+
+def _placed(place: tuple[float, float, float] | None) -> dict[str, float]:
+    return dict(zip("xyz", place, strict=True)) if place else {}
+
+
+def _about(meaning: Any) -> dict[str, str]:
+    return {"kind": meaning.kind, **({"subkind": meaning.subkind} if meaning.subkind else {})}
+
+
+@cache
+def _schema(name: str) -> bytes:
+    """A JSON schema of the messages, for viewers."""
+    number, text = {"type": "number"}, {"type": "string"}
+    box = dict.fromkeys(("x", "y", "z", "heading", "length", "width"), number)
+    motion = dict.fromkeys(("vx", "vy", "ax", "ay", "yaw_rate"), number)
+    thing = {"type": "object", "properties": {"id": text, "type": text, **box, **motion}}
+    parts: dict[str, Any] = {"time": number, "step": {"type": "integer"}}
+    for key in ("obstacles", "standing", "lights", "signs"):
+        parts[key] = {"type": "array", "items": thing}
+    if name == MAP:
+        parts = {"format": text, "version": number, "lanes": {"type": "array"}}
+    return json.dumps({"title": name, "type": "object", "properties": parts}).encode()

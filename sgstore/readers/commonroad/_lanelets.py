@@ -1,0 +1,252 @@
+"""Lanelets, signs and lights of a CommonRoad scenario → text of a road map.
+
+A lanelet is a lane whose borders have as many points on both sides: its cross sections. Lanelets side by side
+are one road, those that an intersection names as ways through it lie in that junction. What a traffic sign
+says holds for the lanelets that refer to it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.roads import (
+    END,
+    MAX_POINTS,
+    START,
+    Border,
+    Joint,
+    LaneLine,
+    PlainCrosswalk,
+    PlainSignal,
+    Sections,
+    about_lanes,
+    lane_text,
+    painted_across,
+    plain_lanes,
+    run_of,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from sgstore.readers.commonroad._document import (
+        Lanelet,
+        Place,
+        ScenarioLight,
+        ScenarioSign,
+        TrafficScenario,
+    )
+    from sgstore.roads import PlainLane
+    from sgstore.world import Floats
+
+_TYPES: Final = {
+    "busLane": "bus",
+    "bicycleLane": "biking",
+    "sidewalk": "sidewalk",
+    "exitRamp": "offRamp",
+    "accessRamp": "onRamp",
+    "shoulder": "shoulder",
+    "parking": "parking",
+    "border": "border",
+    "restricted": "restricted",
+    "busStop": "stop",
+}
+"""``laneletType`` → types of lanes as OpenDRIVE has them; all others are driven on."""
+
+_CROSSWALK: Final = "crosswalk"
+_ON_FOOT: Final = {"pedestrian"}
+_CYCLING: Final = {"bicycle", *_ON_FOOT}
+_CROSSED: Final = {
+    **dict.fromkeys(("dashed", "broad_dashed", "no_marking"), True),
+    **dict.fromkeys(("solid", "broad_solid", "curb", "lowered_curb"), False),
+}
+"""Markings → whether traffic may cross them."""
+
+_MPH: Final = 0.44704
+_KMH: Final = 1 / 3.6
+_CODES: Final = {
+    # Code of a sign → kind. Each country has codes of its own, none of which means something else in another.
+    # Source: CommonRoad: XML format documentation, and commonroad-io 2024.3, traffic_sign.
+    **dict.fromkeys(("206", "R1-1", "r2"), "stop_sign"),
+    **dict.fromkeys(("205", "R1-2", "r1"), "yield_sign"),
+    **dict.fromkeys(("274", "274.1", "R2-1", "r301"), "speed_limit"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SignMeaning:
+    """Kind of a sign, the rest of its meaning in a word or two, and a speed limit, if it is one; m/s."""
+
+    kind: str
+    subkind: str
+    limit: float = math.nan
+
+
+def meaning_of(sign: ScenarioSign) -> SignMeaning:
+    """Return what a sign with its plates means: the first plate whose kind is known, else its codes."""
+    for code, value in sign.plates:
+        kind = _CODES.get(code)
+        if kind == "speed_limit" and 0 < value < 200:
+            miles = code.startswith("R2")
+            number = value / (_MPH if miles else _KMH)
+            return SignMeaning(kind, f"{number:.0f} mph" if miles else f"{number:.0f}", value)
+        if kind is not None and kind != "speed_limit":
+            return SignMeaning(kind, "")
+    return SignMeaning("sign", "+".join(code for code, _ in sign.plates)[:100])
+
+
+def light_place(scenario: TrafficScenario, light: ScenarioLight) -> Place | None:
+    """Return where a light stands: as told, else where the right border of its first lanelet ends."""
+    if light.place is not None:
+        return light.place
+    lanes = (one for one in scenario.lanelets.values() if light.ident in one.lights)
+    return next((lane.right[-1] for lane in lanes), None)
+
+
+def map_text(scenario: TrafficScenario) -> str:
+    """Return the text of the road map; empty if there are no lanelets.
+
+    Raises
+    ------
+    MapError
+        There are too many lanelets or points.
+    """
+    uneven: list[str] = []
+    short: list[str] = []
+    points = 0
+    lines: list[LaneLine] = []
+    crosswalks: list[PlainCrosswalk] = []
+    for lanelet in scenario.lanelets.values():
+        points += len(lanelet.left) + len(lanelet.right)
+        if points > MAX_POINTS:
+            short.append(lanelet.ident)
+            continue
+        left, right = np.array(lanelet.left), np.array(lanelet.right)
+        if len(left) != len(right):
+            uneven.append(lanelet.ident)
+            left, right = _evened(left, right)
+        if run_of((left + right) / 2)[-1] < 1e-3:
+            short.append(lanelet.ident)
+            continue
+        if _CROSSWALK in lanelet.types:
+            outline, z = np.concatenate((right, left[::-1])), np.concatenate((right, left))[:, 2]
+            crosswalks.append(PlainCrosswalk(lanelet.ident, outline[:, :2], float(z.mean())))
+            continue
+        lines.append(_line(scenario, lanelet, left, right))
+    plain, warnings = plain_lanes(lines)
+    if not plain:
+        return ""
+    notes = [
+        about_lanes(which, what)
+        for which, what in (
+            (uneven, "its borders have different numbers of points: cut at even shares"),
+            (short, "left out: without a length, or too many points"),
+        )
+        if which
+    ]
+    return lane_text(plain, [*notes, *warnings], [*_signals(scenario, plain)], crosswalks)
+
+
+def _evened(left: Floats, right: Floats) -> tuple[Floats, Floats]:
+    """Both borders with as many points, at even shares of their lengths."""
+    count = max(len(left), len(right))
+    shares = np.linspace(0.0, 1.0, count)
+
+    def cut(line: Floats) -> Floats:
+        run = run_of(line)
+        return np.column_stack([np.interp(shares * run[-1], run, column) for column in line.T])
+
+    return cut(left), cut(right)
+
+
+def _line(scenario: TrafficScenario, lanelet: Lanelet, left: Floats, right: Floats) -> LaneLine:
+    kind = _lane_type(lanelet)
+    crossed = [_CROSSED.get(marking) for marking in lanelet.markings]
+    junction = scenario.junction_of.get(lanelet.ident, "")
+    unnamed = not junction and "intersection" in lanelet.types
+    return LaneLine(
+        lanelet.ident,
+        kind,
+        (left + right) / 2,
+        both=bool({"vehicle", "car"} & {*lanelet.both_ways}),
+        lefts=(Border(left, crossed[0], crossed[0]),),
+        rights=(Border(right, crossed[1], crossed[1]),),
+        sections=Sections(left[:, :2], right[:, :2], (left[:, 2] + right[:, 2]) / 2),
+        before=tuple(Joint(name, END) for name in lanelet.before),
+        after=tuple(Joint(name, START) for name in lanelet.after),
+        left_beside=(lanelet.beside[0],) if lanelet.beside[0] else (),
+        right_beside=(lanelet.beside[1],) if lanelet.beside[1] else (),
+        junction=None if unnamed else junction,
+        speed_limit=_limit(scenario, lanelet),
+    )
+
+
+def _lane_type(lanelet: Lanelet) -> str:
+    """The type of a lane: by a type of its lanelet that is not of driving, else by who may use it."""
+    for word in lanelet.types:
+        if word in _TYPES:
+            return _TYPES[word]
+    users = {*lanelet.one_way, *lanelet.both_ways}
+    if users and users <= _ON_FOOT:
+        return "sidewalk"
+    return "biking" if users and users <= _CYCLING else "driving"
+
+
+def _limit(scenario: TrafficScenario, lanelet: Lanelet) -> float:
+    """The lowest speed limit of a lanelet; NaN without one."""
+    signs = (scenario.signs[name] for name in lanelet.signs if name in scenario.signs)
+    limits = [lanelet.speed_limit, *(meaning_of(sign).limit for sign in signs)]
+    return min((one for one in limits if 0 < one < 1000), default=math.nan)
+
+
+def _signals(scenario: TrafficScenario, lanes: Sequence[PlainLane]) -> Iterator[PlainSignal]:
+    """Signs and lights on the lanes that refer to them, and stop lines."""
+    row_of = {lane.name: row for row, lane in enumerate(lanes)}
+    stops = _stops(scenario, lanes, row_of)
+    users: dict[str, list[int]] = {}
+    for lanelet in scenario.lanelets.values():
+        if lanelet.ident in row_of:
+            for name in (*lanelet.signs, *lanelet.lights):
+                users.setdefault(name, []).append(row_of[lanelet.ident])
+    for sign in scenario.signs.values():
+        rows = tuple(sorted({*users.get(sign.ident, ())}))
+        if rows:
+            told = meaning_of(sign)
+            limit = told.limit if told.kind == "speed_limit" else math.nan
+            pose = _pose(sign.place)
+            yield PlainSignal(sign.ident, told.kind, *pose, lanes=rows, speed_limit=limit)
+    for light in scenario.lights.values():
+        rows = tuple(sorted({*users.get(light.ident, ())}))
+        if rows:
+            at = tuple((row, stops[row]) for row in rows if row in stops)
+            pose = _pose(light_place(scenario, light))
+            yield PlainSignal(light.ident, "traffic_light", *pose, lanes=rows, stops=at)
+    for row, along in stops.items():
+        name = f"stop line of {lanes[row].name}"
+        yield PlainSignal(name, "sign", lanes=(row,), stops=((row, along),), is_stop_line=True)
+
+
+def _stops(
+    scenario: TrafficScenario, lanes: Sequence[PlainLane], row_of: dict[str, int]
+) -> dict[int, float]:
+    """Lanes with a stop line, and where along them it lies; m."""
+    found: dict[int, float] = {}
+    told: dict[int, Floats] = {}
+    for lanelet in scenario.lanelets.values():
+        if lanelet.stop_line is None or lanelet.ident not in row_of:
+            continue
+        row = row_of[lanelet.ident]
+        found[row] = float(run_of((lanes[row].left + lanes[row].right) / 2)[-1])
+        if len(lanelet.stop_line) > 1:
+            told[row] = np.array(lanelet.stop_line)
+    for row, places in zip(told, painted_across(lanes, [*told.values()]), strict=True):
+        found[row] = places.get(row, found[row])
+    return found
+
+
+def _pose(place: Place | None) -> Place:
+    return place or (math.nan, math.nan, math.nan)
