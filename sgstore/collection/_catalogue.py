@@ -31,7 +31,7 @@ from sgstore.store import (
 from sgstore.vocabulary import NAMES, natural
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from sgstore.collection._place import Place
     from sgstore.lang import Triple
@@ -218,25 +218,20 @@ class Snapshot:
             sets=subset_catalogs(),
         )
 
-    def triples(
-        self, name: str, relations: Iterable[str]
-    ) -> dict[str, dict[str, frozenset[Triple]]]:
-        """Bundle → relation → its triples, of some relations, in a derived set or as they were ingested."""
-        wanted = frozenset(relations)
-        found: dict[str, dict[str, list[Triple]]] = {}
+    def triples(self, name: str, matters: Callable[[Triple], bool]) -> dict[str, frozenset[Triple]]:
+        """Bundle → its triples that matter, in a derived set or as they were ingested."""
+        known: dict[Triple, bool] = {}
+        found: dict[str, list[Triple]] = {}
         for row in self.facts["triple"]:
-            if row[3] in wanted and row[1] == name:
-                of = found.get(row[0])
-                if of is None:
-                    of = found[row[0]] = {}
-                if row[3] in of:
-                    of[row[3]].append(row[3:6])
-                else:
-                    of[row[3]] = [row[3:6]]
-        return {
-            bundle: {relation: frozenset(triples) for relation, triples in of.items()}
-            for bundle, of in found.items()
-        }
+            if row[1] != name:
+                continue
+            triple = row[3:6]
+            wanted = known.get(triple)
+            if wanted is None:
+                wanted = known[triple] = matters(triple)
+            if wanted:
+                found.setdefault(row[0], []).append(triple)
+        return {bundle: frozenset(triples) for bundle, triples in found.items()}
 
     @cached_property
     def kinds(self) -> dict[str, tuple[frozenset[str], ...]]:

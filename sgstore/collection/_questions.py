@@ -349,28 +349,26 @@ class Collection:
         asked = (every if chosen is None else chosen) - left
         homes = {row["bundle"] for row in self.snapshot.traces if row["trace_id"] in asked}
         pruning = Pruning(compiled)
-        held = self._held(compiled.catalog.name, pruning.relations)
+        held = self._held(compiled.catalog.name, pruning)
         return [b for b in self.bundles() if b in homes and pruning.may_answer(*held(b))]
 
     def _held(
-        self, name: str, relations: Sequence[str]
-    ) -> Callable[[str], tuple[Mapping[str, frozenset[Triple]], Sequence[frozenset[str]]]]:
-        """Tell of a bundle the triples of some relations, by relation, and its kinds, under an abstraction."""
+        self, name: str, pruning: Pruning
+    ) -> Callable[[str], tuple[frozenset[Triple], Sequence[frozenset[str]]]]:
+        """Tell of a bundle the triples that matter, and its kinds, under an abstraction."""
         snapshot = self.snapshot
         if name and name not in snapshot.sets:
 
             def narrowed(bundle: str) -> Any:
                 whole = snapshot.contents([bundle])
                 seen = whole.under(name) or whole
-                triples: dict[str, set[Triple]] = {}
-                for triple in (*seen.edges, *seen.map_edges):
-                    triples.setdefault(triple[0], set()).add(triple)
-                kinds = seen.moving, seen.fixed, seen.mapped
-                return {of: frozenset(some) for of, some in triples.items()}, kinds
+                triples = frozenset(filter(pruning.matters, (*seen.edges, *seen.map_edges)))
+                return triples, (seen.moving, seen.fixed, seen.mapped)
 
             return narrowed
-        triples, kinds = snapshot.triples(name, relations), snapshot.kinds
-        return lambda bundle: (triples.get(bundle, {}), kinds[bundle])
+        triples, kinds = snapshot.triples(name, pruning.matters), snapshot.kinds
+        nothing = frozenset["Triple"]()
+        return lambda bundle: (triples.get(bundle, nothing), kinds[bundle])
 
 
 def _facts_of_table(name: str, told: Mapping[str, Any]) -> TableFacts:

@@ -33,7 +33,7 @@ from sgstore.lang._results import (
     with_bindings,
     with_owners,
 )
-from sgstore.lang._rewrite import FALSE, narrowed, rewritten
+from sgstore.lang._rewrite import FALSE, narrowed, possible, rewritten
 from sgstore.lang.ir import (
     Aggregate,
     BlockValue,
@@ -211,38 +211,41 @@ class Pruning:
     compiled : Compiled
         Against the whole.
 
-    Attributes
-    ----------
-    relations : list of str
-        Of whose triples it wants to know.
+    Notes
+    -----
+    Triples that no edge of the pattern may be change nothing about it. Without them most parts look alike, and
+    what was decided for one is decided for all of these.
     """
 
     def __init__(self, compiled: Compiled) -> None:
         query = compiled.query
         self._scopes = [step.scope for step in query.steps if not step.absent] or [query.scope]
         self._known: dict[tuple[object, ...], bool] = {}
-        self.relations = sorted(
-            {r for scope in self._scopes for e in scope.edges if e.high == 1 for r in e.relations}
-        )
+        self._edges = [
+            (edge, scope.kinds(edge.src), scope.kinds(edge.dst))
+            for scope in self._scopes
+            for edge in scope.edges
+            if edge.high == 1
+        ]
 
-    def may_answer(
-        self, triples: Mapping[str, frozenset[Triple]], kinds: Sequence[frozenset[str]]
-    ) -> bool:
+    def matters(self, triple: Triple) -> bool:
+        """Tell whether an edge of the pattern may be such a triple."""
+        return any(True for of in self._edges for _ in possible(*of, (triple,)))
+
+    def may_answer(self, held: frozenset[Triple], kinds: Sequence[frozenset[str]]) -> bool:
         """Tell whether a part may have a match.
 
         Parameters
         ----------
-        triples : mapping of str to frozenset
-            Relation → its triples that occur in the part.
+        held : frozenset of Triple
+            The triples that occur in the part, of those that matter.
         kinds : sequence of frozenset
             Kinds that move, that are fixed, and those of the map.
         """
-        nothing = frozenset["Triple"]()
-        held = tuple(triples.get(one, nothing) for one in self.relations)
         key = (held, *kinds)
         if key not in self._known:
-            edges = {triple: 1 for some in held for triple in some}
             moving, fixed, mapped = kinds
+            edges = dict.fromkeys(held, 1)
             catalog = Catalog(edges=edges, moving=moving, fixed=fixed, mapped=mapped)
             self._known[key] = all(_possible(scope, catalog) for scope in self._scopes)
         return self._known[key]
