@@ -11,8 +11,9 @@ import numpy as np
 
 from sgstore.config import Config
 from sgstore.errors import SgstoreError
+from sgstore.files import working_folder
 from sgstore.map_files import Maps, lost_lanes
-from sgstore.mcap import Loss
+from sgstore.mcap import Loss, near
 from sgstore.readers import on_map, open_recording, open_trace
 from sgstore.segments import TraceTally
 from sgstore.world import BUCKET_FRAMES, TraceReport
@@ -105,7 +106,8 @@ def examine(
     found = Examination(Path(path))
     report = TraceReport()
     try:
-        _read(found, config, maps, _channels(found, report))
+        with working_folder("recording") as held, near(found.path, held):
+            _read(found, config, maps, _channels(found, report))
     except SgstoreError as error:
         found.error = str(error)
         found.warnings = found.warnings or report.warnings

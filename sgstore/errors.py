@@ -21,6 +21,7 @@ A mistake in calling the library stays ``ValueError`` or ``TypeError``. Anything
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -39,8 +40,22 @@ class SgstoreError(Exception):
         for name in ("path", "channel", "time_ns", "offset", "road", "element", "extra"):
             value = getattr(self, name, None)
             if value is not None:
-                about[name] = value if isinstance(value, int) else str(value)
+                about[name] = value if isinstance(value, int) else place_named(value)
         return about
+
+
+_URL: Final = re.compile(r"(s3a?|gs|az|abfs|https?):/+(?=[^/])")
+"""How URLs begin; in paths two strokes have become one."""
+
+
+def place_named(path: str | Path) -> str:
+    """The place of a recording or a collection as people write it: a path, or a URL with both its strokes."""
+    return _URL.sub(r"\1://", str(path), count=1) if _URL.match(str(path)) else str(path)
+
+
+def url_named(path: str | Path) -> str | None:
+    """The URL that a path stands for; ``None``: it is a path on this machine."""
+    return place_named(path) if _URL.match(str(path)) else None
 
 
 class TraceError(SgstoreError):
@@ -77,7 +92,7 @@ class TraceError(SgstoreError):
         where = [
             text
             for value, text in (
-                (path, f"{path}"),
+                (path, "" if path is None else place_named(path)),
                 (channel, f"channel {channel!r}"),
                 (time_ns, f"at {time_ns} ns"),
                 (offset, f"byte {offset}"),

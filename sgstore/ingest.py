@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import threading
@@ -19,9 +20,9 @@ from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from sgstore.config import Config
-from sgstore.errors import SgstoreError, StoreError, TraceError
+from sgstore.errors import SgstoreError, StoreError, TraceError, url_named
 from sgstore.map_files import Maps
-from sgstore.mcap import METADATA, bag_folder, mark_of, parts_of
+from sgstore.mcap import METADATA, bag_folder, mark_of, parts_of, remote_names
 from sgstore.processes import command
 from sgstore.readers import ENDINGS, is_recording
 from sgstore.segments import Job, Progress, SegmentReader, TraceOutcome
@@ -48,12 +49,16 @@ def recordings(names: Iterable[str | Path]) -> list[Path]:
     names : iterable of str or Path
         Files; folders, which stand for the recordings in them and below; bags, by their folder or their
         ``metadata.yaml``; and patterns (``drives/*/day?.mcap``, ``**`` for any depth) that no shell has
-        expanded. What is in a folder or fits a pattern is sorted.
+        expanded. What is in a folder or fits a pattern is sorted. URLs are such names, too:
+        ``s3://bucket/drives/``, ``s3://bucket/*/day?.mcap``, ``https://host/a.mcap`` (a file or a bag: a web
+        server does not tell what else it has).
 
     Raises
     ------
     StoreError
         A folder holds no recording, or nothing fits a pattern.
+    TraceError
+        An object store does not tell what it has.
     """
     return list(dict.fromkeys(path for name in names for path in _meant(Path(name))))
 
@@ -61,6 +66,8 @@ def recordings(names: Iterable[str | Path]) -> list[Path]:
 def _meant(path: Path) -> Iterator[Path]:
     if path.name == METADATA:
         yield path.parent
+    elif (url := url_named(path)) is not None:
+        yield from map(Path, _meant_by(url))
     elif path.is_dir():
         inside = sorted(_inside(path))
         if not inside:
@@ -86,6 +93,45 @@ def _inside(folder: Path) -> Iterator[Path]:
     for path in folder.rglob("*"):
         if is_recording(path) and path.is_file() and path not in own:
             yield path
+
+
+def _meant_by(url: str) -> list[str]:
+    """The recordings that a URL means: itself, those below it, or those that fit it as a pattern."""
+    pattern = has_magic(url)
+    if url.startswith("http") or not (pattern or not url.lower().endswith(ENDINGS)):
+        return [url]
+    if not pattern and bag_folder(Path(url)) is not None:
+        return [url]
+    fixed = re.split(r"[*?[]", url, maxsplit=1)[0].rpartition("/")[0] if pattern else url
+    inside = remote_names(fixed)
+    bags = [name.removesuffix(f"/{METADATA}") for name in inside if name.endswith(f"/{METADATA}")]
+    bags = [bag for bag in bags if bag_folder(Path(bag)) is not None]
+    files = [name for name in inside if name.lower().endswith(ENDINGS)]
+    found = bags + [name for name in files if not name.startswith(tuple(f"{b}/" for b in bags))]
+    if pattern:
+        found = [name for name in found if _fits(name, url)]
+    if not found:
+        why = (
+            "nothing fits this pattern"
+            if pattern
+            else f"no recording ({', '.join(ENDINGS)}) below it"
+        )
+        raise StoreError(f"{url}: {why}")
+    return sorted(found)
+
+
+def _fits(url: str, pattern: str) -> bool:
+    """Tell whether a URL, or a folder that it is in, fits a pattern; ``**`` stands for folders at any depth."""
+    words = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
+
+    def word(found: re.Match[str]) -> str:
+        text = found[0]
+        if len(text) > 2 and text[0] == "[":
+            return text.replace("[!", "[^")
+        return words.get(text) or re.escape(text)
+
+    text = re.sub(r"\*\*/|\*\*|\[!?[^]]+\]|.", word, pattern)
+    return re.fullmatch(f"{text}(?:/.*)?", url) is not None
 
 
 def _parts(bag: Path) -> tuple[BagPart, ...]:

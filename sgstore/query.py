@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
-from sgstore.errors import StoreError
+from sgstore.errors import StoreError, place_named
 from sgstore.lang import CONSTANTS, about_frame, compile_query, union_parts
 from sgstore.matches import UnionMatches
 from sgstore.records import dataclass
@@ -811,7 +811,7 @@ class Store:
             rows = self.file.rows(about_frame(asked), [frame.frame_id])
             about |= {one.attribute.name: v for one, v in zip(asked, rows.values[0], strict=True)}
         whole = {f.name: getattr(trace, f.name) for f in fields(trace)}
-        whole |= {"id": trace.trace_id, "uri": str(trace.path), "ego": trace.ego or None}
+        whole |= {"id": trace.trace_id, "uri": place_named(trace.path), "ego": trace.ego or None}
         whole |= {"map": trace.map or None, "period": trace.period_ns / 1e9}
         whole |= {"duration": (trace.end_ns - trace.start_ns) / 1e9}
         classes = partial(self.file.abstracted.class_of, frame.frame_id)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.config import Config, from_dict
 from sgstore.derive import derive, keep_abstraction
-from sgstore.errors import ConfigError, SgstoreError, StoreError, TraceError
+from sgstore.errors import ConfigError, SgstoreError, StoreError, TraceError, url_named
 from sgstore.files import working_folder
 from sgstore.importing import Words, import_graphs
 from sgstore.ingest import ingest, recordings
@@ -237,7 +237,9 @@ def _by_size(folders: Sequence[str | Path]) -> dict[int, list[Path]]:
     found: dict[int, list[Path]] = {}
     for path in recordings(folders) if folders else ():
         with suppress(OSError, TraceError):
-            found.setdefault(mark_of(path)[0], []).append(path.absolute())
+            found.setdefault(mark_of(path)[0], []).append(
+                path if url_named(path) else path.absolute()
+            )
     return found
 
 

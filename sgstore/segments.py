@@ -26,9 +26,9 @@ import numpy as np
 
 from sgstore import errors
 from sgstore.config import ALL_EGOS, Config, from_dict
-from sgstore.errors import SgstoreError, TraceError
+from sgstore.errors import SgstoreError, TraceError, place_named
 from sgstore.map_files import Maps, lost_lanes
-from sgstore.mcap import Loss, check_name
+from sgstore.mcap import Loss, check_name, near
 from sgstore.readers import on_map, open_trace
 from sgstore.relations import Crowds, renamed
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
@@ -127,7 +127,10 @@ class TraceOutcome:
     def as_dict(self) -> dict[str, Any]:
         """The outcome as plain values, from which :meth:`from_dict` makes it again."""
         told = {"class": type(self.error).__name__, "message": str(self.error)}
-        return asdict(self) | {"path": str(self.path), "error": told if self.error else None}
+        return asdict(self) | {
+            "path": place_named(self.path),
+            "error": told if self.error else None,
+        }
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
@@ -323,7 +326,9 @@ class SegmentReader:
         views: list[_EgoView] = []
         failed: SgstoreError | None = None
         try:
-            self._read(path, folder, views)
+            check_name(path)
+            with near(path, folder / "copy"):
+                self._read(path, folder, views)
         except SgstoreError as error:
             failed = error
         found = [(view.outcome, view.sealed) for view in views] or [(TraceOutcome(path), None)]
@@ -335,7 +340,6 @@ class SegmentReader:
 
     def _read(self, path: Path, folder: Path, views: list[_EgoView]) -> None:
         job, config = self._job, self._job.config
-        check_name(path)
         if self._file is None and job.store.exists():
             self._file = StoreFile(job.store)
         store = None if job.force else self._file

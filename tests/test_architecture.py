@@ -80,7 +80,7 @@ OWNERS = {
     "carla": {"readers"},
     "mcp": {"assistant"},
     "pydantic": {"assistant"},
-    "obstore": {"collection"},
+    "obstore": {"mcap"},
     "ray": {"collection"},
     "pyspark": {"collection"},
     "starlette": {"serve"},

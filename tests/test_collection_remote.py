@@ -1,25 +1,38 @@
-"""A collection in an object store: an S3 server of this machine, which at times answers badly."""
+"""Collections and recordings in object stores: an S3 server of this machine, which at times answers badly."""
 
 from __future__ import annotations
 
 import http.client
 import os
 import random
+import shutil
 import threading
 import urllib.request
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from functools import partial
+from http.server import BaseHTTPRequestHandler, SimpleHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
 
 import duckdb
 import pytest
 from oracle_worlds import random_trace, random_world, store_all
+from recordings import Recorder, car
 
 from sgstore.cli import run as run_verb
-from sgstore.collection import Collection, PartialAnswerError, gc, pack, unpack, verify
+from sgstore.collection import (
+    Collection,
+    PartialAnswerError,
+    commit,
+    gc,
+    land,
+    pack,
+    unpack,
+    verify,
+)
 from sgstore.collection import _place as places
-from sgstore.errors import StoreError
+from sgstore.errors import StoreError, TraceError, place_named
+from sgstore.ingest import ingest, recordings
 from sgstore.query import Store
 from sgstore.store import StoreFile
 from sgstore.store._locking import without_faults
@@ -269,3 +282,182 @@ def test_credentials_are_not_written_anywhere(place: str, between: Between) -> N
     with pytest.raises(StoreError) as refused:
         whole.read("nothing")
     assert os.environ["AWS_SECRET_ACCESS_KEY"] not in str(refused.value)
+
+
+# Recordings --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of some megabytes, most of which are pictures."""
+    path = tmp_path_factory.mktemp("drive") / "day1.mcap"
+    noise = random.Random(1)
+    with Recorder(path) as recorder:
+        for i in range(20):
+            recorder.ground_truth(i / 10, [car(7, i, v=(10, 0)), car(3, 40.0 - i, 3.5)], host=7)
+            picture = recorder.channel("camera", "pictures.Image", b"{}")
+            recorder.write(picture, i / 10, noise.randbytes(400_000))
+    return path
+
+
+def put(between: Between, path: Path, name: str) -> str:
+    """Put a file where recordings are; its URL."""
+    places.place_at("s3://fleet").upload(path, name)
+    between.seen.clear()
+    return f"s3://fleet/{name}"
+
+
+def rows_of(path: Path) -> list[Any]:
+    text = "FROM frames ORDER BY frame_id", "FROM nodes ORDER BY ALL", "FROM edges ORDER BY ALL"
+    return [list(Store(path).sql(one)) for one in text]
+
+
+def got(between: Between) -> int:
+    """How often the content of an object was asked for."""
+    return sum(
+        n for key, n in between.seen.items() if key.startswith("GET") and "list-type" not in key
+    )
+
+
+@pytest.fixture
+def url(between: Between, drive: Path) -> str:
+    return put(between, drive, "drives/day1.mcap")
+
+
+def test_a_recording_in_a_bucket_is_read_as_a_file_is(
+    url: str, drive: Path, between: Between, tmp_path: Path
+) -> None:
+    (here,) = ingest(tmp_path / "here.sgstore", [drive])
+    (there,) = ingest(tmp_path / "there.sgstore", recordings([url]))
+
+    assert (there.status, there.frames, there.losses) == (here.status, here.frames, here.losses)
+    assert there.as_dict()["path"] == url
+    assert got(between) == 1  # all of it fits into one piece
+    assert rows_of(tmp_path / "there.sgstore") == rows_of(tmp_path / "here.sgstore")
+    with Store(tmp_path / "here.sgstore") as one, Store(tmp_path / "there.sgstore") as other:
+        assert other.info()[0].as_dict()["path"] == url
+        between.seen.clear()
+        assert other.payload("day1#7", "camera") == one.payload("day1#7", "camera")
+        assert got(between) < 6  # the chunk, and not all of them
+    for to in ("here", "there"):
+        query = "MATCH (e:Ego) WHERE frame.seq < 3"
+        asked = ["export", str(tmp_path / f"{to}.sgstore"), query, "--to", str(tmp_path / to)]
+        assert run_verb(asked) == 0
+    (clip,), (same,) = (list((tmp_path / to).glob("*.mcap")) for to in ("here", "there"))
+    assert clip.read_bytes() == same.read_bytes()
+    assert run_verb(["ingest", str(tmp_path / "there.sgstore"), url]) == 0
+
+
+@pytest.mark.parametrize("answer", ["503", "cut"])
+def test_a_recording_that_does_not_come_at_once_is_asked_for_again(
+    url: str, between: Between, tmp_path: Path, answer: str
+) -> None:
+    between.wrong = lambda method, path, number: answer if method == "GET" and number <= 2 else ""
+
+    (found,) = ingest(tmp_path / "s.sgstore", [url])
+
+    assert (found.status, found.frames) == ("added", 20)
+
+
+@pytest.mark.parametrize(
+    ("answer", "name", "reason"),
+    [
+        ("403", "drives/day1.mcap", "credentials"),
+        ("cut", "drives/day1.mcap", "not read in 4 tries"),
+        ("", "drives/day2.mcap", "no such object"),
+    ],
+)
+def test_a_recording_that_cannot_be_read_is_one_clear_line(
+    url: str,
+    between: Between,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    answer: str,
+    name: str,
+    reason: str,
+) -> None:
+    between.wrong = lambda method, path, number: (
+        answer if method == "GET" or answer == "403" else ""
+    )
+
+    assert run_verb(["ingest", str(tmp_path / "s.sgstore"), f"s3://fleet/{name}"]) == 1
+    line = capsys.readouterr().err.strip().splitlines()[0]
+    assert f"s3://fleet/{name}: " in line
+    assert reason in line
+
+
+def test_a_recording_that_was_replaced_gives_no_payload(
+    url: str, drive: Path, between: Between, tmp_path: Path
+) -> None:
+    ingest(tmp_path / "s.sgstore", [url])
+    (tmp_path / "other").write_bytes(drive.read_bytes()[:-9] + b"?" * 9)
+    put(between, tmp_path / "other", "drives/day1.mcap")
+
+    with pytest.raises(TraceError, match=r"s3://fleet/drives/day1.mcap: not the file that was"):
+        Store(tmp_path / "s.sgstore").payload("day1#7", "camera")
+
+
+def test_folders_patterns_and_bags_in_a_bucket_are_found(
+    url: str, drive: Path, between: Between, tmp_path: Path
+) -> None:
+    (tmp_path / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information:\n  storage_identifier: mcap\n  relative_file_paths:\n    - a.mcap\n"
+    )
+    put(between, tmp_path / "metadata.yaml", "drives/bag/metadata.yaml")
+    put(between, drive, "drives/bag/a.mcap")
+    put(between, drive, "drives/more/day22.mcap")
+
+    def meant(text: str) -> list[str]:
+        return [place_named(path) for path in recordings([text])]
+
+    bag, more = "s3://fleet/drives/bag", "s3://fleet/drives/more/day22.mcap"
+    assert meant("s3://fleet/drives/") == [bag, url, more]
+    assert meant("s3://fleet/drives/*.mcap") == [url]
+    assert meant("s3://fleet/**/day?.mcap") == [url]
+    assert meant("s3://fleet/drives/m*/day[12]?.mcap") == [more]
+    assert meant(bag) == meant(f"{bag}/metadata.yaml") == [bag]
+    with pytest.raises(StoreError, match=r"s3://fleet/nothing: no recording"):
+        recordings(["s3://fleet/nothing"])
+    (found,) = ingest(tmp_path / "s.sgstore", recordings([bag]))
+    assert (found.frames, found.name) == (20, "bag")
+    assert len(Store(tmp_path / "s.sgstore").payload("bag#7", "camera")) == 400_000
+
+
+def test_recordings_in_a_bucket_land_once(url: str, between: Between, tmp_path: Path) -> None:
+    place = tmp_path / "fleet"
+    shards = [land(place, [url], shard=(number, 2)) for number in (1, 2)]
+    assert [one.status for found in shards for one in found] == ["landed"]
+    between.seen.clear()
+    shards = [land(place, [url], shard=(number, 2)) for number in (1, 2)]
+    assert [one.status for found in shards for one in found] == ["present"]
+    assert got(between) == 0
+    assert commit(place).added == ["day1"]
+    assert [row["uri"] for row in Collection(place).traces()] == [url]
+
+
+def test_a_recording_of_a_web_server_is_read(between: Between, url: str, tmp_path: Path) -> None:
+    found = ingest(tmp_path / "s.sgstore", [f"{between.url}/fleet/drives/day1.mcap"])
+
+    assert [(one.status, one.frames) for one in found] == [("added", 20)]
+
+
+def test_a_web_server_that_knows_no_ranges_gives_the_whole_file(
+    drive: Path, tmp_path: Path
+) -> None:
+    shutil.copy(drive, tmp_path / "day1.mcap")
+    handler = partial(_Silent, directory=str(tmp_path))
+    served = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=served.serve_forever, kwargs={"poll_interval": 0.05}).start()
+    try:
+        url = f"http://127.0.0.1:{served.server_port}/day1.mcap"
+        (found,) = ingest(tmp_path / "s.sgstore", [url])
+        assert len(Store(tmp_path / "s.sgstore").payload("day1#7", "camera")) == 400_000
+    finally:
+        served.shutdown()
+        served.server_close()
+    assert (found.status, found.frames) == ("added", 20)
+
+
+class _Silent(SimpleHTTPRequestHandler):
+    def log_message(self, *_: Any) -> None:
+        """Say nothing."""

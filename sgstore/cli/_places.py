@@ -9,6 +9,7 @@ import typer
 
 from sgstore.cli._options import LOSS, QueryLimits, tables_of
 from sgstore.cli._output import say
+from sgstore.errors import url_named
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -19,17 +20,13 @@ if TYPE_CHECKING:
 ABOUT: Final = "COLLECTION.json"
 """The file by which a folder is known as a collection."""
 
-_REMOTE: Final = ("s3:/", "s3a:/", "gs:/", "az:/", "abfs:/", "http:/", "https:/")
-
 
 def url_of(store: Path) -> str | None:
     """The place of a collection, if what is named as a store is one; else ``None``."""
-    text = str(store)
-    if text.startswith(_REMOTE):  # two strokes have become one on the way
-        scheme, _, rest = text.partition(":/")
-        return f"{scheme}://{rest.lstrip('/')}"
+    if (url := url_named(store)) is not None:
+        return url
     with suppress(OSError, ValueError):  # what cannot be looked at is refused as a store
-        return text if (store / ABOUT).is_file() else None
+        return str(store) if (store / ABOUT).is_file() else None
     return None
 
 

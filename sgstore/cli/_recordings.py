@@ -28,7 +28,7 @@ from sgstore.cli._options import (
 )
 from sgstore.cli._output import Format, say, write_document, write_report
 from sgstore.cli._places import url_of
-from sgstore.errors import StoreError
+from sgstore.errors import StoreError, place_named
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator
@@ -149,11 +149,11 @@ def _say_what_was_odd(outcome: TraceOutcome) -> None:
     if outcome.error:
         say(str(outcome.error))
     for name, number in outcome.unknown_types.items():
-        say(f"{outcome.path}: {number} entities of type {name!r}, {_no_kind(name)}")
+        say(f"{place_named(outcome.path)}: {number} entities of type {name!r}, {_no_kind(name)}")
     for warning in outcome.warnings:
-        say(f"{outcome.path}: {warning}")
+        say(f"{place_named(outcome.path)}: {warning}")
     for loss in outcome.losses:
-        say(f"{outcome.path}: lost: {loss.reason}")
+        say(f"{place_named(outcome.path)}: lost: {loss.reason}")
 
 
 def _no_kind(type_name: str) -> str:
@@ -174,7 +174,7 @@ def _outcome_row(outcome: TraceOutcome) -> tuple[Any, ...]:
         sum(outcome.entities.values()),
         round(outcome.seconds, 2),
         len(outcome.losses),
-        str(outcome.path),
+        place_named(outcome.path),
     )
 
 

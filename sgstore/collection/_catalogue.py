@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.collection._place import MissingObjectError, digest_of_file
+from sgstore.collection._place import ABOUT, MissingObjectError, digest_of_file
 from sgstore.errors import ExportError, StoreError
 from sgstore.files import working_folder
 from sgstore.lang import Catalog, RelationScope, TraceFacts, Type
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from sgstore.lang import Triple
     from sgstore.store import Facts
 
-ABOUT: Final = "COLLECTION.json"
 FORMAT: Final = 1
 """Version of the layout."""
 

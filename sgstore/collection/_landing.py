@@ -19,11 +19,11 @@ from sgstore.collection import _catalogue as catalogue
 from sgstore.collection._pack import ATTEMPTS, Commit, groups, map_names, put_bundle
 from sgstore.collection._place import digest_of_file, place_at
 from sgstore.config import Config
-from sgstore.errors import SgstoreError, StoreError
+from sgstore.errors import SgstoreError, StoreError, TraceError, url_named
 from sgstore.files import working_folder
 from sgstore.ingest import BLOCK_FRAMES, Workers
 from sgstore.map_files import Maps
-from sgstore.mcap import digest_of
+from sgstore.mcap import digest_of, mark_of
 from sgstore.segments import Job, SegmentReader, TraceOutcome
 from sgstore.store import (
     Sealed,
@@ -124,7 +124,7 @@ class _Landing:
         wanted: dict[int, tuple[Path, str]] = {}
         for place, path in enumerate(paths):
             try:
-                digest = digest_of(path)
+                digest = _mark(path)
             except SgstoreError as error:  # then one share says so, always the same
                 if _share(hashlib.sha256(path.name.encode()).hexdigest(), of) == share:
                     found[place] = [TraceOutcome(path, error=error)]
@@ -213,6 +213,20 @@ class _Landing:
             for name in reversed(FILES):  # what says that it is complete comes last
                 self.place.upload(parts[0] / name, f"segments/{segment[:2]}/{segment}/{name}")
             return segment
+
+
+def _mark(path: Path) -> str:
+    """What a recording is known by before it is read: its digest.
+
+    Of one that lies elsewhere, where it lies and how it looks: to hash it, all shards would have to fetch it.
+    """
+    url = url_named(path)
+    if url is None:
+        return digest_of(path)
+    try:
+        return hashlib.sha256(json.dumps([url, *mark_of(path)]).encode()).hexdigest()
+    except OSError as error:
+        raise TraceError(error.strerror or "cannot be read", path=path) from error
 
 
 def _share(digest: str, of: int) -> int:

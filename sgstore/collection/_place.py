@@ -10,26 +10,26 @@ import hashlib
 import os
 import secrets
 import shutil
-import time
 from contextlib import contextmanager, suppress
-from datetime import timedelta
-from functools import cache
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
-from sgstore.errors import MissingExtraError, StoreError
+from sgstore.errors import StoreError, url_named
+from sgstore.mcap import (
+    fetch_object,
+    object_store_at,
+    object_stores,
+    reason_of_object_store,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator
 
+ABOUT: Final = "COLLECTION.json"
+"""The file by which a folder is known as a collection."""
+
 PIECE: Final = 1 << 20
 """Bytes that are read at a time."""
-
-TRIES: Final = 4
-"""How often is asked for what an object store did not give whole."""
-
-_SCHEMES: Final = ("s3://", "s3a://", "gs://", "az://", "abfs://", "http://", "https://")
 
 
 class MissingObjectError(StoreError):
@@ -89,13 +89,8 @@ def place_at(url: str | Path) -> Place:
     MissingExtraError
         It is in an object store, and the extra ``cluster`` is not installed.
     """
-    text = str(url)
-    return _Remote(text) if is_remote(text) else _Folder(Path(text.removeprefix("file://")))
-
-
-def is_remote(url: str | Path) -> bool:
-    """Tell whether a place is in an object store."""
-    return str(url).startswith(_SCHEMES)
+    remote = url_named(url)
+    return _Folder(Path(str(url).removeprefix("file://"))) if remote is None else _Remote(remote)
 
 
 def digest_of_file(path: Path) -> str:
@@ -190,23 +185,18 @@ class _Remote:
 
     def __init__(self, url: str) -> None:
         self.url = url.rstrip("/")
-        self._objects = _package()
+        self._objects = object_stores()
         with self._told(""):
-            self._store = self._objects.store.from_url(self.url, **_options(self.url))
+            self._store = object_store_at(self.url)
 
     @contextmanager
     def _told(self, name: str) -> Generator[None]:
         where = f"{self.url}/{name}".rstrip("/")
-        wrong = self._objects.exceptions
         try:
             yield
-        except (FileNotFoundError, wrong.NotFoundError) as error:
-            raise MissingObjectError(f"{where}: no such object, or no such bucket") from error
-        except (PermissionError, wrong.PermissionDeniedError, wrong.UnauthenticatedError) as error:
-            raise StoreError(f"{where}: access is refused: look at the credentials") from error
-        except (wrong.BaseError, OSError) as error:
-            text = " ".join(str(error).split())
-            raise StoreError(f"{where}: {text[:300]}") from error
+        except (self._objects.exceptions.BaseError, OSError) as error:
+            reason, missing = reason_of_object_store(error)
+            raise (MissingObjectError if missing else StoreError)(f"{where}: {reason}") from error
 
     def read(self, name: str) -> bytes:
         with self._told(name):
@@ -225,22 +215,8 @@ class _Remote:
             self._objects.put(self._store, name, path)
 
     def fetch(self, name: str, to: Path) -> None:
-        with self._told(name):
-            size = -1
-            for left in reversed(range(TRIES)):
-                found = self._objects.get(self._store, name)
-                size = found.meta["size"]
-                try:
-                    with to.open("wb") as file:
-                        for piece in found.stream(min_chunk_size=PIECE):
-                            file.write(piece)
-                    if to.stat().st_size == size:
-                        return
-                except self._objects.exceptions.BaseError:
-                    if not left:
-                        raise
-                time.sleep(0.1 * (TRIES - left))
-            raise StoreError(f"{self.url}/{name}: ends before its {size} bytes do")
+        with self._told(name), to.open("wb") as file:
+            fetch_object(self._store, name, file)
 
     def names(self, folder: str) -> Iterator[tuple[str, int, float]]:
         with self._told(folder):
@@ -255,26 +231,3 @@ class _Remote:
     def local(self, name: str) -> Path | None:
         del name  # it must be fetched
         return None
-
-
-def _options(url: str) -> dict[str, Any]:
-    """Settings of the client: an S3 of one's own may be reached by plain HTTP (AWS_ENDPOINT_URL)."""
-    retry = {
-        "max_retries": TRIES,
-        "backoff": {"init_backoff": timedelta(seconds=0.1), "max_backoff": timedelta(seconds=5)},
-        "retry_timeout": timedelta(seconds=60),
-    }
-    endpoint = os.environ.get("AWS_ENDPOINT_URL", os.environ.get("AWS_ENDPOINT", ""))
-    plain = url.startswith("http:") or (url.startswith("s3") and endpoint.startswith("http://"))
-    return {"retry_config": retry} | ({"client_options": {"allow_http": True}} if plain else {})
-
-
-@cache
-def _package() -> Any:
-    try:
-        found = import_module("obstore")
-        import_module("obstore.store")
-        import_module("obstore.exceptions")
-    except ImportError as error:
-        raise MissingExtraError("obstore", "cluster") from error
-    return found

@@ -17,6 +17,7 @@ import heapq
 import struct
 import zlib
 from collections import Counter
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from io import BytesIO
 from typing import TYPE_CHECKING, Final
@@ -33,12 +34,13 @@ from sgstore.errors import ExportError
 from sgstore.exporters._clips import ChannelCount, WrittenClip, clip_name, tool
 from sgstore.exporters._layout import LAYOUT, layout
 from sgstore.exporters._mcap_graphs import GRAPH, SCENE, Added, is_added
-from sgstore.mcap import CLIP, HEAD, READ_ERRORS, Loss, McapFile, digest_of
+from sgstore.files import working_folder
+from sgstore.mcap import CLIP, HEAD, READ_ERRORS, Loss, McapFile, digest_of, near
 from sgstore.readers import open_recording
 from sgstore.world import Clip, TraceReport, tolerance_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Generator, Iterable, Iterator
     from pathlib import Path
 
     from mcap.records import Channel
@@ -74,7 +76,7 @@ def write(export: Export, folder: Path) -> list[WrittenClip]:
     ego = ""
     for name in dict.fromkeys(clip.trace for clip in export.clips):
         trace = export.trace(name)
-        with open_recording(trace.path) as recording:
+        with _near(trace.path), open_recording(trace.path) as recording:
             source = _survey(recording, trace, export.store.file.context(name))
             for number, clip in enumerate(export.clips, 1):
                 if clip.trace == name:
@@ -95,6 +97,13 @@ def write(export: Export, folder: Path) -> list[WrittenClip]:
         text = layout(channels, scene=SCENE, graph=GRAPH, ego=ego)
         (folder / LAYOUT).write_text(text, encoding="utf-8", errors="backslashreplace")
     return [written[number] for number in sorted(written)]
+
+
+@contextmanager
+def _near(path: Path) -> Generator[None]:
+    """Read a recording that lies elsewhere from a copy: it is read several times."""
+    with working_folder("recording") as held, near(path, held):
+        yield
 
 
 @dataclass(slots=True)

@@ -16,13 +16,16 @@ import os
 import re
 import stat
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
+from io import FileIO
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from mcap.opcode import Opcode
 
-from sgstore.errors import TraceError
+from sgstore.errors import TraceError, url_named
 from sgstore.mcap._chunks import (
     HEAD,
     MAX_CHUNK,
@@ -34,7 +37,7 @@ from sgstore.mcap._chunks import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Generator, Iterable, Iterator
     from io import BufferedReader
 
 _Found = TypeVar("_Found")
@@ -47,6 +50,7 @@ MAX_PARTS: Final = 10_000
 
 _MARK: Final = b"rosbag2_bagfile_information"
 _BEGINNING: Final = 4096
+_FILES: Final = (".mcap", ".osi", ".zst")
 _ENTRY: Final = re.compile(r"(?P<indent> *)(?P<dash>- +)?(?P<rest>\S.*?)\s*")
 _KEY: Final = re.compile(r"(relative_file_paths|storage_identifier|compression_mode)\s*:\s*(.*)")
 
@@ -76,6 +80,8 @@ def bag_folder(path: Path) -> Path | None:
     """
     if path.name == METADATA:
         return path.parent
+    if (url := url_named(path)) is not None:
+        return path if _is_remote_bag(url) else None
     try:
         if not path.is_dir():
             return None
@@ -83,6 +89,20 @@ def bag_folder(path: Path) -> Path | None:
             return path if _MARK in file.read(_BEGINNING) else None
     except (OSError, ValueError):
         return None
+
+
+@lru_cache(maxsize=1024)
+def _is_remote_bag(url: str) -> bool:
+    """Tell whether a folder in an object store is a bag; what is called like a file is none."""
+    if url.lower().endswith(_FILES):
+        return False
+    from sgstore.mcap._remote import open_url
+
+    try:
+        with open_url(f"{url}/{METADATA}") as file:
+            return _MARK in file.read(_BEGINNING)
+    except (OSError, TraceError):
+        return False
 
 
 def parts_of(folder: Path) -> tuple[BagPart, ...]:
@@ -114,7 +134,7 @@ def part_at(parts: tuple[BagPart, ...], place: int) -> BagPart | None:
 
 def _listed(path: Path) -> list[str]:
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             content = file.read(MAX_METADATA + 1)
         text = content.decode()
     except (OSError, ValueError) as error:
@@ -193,8 +213,10 @@ def _inside(folder: Path, name: str) -> Path:
 def _size(path: Path) -> int:
     """Size of a regular file; -1 if there is none."""
     try:
+        if url_named(path) is not None:
+            return mark_of(path)[0]
         status = path.stat()
-    except (OSError, ValueError):
+    except (OSError, ValueError, TraceError):
         return -1
     return status.st_size if stat.S_ISREG(status.st_mode) else -1
 
@@ -349,10 +371,77 @@ def mark_of(path: Path) -> tuple[int, int]:
     """
     folder = bag_folder(path)
     if folder is None:
-        status = path.stat()
-        return status.st_size, status.st_mtime_ns
+        return _mark(path)
     files = [part for part in parts_of(folder) if part.size >= 0]
-    return sum(part.size for part in files), max(part.path.stat().st_mtime_ns for part in files)
+    return sum(part.size for part in files), max(_mark(part.path)[1] for part in files)
+
+
+def _mark(path: Path) -> tuple[int, int]:
+    if (url := url_named(path)) is not None:
+        from sgstore.mcap._remote import mark_of_url
+
+        return mark_of_url(url)
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
+
+
+def mark_of_open(file: BufferedReader) -> tuple[int, int]:
+    """Size and time of change of a file that :func:`open_regular` has opened; bytes, ns."""
+    remote: Any = file.raw
+    if not isinstance(remote, FileIO):
+        return remote.mark
+    status = os.fstat(file.fileno())
+    return status.st_size, status.st_mtime_ns
+
+
+@contextmanager
+def near(path: Path, folder: Path) -> Generator[None]:
+    """Read a recording from a copy in a folder, which is made, while the block lasts, if it lies elsewhere.
+
+    Everything else goes on calling it by its URL.
+
+    Parameters
+    ----------
+    path : Path
+        A recording; nothing is done for one on this machine.
+    folder : Path
+        It is made where it is needed.
+
+    Raises
+    ------
+    TraceError
+        There is no such recording, or it cannot be fetched.
+    """
+    if url_named(path) is None:
+        yield
+        return
+    from sgstore.mcap._remote import copied
+
+    bag = bag_folder(path)
+    paths = [path] if bag is None else [p.path for p in parts_of(bag) if p.size >= 0]
+    folder.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(copied([url_named(one) or "" for one in paths], folder))
+        except OSError as error:
+            raise TraceError(f"cannot be fetched: {error.strerror}", path=path) from error
+        yield
+
+
+def remote_names(url: str) -> list[str]:
+    """URLs of all that is below a URL in an object store.
+
+    Raises
+    ------
+    TraceError
+        The object store does not tell.
+    """
+    from sgstore.mcap._remote import names_below
+
+    try:
+        return sorted(names_below(url))
+    except OSError as error:
+        raise TraceError(error.strerror or "cannot be read", path=url) from error
 
 
 def _part_of(path: Path, parts: tuple[BagPart, ...], place: int) -> tuple[Path, int]:
@@ -372,6 +461,10 @@ def open_regular(path: Path) -> BufferedReader:
         There is no such file, it is a folder or a device, or it may not be read.
     """
     try:
+        if (url := url_named(path)) is not None:
+            from sgstore.mcap._remote import open_url
+
+            return open_url(url)
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):
             raise TraceError("a folder; expected an MCAP recording", path=path)
@@ -379,6 +472,7 @@ def open_regular(path: Path) -> BufferedReader:
             raise TraceError("not a regular file; expected an MCAP recording", path=path)
         return path.open("rb")
     except FileNotFoundError as error:
-        raise TraceError("no such file", path=path) from error
+        there = "no such file" if url_named(path) is None else f"{error.strerror}"
+        raise TraceError(there, path=path) from error
     except (OSError, ValueError) as error:
         raise TraceError(f"cannot be opened: {error}", path=path) from error

@@ -21,7 +21,6 @@ Source: MCAP specification, format version 0 (mcap.dev/spec).
 
 from __future__ import annotations
 
-import os
 from array import array
 from bisect import bisect_right
 from contextlib import suppress
@@ -57,6 +56,7 @@ from sgstore.mcap._fetch import (
     BagPart,
     bag_folder,
     mark_of,
+    mark_of_open,
     open_regular,
     part_at,
     parts_of,
@@ -171,8 +171,7 @@ class McapFile:
         self._definition_bytes = 0
         self._file = open_regular(path)
         try:
-            status = os.fstat(self._file.fileno())
-            self.size, self.mtime_ns = status.st_size, status.st_mtime_ns
+            self.size, self.mtime_ns = mark_of_open(self._file)
             self.profile, self.library = self._header()
             summary = read_summary(self._file, self.size)
             self.schemas.update(summary.schemas)

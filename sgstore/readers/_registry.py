@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from sgstore import plugins
 from sgstore.errors import TraceError
-from sgstore.mcap import MAGIC, McapFile, messages_at
+from sgstore.mcap import MAGIC, McapFile, messages_at, open_regular
 from sgstore.readers.commonroad._file import ENDINGS as _SCENARIO_ENDINGS
 from sgstore.readers.commonroad._file import CommonRoadFile, is_scenario
 from sgstore.readers.commonroad._file import read_messages as _read_scenario_messages
@@ -147,9 +147,9 @@ def _is_single_channel(path: Path) -> bool:
     if not path.name.lower().endswith(_OSI_ENDINGS):
         return False
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             return file.read(len(MAGIC)) != MAGIC
-    except OSError:
+    except (OSError, TraceError):
         return True
 
 

@@ -23,7 +23,6 @@ from sgstore.store._locking import (
     stamp_of,
     translated,
 )
-from sgstore.store._packing import plain
 from sgstore.store._rows import BATCH, Batches, Given, Rows, give
 from sgstore.store._traces import (
     FrameRef,
@@ -36,6 +35,7 @@ from sgstore.store._traces import (
     stored_name,
     stored_traces,
     trace_named,
+    uri_of,
 )
 from sgstore.world import Channel, MessageRefs
 
@@ -766,7 +766,7 @@ class StoreFile:
             "SELECT any_value(digest) FROM recording WHERE (uri = ? OR place = ?)"
             " AND size = ? AND mtime_ns = ?"
         )
-        places = plain(str(path.resolve())), place_below(self.path, path)
+        places = uri_of(path), place_below(self.path, path)
         with self.access.reading() as connection:
             found = connection.execute(sql, [*places, *mark]).fetchone()
         return str(found[0]) if found and found[0] else ""

@@ -11,7 +11,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.errors import SgstoreError, StoreError
+from sgstore.errors import SgstoreError, StoreError, place_named, url_named
 from sgstore.records import dataclass
 from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, as_json, plain
 from sgstore.store._rows import run
@@ -183,7 +183,7 @@ class StoredTrace:
 
     def as_dict(self) -> dict[str, Any]:
         """All that is known of it, as plain values."""
-        return asdict(self)
+        return asdict(self) | {"path": place_named(self.path)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,8 +224,15 @@ ROOT: Final = "SGSTORE_ROOT"
 """Variable of the environment: a folder in which recordings are looked for first."""
 
 
+def uri_of(path: Path) -> str:
+    """The place of a recording as a store keeps it: its URL, or where it lies on this machine."""
+    return url_named(path) or plain(str(path.resolve()))
+
+
 def place_below(store: Path, path: Path) -> str:
     """The place of a recording from the folder of a store; empty where it does not lie below it."""
+    if url_named(path) is not None:
+        return ""
     with suppress(ValueError):
         return plain(path.resolve().relative_to(store.resolve().parent).as_posix())
     return ""

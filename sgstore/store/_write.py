@@ -19,6 +19,7 @@ from sgstore.store._classes import IngestedClasses
 from sgstore.store._packing import MAX_FRAMES, NodeKinds, texts
 from sgstore.store._payloads import FrameTimes, Happenings
 from sgstore.store._staging import Sealed, Staging
+from sgstore.store._traces import uri_of
 from sgstore.world import BUCKET_FRAMES, Origin, longest_step_ns, origin_of, quantize
 
 if TYPE_CHECKING:
@@ -306,7 +307,7 @@ class Segment:
         recording = {
             "recording_id": np.array([identity.numbers["recording_id"]]),
             "digest": texts([info.digest]),
-            "uri": texts([str(info.path.resolve())]),
+            "uri": texts([uri_of(info.path)]),
             "size": np.array([info.size], np.int64),
             "mtime_ns": np.array([info.mtime_ns], np.int64),
         }

@@ -10,7 +10,6 @@ Source: zstd compression format (RFC 8878), sections 3.1.1 and 3.1.2.
 
 from __future__ import annotations
 
-import os
 import struct
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -31,6 +30,7 @@ from sgstore.mcap import (
     Findings,
     Loss,
     Messages,
+    mark_of_open,
     open_regular,
 )
 from sgstore.readers.osi._schema import (
@@ -262,8 +262,7 @@ class OsiFile:
         self._mark = b""
         self._file = open_regular(path)
         try:
-            status = os.fstat(self._file.fileno())
-            self.size, self.mtime_ns = status.st_size, status.st_mtime_ns
+            self.size, self.mtime_ns = mark_of_open(self._file)
             name = self._recognise()
         except BaseException:
             self._file.close()

@@ -1,0 +1,381 @@
+"""Recordings in object stores and on web servers, by obstore: read by ranges, or copied for a while.
+
+A recording is called by its URL: ``s3://bucket/day1/a.mcap``, ``https://host/a.mcap``. Of one that is asked for
+single messages only these ranges travel. One that is read from end to end, and more than once, is copied first
+(:func:`copied`): whoever opens it meanwhile reads the copy, and everything else goes on calling it by its URL.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import secrets
+import time
+from contextlib import closing, contextmanager, suppress
+from datetime import timedelta
+from errno import EINVAL, EIO, ENOENT
+from functools import cache, lru_cache
+from importlib import import_module
+from tempfile import TemporaryFile
+from typing import IO, TYPE_CHECKING, Any, Final
+
+from sgstore.errors import MissingExtraError, TraceError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Iterator
+    from datetime import datetime
+    from pathlib import Path
+
+TRIES: Final = 4
+"""How often is asked for what an object store did not give whole."""
+
+PIECE: Final = 1 << 20
+"""Bytes that are asked for at a time where single messages are read."""
+
+COPIED: Final = 16 << 20
+"""Bytes that are asked for at a time where all are read."""
+
+_copies: Final[dict[str, Path]] = {}
+"""URL → its copy on this machine, as long as there is one."""
+
+
+@cache
+def object_stores() -> Any:
+    """Import obstore.
+
+    Raises
+    ------
+    MissingExtraError
+        The extra ``cluster`` is not installed.
+    """
+    try:
+        found = import_module("obstore")
+        import_module("obstore.store")
+        import_module("obstore.exceptions")
+    except ImportError as error:
+        raise MissingExtraError("obstore", "cluster") from error
+    return found
+
+
+def object_store_at(url: str) -> Any:
+    """Open an object store at a URL; it asks again where that is worth it, a while later."""
+    return object_stores().store.from_url(url, **_options(url))
+
+
+def _options(url: str) -> dict[str, Any]:
+    """Settings of the client: an S3 of one's own may be reached by plain HTTP (AWS_ENDPOINT_URL)."""
+    retry = {
+        "max_retries": TRIES,
+        "backoff": {"init_backoff": timedelta(seconds=0.1), "max_backoff": timedelta(seconds=5)},
+        "retry_timeout": timedelta(seconds=60),
+    }
+    endpoint = os.environ.get("AWS_ENDPOINT_URL", os.environ.get("AWS_ENDPOINT", ""))
+    plain = url.startswith("http:") or (url.startswith("s3") and endpoint.startswith("http://"))
+    return {"retry_config": retry} | ({"client_options": {"allow_http": True}} if plain else {})
+
+
+def reason_of_object_store(error: BaseException) -> tuple[str, bool]:
+    """Describe in one line why an object store refused; and tell whether it has no such object."""
+    wrong = object_stores().exceptions
+    if isinstance(error, FileNotFoundError | wrong.NotFoundError):
+        return "no such object, or no such bucket", True
+    refused = PermissionError, wrong.PermissionDeniedError, wrong.UnauthenticatedError
+    if isinstance(error, refused):
+        return "access is refused: look at the credentials", False
+    told = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    return " ".join(told.split())[:300], False
+
+
+def fetch_object(store: Any, name: str, file: IO[bytes]) -> None:
+    """Write an object into a file that is open for writing; one that ends early is asked for again.
+
+    Raises
+    ------
+    OSError
+        It always ends early, or the file cannot be written.
+    obstore.exceptions.BaseError
+        The object store does not give it.
+    """
+    objects, size = object_stores(), -1
+    for left in reversed(range(TRIES)):
+        file.seek(0)
+        file.truncate()
+        found = objects.get(store, name)
+        size = found.meta["size"]
+        try:
+            for piece in found.stream(min_chunk_size=PIECE):
+                file.write(piece)
+        except objects.exceptions.BaseError:
+            if not left:
+                raise
+        else:
+            if file.tell() == size:
+                return
+        time.sleep(0.1 * (TRIES - left))
+    raise OSError(EIO, f"ends before its {size} bytes do")
+
+
+# One object -----------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=64)
+def _opened(root: str, endpoint: str) -> Any:
+    del endpoint  # another one is another store
+    return object_store_at(root)
+
+
+def _at(url: str) -> tuple[Any, str]:
+    """The object store of a URL, and the name of the object in it."""
+    scheme, _, rest = url.partition("://")
+    host, _, name = rest.partition("/")
+    root = f"{scheme}://{host}"
+    key = [os.environ.get(one, "") for one in ("AWS_ENDPOINT_URL", "AWS_ENDPOINT", *_KEYS)]
+    return _opened(root, "\n".join(key)), name
+
+
+_KEYS: Final = ("AWS_ACCESS_KEY_ID", "AWS_SESSION_TOKEN", "AWS_PROFILE")
+
+
+@contextmanager
+def _told(url: str) -> Generator[None]:
+    try:
+        yield
+    except (object_stores().exceptions.BaseError, OSError) as error:
+        reason, missing = reason_of_object_store(error)
+        if missing:
+            raise FileNotFoundError(ENOENT, reason, url) from error
+        raise TraceError(reason, path=url) from error
+
+
+def _nanoseconds(time: datetime) -> int:
+    return int(time.timestamp()) * 1_000_000_000 + time.microsecond * 1000
+
+
+def mark_of_url(url: str) -> tuple[int, int]:
+    """Size and time of change of an object; bytes, ns.
+
+    Raises
+    ------
+    FileNotFoundError
+        There is none.
+    TraceError
+        The object store does not tell.
+    """
+    copy = _copies.get(url)
+    if copy is not None:
+        status = copy.stat()
+        return status.st_size, status.st_mtime_ns
+    with _told(url):
+        store, name = _at(url)
+        about = object_stores().head(store, name)
+        return about["size"], _nanoseconds(about["last_modified"])
+
+
+def names_below(url: str) -> Iterator[str]:
+    """The URLs of all objects below a URL, in no order.
+
+    Raises
+    ------
+    TraceError
+        The object store does not tell.
+    """
+    scheme, _, rest = url.partition("://")
+    host = rest.partition("/")[0]
+    with _told(url):
+        store, name = _at(url)
+        for some in object_stores().list(store, prefix=name.rstrip("/") or None):
+            for one in some:
+                yield f"{scheme}://{host}/{one['path']}"
+
+
+def open_url(url: str) -> io.BufferedReader:
+    """An object, opened for reading; a copy of it where there is one.
+
+    Raises
+    ------
+    FileNotFoundError
+        There is none.
+    TraceError
+        The object store does not give it.
+    """
+    copy = _copies.get(url)
+    return copy.open("rb") if copy is not None else io.BufferedReader(RemoteFile(url), PIECE)
+
+
+class NoRangesError(TraceError):
+    """A server gives its files as a whole only."""
+
+
+class RemoteFile(io.RawIOBase):
+    """An object as a file: what is read of it is asked for by its range.
+
+    Attributes
+    ----------
+    mark : (int, int)
+        Its size and its time of change; bytes, ns.
+    """
+
+    def __init__(self, url: str) -> None:
+        super().__init__()
+        self.name = url
+        with _told(url):
+            self._store, self._key = _at(url)
+            about = object_stores().head(self._store, self._key)
+        self._tag = about["e_tag"]
+        self._whole: IO[bytes] | None = None
+        self._position = 0
+        self.mark = about["size"], _nanoseconds(about["last_modified"])
+
+    def readable(self) -> bool:
+        """Return True."""
+        return True
+
+    def seekable(self) -> bool:
+        """Return True."""
+        return True
+
+    def tell(self) -> int:
+        """Return the position."""
+        return self._position
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
+        """Change the position."""
+        base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self.mark[0]}[whence]
+        if base + offset < 0:
+            raise OSError(EINVAL, "negative position")
+        self._position = base + offset
+        return self._position
+
+    def readinto(self, buffer: Any, /) -> int:
+        """Read so many bytes as there is room for, or as there are."""
+        view = memoryview(buffer).cast("B")
+        stop = min(self._position + len(view), self.mark[0])
+        if stop <= self._position:
+            return 0
+        data = self.piece(self._position, stop)
+        view[: len(data)] = data
+        self._position = stop
+        return len(data)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._whole is not None:
+            self._whole.close()
+        super().close()
+
+    def piece(self, start: int, stop: int) -> memoryview:
+        """Return the bytes from one place to another; of a server that knows no ranges all come, once.
+
+        Raises
+        ------
+        FileNotFoundError
+            The object is gone.
+        TraceError
+            It was replaced, or does not come.
+        """
+        if self._whole is None:
+            try:
+                return self._range(start, stop)
+            except NoRangesError:
+                self._whole = self._fetched()
+        self._whole.seek(start)
+        return memoryview(self._whole.read(stop - start))
+
+    def _range(self, start: int, stop: int) -> memoryview:
+        asked: dict[str, Any] = {"range": (start, stop)}
+        if self._tag:
+            asked["if_match"] = self._tag
+        wrong = object_stores().exceptions
+
+        def ask() -> memoryview:
+            try:
+                found = object_stores().get(self._store, self._key, options=asked)
+                return memoryview(found.bytes())
+            except wrong.PreconditionError as error:
+                raise TraceError("it was replaced while it was read", path=self.name) from error
+            except wrong.NotSupportedError as error:
+                raise NoRangesError("its server knows no ranges", path=self.name) from error
+
+        return whole(self.name, stop - start, ask)
+
+    def _fetched(self) -> IO[bytes]:
+        """Fetch all of the object, to a file without a name."""
+        file = TemporaryFile()  # noqa: SIM115  closed with this one
+        with _told(self.name):
+            fetch_object(self._store, self._key, file)
+        return file
+
+
+def whole(url: str, size: int, ask: Callable[[], memoryview]) -> memoryview:
+    """Ask for bytes until they come as a whole, a few times.
+
+    Raises
+    ------
+    FileNotFoundError
+        There is no such object.
+    TraceError
+        They do not come; it says why.
+    """
+    wrong, reason = object_stores().exceptions, ""
+    final = wrong.NotFoundError, wrong.PermissionDeniedError, wrong.UnauthenticatedError
+    for done in range(TRIES):
+        if done:
+            time.sleep(0.1 * done)
+        with _told(url):
+            try:
+                data = ask()
+            except final:
+                raise
+            except wrong.BaseError as error:
+                reason, _ = reason_of_object_store(error)
+                continue
+        if len(data) == size:
+            return data
+        reason = f"{len(data)} bytes came of {size}"
+    raise TraceError(f"not read in {TRIES} tries: {reason}", path=url)
+
+
+# Copies ---------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def copied(urls: list[str], folder: Path) -> Generator[None]:
+    """Read objects from copies of them in a folder of this machine, for as long as the block lasts.
+
+    Raises
+    ------
+    FileNotFoundError
+        There is no such object.
+    TraceError
+        It does not come as a whole, or there is no room for it.
+    """
+    made: dict[str, Path] = {}
+    try:
+        for url in urls:
+            path = folder / f"copy-{secrets.token_hex(6)}"
+            try:
+                _copy(url, path)
+            finally:
+                made[url] = path
+            _copies[url] = path
+        yield
+    finally:
+        for url, path in made.items():
+            _copies.pop(url, None)
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+
+
+def _copy(url: str, path: Path) -> None:
+    file = RemoteFile(url)
+    size, changed = file.mark
+    with closing(file):
+        pieces = (file.piece(at, min(at + COPIED, size)) for at in range(0, size, COPIED))
+        with path.open("wb") as to:
+            for piece in pieces:
+                try:
+                    to.write(piece)
+                except OSError as error:
+                    reason = f"no copy of it can be written: {error.strerror}"
+                    raise TraceError(reason, path=url) from error
+    os.utime(path, ns=(changed, changed))
