@@ -23,12 +23,15 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
+from sgstore.quoting import literal, quoted
+
 try:
     import fcntl
 except ImportError:  # not on Windows: there nobody could ask for a file that is kept, so none is
     fcntl = None
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from duckdb import DuckDBPyConnection
@@ -80,13 +83,63 @@ def _wanted(path: Path) -> bool:
     return False  # one that was killed left it
 
 
+class AttachedFile:
+    """A file that is attached, to be read, to the instance of the database for its folder.
+
+    Parameters
+    ----------
+    path : Path
+    connect : function
+        Makes that instance, given the folder that it may read.
+    settings : tuple
+        Those that it has: instances with others are others.
+
+    Attributes
+    ----------
+    name : str
+        Of the file in the instance.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        connect: Callable[[Path], DuckDBPyConnection],
+        settings: tuple[object, ...],
+    ) -> None:
+        place = path.resolve()
+        key = place.parent, *settings
+        with _instances_lock:
+            if key not in _instances:
+                _instances[key] = connect(place.parent)
+            self._instance = _instances[key]
+        self.name = f"file {place.name}"
+        told = f"ATTACH {literal(str(place))} AS {quoted(self.name)} (READ_ONLY)"
+        self._instance.cursor().execute(told)
+
+    def cursor(self) -> DuckDBPyConnection:
+        """A connection that reads the file."""
+        connection = self._instance.cursor()
+        connection.execute(f"USE {quoted(self.name)}.main")
+        return connection
+
+    def close(self) -> None:
+        """Detach the file."""
+        self._instance.cursor().execute(f"DETACH {quoted(self.name)}")
+
+
+_instances: Final[dict[tuple[object, ...], DuckDBPyConnection]] = {}
+"""The instances of the database for the files of a folder, by it and their settings."""
+
+_instances_lock = threading.Lock()
+
+
 @dataclass(slots=True, eq=False)
 class OpenFile:
     """The state of one file in this process. Whoever changes it holds ``changed``.
 
     Attributes
     ----------
-    instance : DuckDBPyConnection or None
+    instance : DuckDBPyConnection, AttachedFile or None
         The instance of the database that all readers share.
     opened : Stamp
         The file that it was when it was opened.
@@ -114,7 +167,7 @@ class OpenFile:
 
     path: Path
     changed: threading.Condition = field(default_factory=threading.Condition)
-    instance: DuckDBPyConnection | None = None
+    instance: DuckDBPyConnection | AttachedFile | None = None
     opened: Stamp = ()
     settings: tuple[object, ...] = ()
     folder: Path | None = None
@@ -247,7 +300,12 @@ def give_back(patience_s: float = 0.0) -> None:
 
 
 # At the end of the process the thread must not be within the database.
-atexit.register(give_back, 5.0)
+@atexit.register
+def _end() -> None:
+    give_back(5.0)
+    while _instances:
+        _instances.popitem()[1].close()
+
 
 _of_parents: Final[list[object]] = []
 """What a process that was forked off has of its parent's: the database survives no fork, not even its end."""
@@ -256,6 +314,8 @@ _of_parents: Final[list[object]] = []
 def _begin_anew() -> None:
     """Forget, in a process that was forked off, what threads of its parent did."""
     _watch.begin()
+    _of_parents.extend(_instances.values())
+    _instances.clear()
     for file in files.values():
         _of_parents.extend((file.instance, *file.cursors))
         file.changed, file.held = threading.Condition(), threading.local()
