@@ -17,6 +17,7 @@ from sgstore.cli._options import (
     AskOptions,
     Budget,
     CaseUnit,
+    EngineName,
     LongestClip,
     Parameters,
     Picture,
@@ -35,6 +36,8 @@ from sgstore.cli._options import (
 from sgstore.cli._output import count_bar, say
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from sgstore.coverage import ChosenFrames, Classed, ReportTable
     from sgstore.locks import Lock
     from sgstore.query import Store
@@ -55,8 +58,8 @@ A = Annotated[
     str,
     Argument(
         metavar="A",
-        help="Frames: a store, STORE:QUERY for those that match, STORE:TESTS.lock for those of a lock;"
-        " TESTS.lock alone takes the store beside it that has its recordings.",
+        help="Frames: a store or a collection, STORE:QUERY for those that match, STORE:TESTS.lock for those of"
+        " a lock; TESTS.lock alone takes the store beside it that has its recordings.",
     ),
 ]
 B = Annotated[str, Argument(metavar="B", help="Frames, as A.")]
@@ -84,6 +87,21 @@ Covered = Annotated[bool, Option("--covered", help="List what is covered, with i
 
 
 @dataclass(frozen=True)
+class FrameAskOptions(AskOptions):
+    """Options of a verb that asks stores or collections for classes of frames."""
+
+    engine: EngineName = "local"
+
+    def frames(self, *texts: str) -> Iterator[ChosenFrames]:
+        """Frames that each of some texts means."""
+        from sgstore.coverage import selection_of
+
+        spill = self.spill()
+        for text in texts:
+            yield selection_of(text, max_spill=spill, engine=self.engine)
+
+
+@dataclass(frozen=True)
 class WindowOptions:
     """Options for the classes of frames."""
 
@@ -91,14 +109,12 @@ class WindowOptions:
     window: Window = 1
     incomplete: Incomplete = "equal"
 
-    def of(self, ask: AskOptions, *texts: str, slots: Path | None = None) -> list[Classed]:
+    def of(self, ask: FrameAskOptions, *texts: str, slots: Path | None = None) -> list[Classed]:
         """Frames that texts mean, with their classes; says which traces cannot answer a query."""
-        from sgstore.coverage import classed, read_specifications, selection_of
+        from sgstore.coverage import classed, read_specifications
 
-        spill = ask.spill()
         found: list[Classed] = []
-        for text in texts:
-            chosen = selection_of(text, max_spill=spill)
+        for chosen in ask.frames(*texts):
             say_left_out(chosen)
             declared = None
             if slots is not None:
@@ -126,7 +142,7 @@ def classes_(
     limit: Limit = None,
     *,
     scenes: SceneOptions,
-    ask: AskOptions,
+    ask: FrameAskOptions,
 ) -> None:
     """List the classes of scenes, the most frequent first, and estimate what is unseen."""
     from sgstore.coverage import classes, rank_sizes
@@ -149,7 +165,7 @@ def of_(
     by: Annotated[str, Option("--by", metavar="B", help="Frames that cover it, as A.")],
     *,
     scenes: SceneOptions,
-    ask: AskOptions,
+    ask: FrameAskOptions,
 ) -> None:
     """Measure how much of A is covered by B, by classes and by frames."""
     from sgstore.coverage import covered
@@ -168,7 +184,7 @@ def novel_(
     limit: Limit = None,
     *,
     scenes: SceneOptions,
-    ask: AskOptions,
+    ask: FrameAskOptions,
 ) -> None:
     """List the scenes of A that are not in B, the rarest first."""
     from sgstore.coverage import novel, novel_clips, novel_frames
@@ -178,7 +194,7 @@ def novel_(
 
 
 @coverage.command("venn")
-def venn_(a: A, b: B, *, scenes: SceneOptions, ask: AskOptions) -> None:
+def venn_(a: A, b: B, *, scenes: SceneOptions, ask: FrameAskOptions) -> None:
     """Count what A and B share, and what only one of them has."""
     from sgstore.coverage import venn
 
@@ -193,7 +209,7 @@ def growth_(
     picture: Picture = None,
     *,
     scenes: SceneOptions,
-    ask: AskOptions,
+    ask: FrameAskOptions,
 ) -> None:
     """Show how the number of classes grows, beside a random order, to tell if more data helps."""
     from sgstore.coverage import growth
@@ -230,7 +246,7 @@ def combos_(
     picture: Picture = None,
     limit: Limit = None,
     *,
-    ask: AskOptions,
+    ask: FrameAskOptions,
 ) -> None:
     """Count the combinations of k features, such as (car near ego), or of values of declared slots."""
     from sgstore.coverage import combos
@@ -275,10 +291,10 @@ def spec_(
     covered: Covered = False,
     limit: Limit = None,
     *,
-    ask: AskOptions,
+    ask: FrameAskOptions,
 ) -> None:
     """Measure how much of a specification is covered: the cells of a query, or declared slots."""
-    from sgstore.coverage import selection_of, specification
+    from sgstore.coverage import specification
 
     if (query is None) == (slots is None):
         raise typer.BadParameter("give a query, or a file with --slots FILE")
@@ -290,9 +306,8 @@ def spec_(
         return
     if by and cells:
         raise typer.BadParameter("give one of --by and --cells")
-    spill = ask.spill()
-    reference = selection_of(by, max_spill=spill) if by else ""
-    tables = specification(selection_of(a, max_spill=spill), query, cells, reference)
+    chosen, *reference = ask.frames(a, *([by] if by else []))
+    tables = specification(chosen, query, cells, *reference)
     ask.report(tables[2 if missing else 1 if covered else 0], limit)
 
 
@@ -304,7 +319,7 @@ def windows_(
     window: Window = 10,
     incomplete: Incomplete = "equal",
     *,
-    ask: AskOptions,
+    ask: FrameAskOptions,
 ) -> None:
     """List the classes of windows: of a frame together with those recorded before it."""
     from sgstore.coverage import classes
@@ -325,7 +340,7 @@ def explain_(
     frames: Annotated[bool, Option("--frames", help="Weight classes by their frames.")] = False,
     limit: Limit = None,
     *,
-    ask: AskOptions,
+    ask: FrameAskOptions,
 ) -> None:
     """Explain how the scenes of B differ from those of A: the features that differ most."""
     from sgstore.coverage import explain
@@ -357,7 +372,7 @@ def failures_(
     limit: Limit = None,
     *,
     windows: WindowOptions,
-    ask: AskOptions,
+    ask: FrameAskOptions,
 ) -> None:
     """List failures of a system that are novel, and those that coverage would have predicted (S3C)."""
     from sgstore.coverage import S3C_THRESHOLD, failures, read_outcomes
@@ -382,11 +397,11 @@ def _fraction(text: str) -> float:
 
 
 def _slot_table(
-    text: str, slots: Path, k: int, ask: AskOptions, *, covered: bool, missing: bool
+    text: str, slots: Path, k: int, ask: FrameAskOptions, *, covered: bool, missing: bool
 ) -> ReportTable:
-    from sgstore.coverage import read_specifications, selection_of, slot_coverage
+    from sgstore.coverage import read_specifications, slot_coverage
 
-    chosen = selection_of(text, max_spill=ask.spill())
+    (chosen,) = ask.frames(text)
     tables = slot_coverage(chosen, read_specifications(slots), k)
     return tables[1 if covered else 2 if missing else 0]
 

@@ -1,5 +1,6 @@
 # The face of this package: what others may import from it.
 
+from ._frames import CollectionFrames as CollectionFrames
 from ._landing import commit as commit
 from ._landing import land as land
 from ._open import open as open
@@ -10,6 +11,7 @@ from ._pack import gc as gc
 from ._pack import pack as pack
 from ._pack import unpack as unpack
 from ._pack import verify as verify
+from ._place import ABOUT as ABOUT
 from ._questions import Collection as Collection
 from ._remake import rebuild as rebuild
 from ._questions import PartedChecks as PartedChecks
@@ -19,8 +21,10 @@ from ._questions import PartedUnion as PartedUnion
 from ._questions import PartialAnswerError as PartialAnswerError
 
 __all__ = [
+    "ABOUT",
     "Collection",
     "CollectionFaults",
+    "CollectionFrames",
     "Commit",
     "Garbage",
     "PartedChecks",

@@ -16,11 +16,13 @@ from functools import cached_property, partial
 from heapq import merge
 from itertools import islice
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection import _worker as worker
 from sgstore.collection._engines import engine_named
+from sgstore.collection._frames import CollectionFrames
 from sgstore.collection._pack import refuse_others
 from sgstore.collection._place import place_at
 from sgstore.errors import QueryError, SqlError, StoreError
@@ -170,6 +172,12 @@ class Collection:
                     known["traces"] = frozenset({*(known["traces"] or ()), *one["traces"]})
         return {name: _facts_of_table(name, one) for name, one in told.items()}
 
+    @cached_property
+    def abstracted(self) -> CollectionFrames:
+        """Its frames as abstractions have them."""
+        homes = {row["trace_id"]: row["bundle"] for row in self.snapshot.traces}
+        return CollectionFrames(self.ask, self.bundles() or [worker.EMPTY], homes)
+
     def bundles(self) -> list[str]:
         """All bundles, the largest first."""
         ordered = sorted(self.snapshot.bundles, key=lambda one: (-one["bytes"], one["bundle"]))
@@ -245,8 +253,13 @@ class Collection:
 
     # How a question is asked ----------------------------------------------------------------------
 
-    def ask(self, question: dict[str, Any], bundles: Sequence[str]) -> Iterator[dict[str, Any]]:
-        """Yield what each of some bundles answers, as they come.
+    def ask(
+        self,
+        question: dict[str, Any],
+        bundles: Sequence[str],
+        each: Mapping[str, dict[str, Any]] = MappingProxyType({}),
+    ) -> Iterator[dict[str, Any]]:
+        """Yield what each of some bundles answers, as they come; ``each``: what only one of them is asked.
 
         Raises
         ------
@@ -257,7 +270,7 @@ class Collection:
         failed: dict[str, str] = {}
         with working_folder("answers") as folder:
             base = self._task(question, folder)
-            tasks = [base | {"bundle": bundle} for bundle in bundles]
+            tasks = [base | {"bundle": bundle} | each.get(bundle, {}) for bundle in bundles]
             done = set[str]()
             for result in self.engine.map(worker.answer, tasks):
                 if result["bundle"] in done:
@@ -583,7 +596,7 @@ class PartedMatches(Tabular):
                     self._reasons |= answer["reasons"]
                     for number, told in enumerate(answer["parts"]):
                         name = PARTS if not number else f"{PARTS} {number}"
-                        part = _moved(PartFile.from_dict(told), folder)
+                        part = PartFile.from_dict(told).moved(folder)
                         tables.setdefault(name, []).append(part)
             yield tables
 
@@ -636,11 +649,6 @@ class _NoFile:
     @contextmanager
     def snapshot(self) -> Generator[None]:
         yield
-
-
-def _moved(part: PartFile, folder: Path) -> PartFile:
-    """A part whose file is in another folder now, where it stays until all have come."""
-    return replace(part, path=part.path.replace(folder / part.path.name))
 
 
 class PartedChecks:

@@ -21,11 +21,19 @@ from sgstore.errors import StoreError
 from sgstore.files import working_folder
 from sgstore.lang import Compiled, Type, parted
 from sgstore.query import UserStatement, matches_of
-from sgstore.store import PartFile, StoreFile, UserTables, write_classes, write_part
+from sgstore.store import (
+    PartFile,
+    StoreFile,
+    UserTables,
+    write_classes,
+    write_coded,
+    write_part,
+    write_rows,
+)
 from sgstore.temporal import CheckRun, TemporalMatches, Verdict
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Mapping
+    from collections.abc import Callable, Generator, Iterator, Mapping
 
     from sgstore.lang import Catalog
     from sgstore.matches import Interval, Matches
@@ -133,12 +141,26 @@ def answer(task: dict[str, Any]) -> dict[str, Any]:
     with working_folder("part") as held:
         to = Path(task["to"]) if task["to"] else held
         with _opened(task, held) as file:
-            whole = Whole.from_dict(task["whole"])
-            known = whole.catalog(file.catalog())  # a bundle never changes
+            known = _known(file, json.dumps(task["whole"]))
             found = _KINDS[task["kind"]](task, file, lambda: known, to)
         if not task["to"]:
             _carry(found)
         return {"bundle": task["bundle"], **found}
+
+
+def _known(file: StoreFile, told: str) -> Catalog:
+    """The catalog of a bundle, which never changes; what was found out about its traces is remembered."""
+    local = file.catalog()
+    held = _catalogs.get((file.path, told))
+    if held is None or held[0] is not local:
+        whole = Whole.from_dict(json.loads(told))
+        held = _catalogs[file.path, told] = local, whole.catalog(local)
+        while len(_catalogs) > KEPT:
+            del _catalogs[next(iter(_catalogs))]
+    return held[1]
+
+
+_catalogs: Final[dict[tuple[Path, str], tuple[Catalog, Catalog]]] = {}
 
 
 @contextmanager
@@ -163,7 +185,7 @@ def _opened(task: dict[str, Any], held: Path) -> Generator[StoreFile]:
 @lru_cache(maxsize=KEPT)
 def _kept(path: Path) -> StoreFile:
     """A bundle that was asked lately: its file stays open for a second, and what it holds is remembered."""
-    return StoreFile(path)
+    return StoreFile.together(path)
 
 
 def _tables_of(task: dict[str, Any], held: Path) -> dict[str, Path]:
@@ -268,6 +290,49 @@ def _sql(
     return {"lines": str(path), **about}
 
 
+def _coded(
+    task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
+) -> dict[str, Any]:
+    """The class of each frame in an abstraction."""
+    part = write_coded(file, task["abstraction"], to / f"{secrets.token_hex(8)}.parquet")
+    return {"parts": [part.as_dict()], "reasons": {}}
+
+
+def _features(
+    task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
+) -> dict[str, Any]:
+    """Features of the graphs of some frames in an abstraction; frames by their place in the question."""
+    from sgstore.arrays import np
+
+    def rows() -> Iterator[tuple[int, str, int]]:
+        frame_id = np.array(task["frames"], np.int64)
+        for row, some in file.abstracted.features(task["abstraction"], frame_id):
+            names = [json.dumps(name) for name in some.names]
+            of = row[some.frame].tolist(), some.feature.tolist(), some.often.tolist()
+            yield from (
+                (one, names[feature], often) for one, feature, often in zip(*of, strict=True)
+            )
+
+    columns = {"frame": "BIGINT", "feature": "VARCHAR", "often": "BIGINT"}
+    part = write_rows(columns, rows(), to / f"{secrets.token_hex(8)}.parquet")
+    return {"parts": [part.as_dict()], "reasons": {}}
+
+
+_FRAMES: Final = {
+    "times": ("SELECT frame_id, time_ns FROM frame", ("frame_id", "time_ns")),
+    "imports": ("SELECT graph, frame_id FROM imports", ("graph", "frame_id")),
+}
+
+
+def _frames(
+    task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
+) -> dict[str, Any]:
+    """The times of all frames, or the names that they had in imported files."""
+    sql, columns = _FRAMES[task["kind"]]
+    part = write_part(file, (sql, ()), columns, (), to / f"{secrets.token_hex(8)}.parquet")
+    return {"parts": [part.as_dict()], "reasons": {}}
+
+
 def _tables(
     _task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], _to: Path
 ) -> dict[str, Any]:
@@ -291,12 +356,18 @@ _KINDS: Final[dict[str, Any]] = {
     "classes": _classes,
     "sql": _sql,
     "tables": _tables,
+    "coded": _coded,
+    "features": _features,
+    "times": _frames,
+    "imports": _frames,
 }
 
 
 def _carry(found: dict[str, Any]) -> None:
     """Put the content of files into a result that is read on another machine."""
     for part in found.get("parts", ()):
+        if not part["rows"]:
+            continue
         part["data"] = base64.b64encode(Path(part["path"]).read_bytes()).decode()
     if "lines" in found:
         found["data"] = Path(found["lines"]).read_text(encoding="utf-8")

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from sgstore.coverage._classes import Classed
-    from sgstore.query import Store
+    from sgstore.coverage._frames import ChosenFrames
     from sgstore.world import Bools, Floats, Ints
 
 
@@ -169,7 +169,7 @@ def classes(a: Classed, unit: CountedUnit = "frame") -> ReportTable:
         sizes[order].tolist(),
         (sizes[order] / max(total, 1)).tolist(),
         cumulative,
-        names_of(a.chosen.store, first[order]),
+        names_of(a.chosen.source, first[order]),
         strict=True,
     )
     columns = ("rank", "class", f"{unit}s", "share", "cumulative", "frame")
@@ -244,7 +244,7 @@ def novel(a: Classed, than: Classed) -> ReportTable:
     new = np.flatnonzero((sizes > 0) & (than.sizes() == 0))
     order = new[np.lexsort((first[new], sizes[new]))]
     names = [a.names[code] for code in order.tolist()]
-    frames = names_of(a.chosen.store, first[order])
+    frames = names_of(a.chosen.source, first[order])
     rows = list(zip(names, sizes[order].tolist(), frames, strict=True))
     total, many = int(sizes.sum()), int((sizes > 0).sum())
     said = [
@@ -267,7 +267,7 @@ def novel_frames(a: Classed, than: Classed) -> ReportTable:
     sizes = a.sizes()
     rows = np.flatnonzero(is_novel(a, than))
     rows = rows[np.lexsort((a.frame_id[rows], sizes[a.code[rows]]))]
-    frames = names_of(a.chosen.store, a.frame_id[rows])
+    frames = names_of(a.chosen.source, a.frame_id[rows])
     listed = zip(frames, a.frame_id[rows].tolist(), a.code[rows].tolist(), strict=True)
     table = [(frame, number, a.names[code], int(sizes[code])) for frame, number, code in listed]
     said = [f"{len(rows)} frames of {a.chosen.text} of classes that are not in {than.chosen.text}"]
@@ -288,7 +288,7 @@ def novel_clips(a: Classed, than: Classed) -> ReportTable:
     fresh = begins(ids)
     starts = np.flatnonzero(fresh)
     ends = np.append(starts[1:], len(rows)) - 1
-    first, last = names_of(a.chosen.store, ids[starts]), names_of(a.chosen.store, ids[ends])
+    first, last = names_of(a.chosen.source, ids[starts]), names_of(a.chosen.source, ids[ends])
     number = np.cumsum(fresh) - 1
     pairs = np.unique(np.stack([number, a.code[rows]]), axis=1)[0]
     kinds = np.bincount(pairs, minlength=len(starts))
@@ -422,14 +422,14 @@ def read_outcomes(path: str | Path, threshold: float = S3C_THRESHOLD) -> dict[st
 
 
 def told_outcomes(
-    outcomes: Mapping[str, bool], store: Store, frame_id: Ints
+    outcomes: Mapping[str, bool], chosen: ChosenFrames, frame_id: Ints
 ) -> tuple[Bools, Bools]:
     """(N,): which frames failed, and of which an outcome is known; names are those of :func:`read_outcomes`."""
     failed, known = (np.zeros(len(frame_id), np.bool_) for _ in range(2))
     place = {int(frame): row for row, frame in enumerate(frame_id.tolist())}
-    ids = store.file.abstracted.times()[0]
-    called = dict(zip(names_of(store, ids), ids.tolist(), strict=True))
-    called |= store.file.abstracted.imported_names()
+    ids = chosen.abstracted.times()[0]
+    called = dict(zip(names_of(chosen.source, ids), ids.tolist(), strict=True))
+    called |= chosen.abstracted.imported_names()
     for name, fails in outcomes.items():
         row = place.get(called.get(name, int(name) if _ID.fullmatch(name) else -1))
         if row is not None:
@@ -504,8 +504,8 @@ def failures(
         No outcome is about a frame of either.
     """
     _, (train, test) = shared(train, test)
-    failed_train, known_train = told_outcomes(outcomes, train.chosen.store, train.frame_id)
-    failed, known = told_outcomes(outcomes, test.chosen.store, test.frame_id)
+    failed_train, known_train = told_outcomes(outcomes, train.chosen, train.frame_id)
+    failed, known = told_outcomes(outcomes, test.chosen, test.frame_id)
     if not known.any():
         raise ConfigError(
             f"none of the {len(outcomes)} outcomes is about a frame of {test.chosen.text}"
@@ -555,7 +555,7 @@ def failures(
 
 def _listed(test: Classed, novel: Bools, inputs: Ints) -> ReportTable:
     rows = np.flatnonzero(novel)
-    frames = names_of(test.chosen.store, test.frame_id[rows])
+    frames = names_of(test.chosen.source, test.frame_id[rows])
     columns = zip(frames, test.code[rows].tolist(), inputs[rows].tolist(), strict=True)
     listed = [(frame, test.names[code], many) for frame, code, many in columns]
     return ReportTable(("frame", "class", "in_training"), listed)

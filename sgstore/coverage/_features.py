@@ -92,7 +92,7 @@ def features(a: Classed, abstraction: str, *, of_ego: bool = False) -> ClassFeat
     order = np.argsort(first[codes], kind="stable")
     number: dict[Feature, int] = {}
     parts: list[tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]] = []
-    read = a.chosen.store.file.abstracted.features(abstraction, first[codes[order]])
+    read = a.chosen.abstracted.features(abstraction, first[codes[order]])
     for row, some in read:
         own = np.array([number.setdefault(name, len(number)) for name in some.names] or [0])
         rows, columns = order[row[some.frame]].astype(np.int32), own[some.feature].astype(np.int32)
@@ -483,7 +483,7 @@ def explain(
 
 def _without(a: Classed, b: Classed) -> tuple[Classed, int]:
     """``a`` without the frames that ``b`` has, too; and how many these are."""
-    if a.chosen.store.file.path.resolve() != b.chosen.store.file.path.resolve():
+    if a.chosen.place != b.chosen.place:
         return a, 0
     rows = np.flatnonzero(~np.isin(a.frame_id, b.frame_id))
     kept = replace(a, frame_id=a.frame_id[rows], code=a.code[rows])

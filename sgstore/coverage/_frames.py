@@ -6,13 +6,14 @@ Features and values of slots as queries: what is missing is asked for by text th
 from __future__ import annotations
 
 import re
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.errors import StoreError
+from sgstore.errors import StoreError, url_named
 from sgstore.lang import node_of_kind
 from sgstore.locks import ENDING as LOCK
 from sgstore.locks import frames_of_lock, read_lock, store_beside
@@ -23,7 +24,11 @@ from sgstore.world import longest_step_ns
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from contextlib import AbstractContextManager
 
+    from sgstore.collection import Collection, CollectionFrames
+    from sgstore.lang import TraceFacts
+    from sgstore.store import Abstracted, StoredTrace
     from sgstore.world import Bools, Floats, Ints
 
 
@@ -163,13 +168,13 @@ def of_unknown(unknown: int, text: str) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class ChosenFrames:
-    """Frames of a store.
+    """Frames of a store, or of a collection.
 
     Attributes
     ----------
     text : str
         What they were called.
-    store : Store
+    source : Store or Collection
     frame_id : int64 or None
         Ascending; ``None``: all.
     reasons : mapping of str to str
@@ -177,7 +182,7 @@ class ChosenFrames:
     """
 
     text: str
-    store: Store
+    source: Store | Collection
     frame_id: Ints | None = None
     reasons: Mapping[str, str] = field(default_factory=dict[str, str])
 
@@ -185,6 +190,41 @@ class ChosenFrames:
     def left_out(self) -> tuple[str, ...]:
         """Traces that cannot answer the query."""
         return tuple(self.reasons)
+
+    @property
+    def store(self) -> Store:
+        """The store that they are of.
+
+        Raises
+        ------
+        StoreError
+            They are of a collection.
+        """
+        if isinstance(self.source, Store):
+            return self.source
+        raise StoreError(
+            f"{self.text}: a collection, where one store is needed; 'sgstore collection unpack' makes one of it"
+        )
+
+    @property
+    def abstracted(self) -> Abstracted | CollectionFrames:
+        """The frames of its store as abstractions have them."""
+        return (
+            self.source.file.abstracted
+            if isinstance(self.source, Store)
+            else self.source.abstracted
+        )
+
+    @property
+    def place(self) -> str:
+        """Where its store lies."""
+        if isinstance(self.source, Store):
+            return str(self.source.file.path.resolve())
+        return self.source.place.url
+
+    def snapshot(self) -> AbstractContextManager[object]:
+        """Keep a store open for several questions; a collection does not change while it is asked."""
+        return self.source.file.snapshot() if isinstance(self.source, Store) else nullcontext()
 
     def rows_of(self, frame_id: Ints) -> Ints:
         """Rows of the chosen ones among frames with ascending ids."""
@@ -196,16 +236,19 @@ class ChosenFrames:
         return at[known].astype(np.int64)
 
 
-def selection_of(text: str, *, max_spill: int = 0) -> ChosenFrames:
+def selection_of(text: str, *, max_spill: int = 0, engine: str = "local") -> ChosenFrames:
     """The frames that a text means: a store, those of it in which a query holds, or those of a lock.
 
     Parameters
     ----------
     text : str
         ``STORE``, ``STORE:QUERY``, ``STORE:LOCK``; or ``LOCK``, if one store beside it has all its traces. A
-        lock is a file that is called ``….lock``.
+        lock is a file that is called ``….lock``. ``URL`` and ``URL:QUERY`` mean a collection, in a folder or an
+        object store.
     max_spill : int
         As of :class:`sgstore.query.Store`; bytes.
+    engine : str
+        Who asks the bundles of a collection; as of :class:`sgstore.collection.Collection`.
 
     Raises
     ------
@@ -219,23 +262,62 @@ def selection_of(text: str, *, max_spill: int = 0) -> ChosenFrames:
         lock = read_lock(whole)
         store = Store(store_beside(whole, lock), max_spill=max_spill)
         return ChosenFrames(text, store, frames_of_lock(lock, store))
-    if whole.exists():
-        return ChosenFrames(text, Store(whole, max_spill=max_spill))
+    place, query = _place_and_query(text)
+    if _is_collection(place):
+        return _of_collection(text, place, query, engine)
+    store = Store(place, max_spill=max_spill)
+    if not query:
+        return ChosenFrames(text, store)
+    if Path(query).suffix == LOCK and Path(query).is_file():
+        return ChosenFrames(text, store, frames_of_lock(read_lock(Path(query)), store))
+    return ChosenFrames(text, store, frames_of(store, query), store.find(query).reasons)
+
+
+def _place_and_query(text: str) -> tuple[str, str]:
+    """Split a text into the place of a store or a collection, and the query behind it."""
+    if url_named(text) is not None:
+        colon = _BEFORE_QUERY.search(text)
+        return (text, "") if colon is None else (text[: colon.start()], text[colon.end() :])
+    if Path(text).exists():
+        return text, ""
     for colon in re.finditer(":", text):
-        path, query = Path(text[: colon.start()]), text[colon.end() :]
-        if path.is_file():
-            store = Store(path, max_spill=max_spill)
-            if Path(query).suffix == LOCK and Path(query).is_file():
-                return ChosenFrames(text, store, frames_of_lock(read_lock(Path(query)), store))
-            found = frames_of(store, query)
-            return ChosenFrames(text, store, found, store.find(query).reasons)
+        place, query = text[: colon.start()], text[colon.end() :]
+        if Path(place).is_file() or _is_collection(place):
+            return place, query
     raise StoreError(
         f"{text}: neither a store nor STORE:QUERY, such as 'drives.sgstore:MATCH (p:Person)', nor a"
         " lock"
     )
 
 
-def frames_of(store: Store, query: str, /, **parameters: object) -> Ints:
+def _is_collection(place: str) -> bool:
+    if url_named(place) is not None:
+        return True
+    if not Path(place).is_dir():
+        return False
+    from sgstore.collection import ABOUT
+
+    return Path(place, ABOUT).is_file()
+
+
+_BEFORE_QUERY: Final = re.compile(r":(?![/\d])")
+"""The colon before a query, behind a URL, which has colons of its own."""
+
+
+def _of_collection(text: str, url: str, query: str, engine: str) -> ChosenFrames:
+    from sgstore.collection import Collection
+
+    whole = Collection(url, engine=engine)
+    if Path(query).suffix == LOCK:
+        raise StoreError(
+            f"{text}: a lock names frames of one store: 'sgstore collection unpack' makes one of a collection"
+        )
+    if not query:
+        return ChosenFrames(text, whole)
+    return ChosenFrames(text, whole, frames_of(whole, query), whole.find(query).reasons)
+
+
+def frames_of(store: Store | Collection, query: str, /, **parameters: object) -> Ints:
     """Ids of the frames in which a query holds, ascending. ``**parameters``: values of ``$name`` in it."""
     if block_of(query) is not None:  # in columns
         found = store.find(f"{query} RETURN FRAMES", **parameters).numpy()["frame_id"]
@@ -244,14 +326,19 @@ def frames_of(store: Store, query: str, /, **parameters: object) -> Ints:
     return np.unique(np.fromiter(rows, np.int64))
 
 
-def periods_of(store: Store, frame_id: Ints) -> Floats:
+def traces_of(store: Store | Collection) -> Sequence[StoredTrace | TraceFacts]:
+    """The traces of a store, or of a collection, by name."""
+    return store.info() if isinstance(store, Store) else store.catalog.traces
+
+
+def periods_of(store: Store | Collection, frame_id: Ints) -> Floats:
     """(N,): the median period of the trace of each frame; ns."""
-    periods = {one.trace_id: one.period_ns for one in store.info()}
+    periods = {one.trace_id: one.period_ns for one in traces_of(store)}
     traces, number = np.unique(trace_of(frame_id), return_inverse=True)
     return np.array([periods.get(one, 0) for one in traces.tolist()], np.float64)[number]
 
 
-def run_begins(store: Store, frame_id: Ints, time_ns: Ints) -> Bools:
+def run_begins(store: Store | Collection, frame_id: Ints, time_ns: Ints) -> Bools:
     """(N,): which frames begin a run: the first of a trace, and the first where some are missing before it."""
     step = np.diff(time_ns, prepend=time_ns[:1])
     periods, place = np.unique(periods_of(store, frame_id), return_inverse=True)
@@ -259,9 +346,9 @@ def run_begins(store: Store, frame_id: Ints, time_ns: Ints) -> Bools:
     return begins(frame_id) | (step > longest[place]) | (step < 0)
 
 
-def names_of(store: Store, frame_id: Sequence[int] | Ints) -> list[str]:
+def names_of(store: Store | Collection, frame_id: Sequence[int] | Ints) -> list[str]:
     """Frames as every command takes them: ``TRACE#SEQ``."""
-    traces = {trace.trace_id: trace.name for trace in store.info()}
+    traces = {trace.trace_id: trace.name for trace in traces_of(store)}
     ids = np.asarray(frame_id, np.int64)
     return [
         f"{traces.get(trace, trace)}#{seq}"

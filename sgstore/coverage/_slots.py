@@ -63,7 +63,7 @@ def cells(chosen: ChosenFrames, query: str) -> tuple[tuple[str, ...], dict[tuple
     QueryError
         The query is none, or returns no values.
     """
-    store = chosen.store
+    store = chosen.source
     matches = store.find(query)
     if matches.columns[: len(_FRAME)] != _FRAME:
         matches = store.find(_with_frames(query))
@@ -289,7 +289,7 @@ class _Held:
 
     def __init__(self, chosen: ChosenFrames) -> None:
         self._chosen = chosen
-        ids = chosen.store.file.abstracted.times()[0]
+        ids = chosen.abstracted.times()[0]
         self._ids = ids[chosen.rows_of(ids)]
         self._known: dict[str, Bools] = {}
 
@@ -298,7 +298,7 @@ class _Held:
         if pattern not in self._known:
             there = np.ones(len(self._ids), np.bool_)
             if pattern:
-                there = np.isin(self._ids, frames_of(self._chosen.store, pattern))
+                there = np.isin(self._ids, frames_of(self._chosen.source, pattern))
             self._known[pattern] = there
         return self._known[pattern]
 
@@ -355,7 +355,7 @@ def slot_sets(chosen: ChosenFrames, specification: Specification) -> tuple[Ints,
     QueryError
         A pattern is none.
     """
-    with chosen.store.file.snapshot():
+    with chosen.snapshot():
         return _Held(chosen).sets(specification)
 
 
@@ -412,7 +412,7 @@ def slot_coverage(
     held = _Held(chosen)
     for one in specifications:
         size = k or len(one.slots)
-        with chosen.store.file.snapshot():
+        with chosen.snapshot():
             found = list(_combined(one, size, held))
         many = sum(frames > 0 for _, _, frames in found)
         denominator = f"combinations of values of {size} of {len(one.slots)} declared slots"

@@ -528,7 +528,7 @@ def outcomes_of(units: Units, outcomes: Mapping[str, bool]) -> tuple[Bools, Bool
     ConfigError
         No outcome is about a unit.
     """
-    told = told_outcomes(outcomes, units.chosen.store, units.frame_id)
+    told = told_outcomes(outcomes, units.chosen, units.frame_id)
     ranges = np.stack([units.begin, units.end], axis=1).ravel()
     failed, known = (np.logical_or.reduceat(np.append(one, False), ranges)[::2] for one in told)
     if not known.any():

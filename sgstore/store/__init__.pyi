@@ -15,10 +15,16 @@ from ._landed import split_segment as split_segment
 from ._landed import whole_segment as whole_segment
 from ._merge import PartFile as PartFile
 from ._merge import merged_arrays as merged_arrays
+from ._merge import merged_classes as merged_classes
 from ._merge import merged_file as merged_file
 from ._merge import merged_parts as merged_parts
 from ._merge import write_classes as write_classes
+from ._merge import write_coded as write_coded
+from ._merge import write_rows as write_rows
 from ._merge import write_part as write_part
+from ._classes import Abstracted as Abstracted
+from ._classes import CodedClasses as CodedClasses
+from ._classes import Triples as Triples
 from ._contents import DIGEST_BYTES as DIGEST_BYTES
 from ._contents import WINDOW as WINDOW
 from ._contents import Mark as Mark
@@ -70,6 +76,9 @@ from ._write import OnMap as OnMap
 from ._write import Segment as Segment
 
 __all__ = [
+    "Abstracted",
+    "CodedClasses",
+    "Triples",
     "BUCKET_BITS",
     "Batches",
     "CATALOGUE",
@@ -114,6 +123,7 @@ __all__ = [
     "marks",
     "maps_of_traces",
     "merged_arrays",
+    "merged_classes",
     "merged_file",
     "merged_parts",
     "messages_of",
@@ -132,6 +142,8 @@ __all__ = [
     "whole_segment",
     "write_bundle",
     "write_classes",
+    "write_coded",
+    "write_rows",
     "write_csv",
     "write_batches",
     "write_parquet",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -268,6 +268,22 @@ class Abstracted:
         with self._access.reading() as connection:
             return coded_classes(connection, abstraction_named(name).name)
 
+    def masks(self, name: str) -> Iterator[tuple[str | None, int, int]]:
+        """The class of the frames of each bucket, and which frames: as they are kept, or else made anew.
+
+        Nothing is kept of what is made.
+        """
+        name = abstraction_named(name).name
+        with self._access.reading() as connection:
+            rows = connection.execute(f"SELECT * FROM ({_CLASSES})", {"name": name}).fetchall()
+            yield from ((kept and kept.hex, bucket, mask) for kept, bucket, mask in rows)
+            for trace_id in _missing(connection, name):
+                classes = TraceClasses((name,))
+                for seq, seen in self._graphs.of_trace(connection, trace_id):
+                    found = classes.columns(seen, trace_id, seq)
+                    of = found["class"].tolist(), found["bucket"].tolist(), found["mask"].tolist()
+                    yield from ((own or None, *rest) for own, *rest in zip(*of, strict=True))
+
     def times(self) -> tuple[Ints, Ints]:
         """Ids of all frames, ascending, and their simulation times; ns."""
         with self._access.reading() as connection:
@@ -350,15 +366,14 @@ def _missing(connection: DuckDBPyConnection, name: str, catalog: str = "") -> di
 # Classes of all frames as numbers, and the features of graphs: what coverage is made of -----------
 
 _CLASSES: Final = """
-WITH kept AS (
   SELECT class, bucket, mask FROM frame_class WHERE abstraction = $name
-  UNION ALL SELECT class, bucket, mask FROM later_class WHERE abstraction = $name)
+  UNION ALL SELECT class, bucket, mask FROM later_class WHERE abstraction = $name
 """
-_NAMES: Final = f"""{_CLASSES}
+_NAMES: Final = """WITH kept AS ({})
 SELECT replace(class::VARCHAR, '-', '') AS name FROM (SELECT DISTINCT class FROM kept WHERE class IS NOT NULL)
 ORDER BY class
 """
-_MASKS: Final = f"""{_CLASSES}
+_MASKS: Final = """WITH kept AS ({})
 SELECT bucket, mask, CASE WHEN class IS NULL THEN -1 ELSE dense_rank() OVER (ORDER BY class NULLS LAST) - 1 END
   AS code FROM kept
 """
@@ -394,8 +409,15 @@ def coded_classes(connection: DuckDBPyConnection, name: str) -> CodedClasses:
     name : str
         As the store has it.
     """
-    names = connection.execute(_NAMES, {"name": name}).fetchnumpy()["name"]
-    rows = connection.execute(_MASKS, {"name": name}).fetchnumpy()
+    return classes_coded(connection, _CLASSES, {"name": name})
+
+
+def classes_coded(
+    connection: DuckDBPyConnection, kept: str, values: dict[str, Any] | None = None
+) -> CodedClasses:
+    """The classes that the rows of a statement name: ``class``, ``bucket``, ``mask``."""
+    names = connection.execute(_NAMES.format(kept), values).fetchnumpy()["name"]
+    rows = connection.execute(_MASKS.format(kept), values).fetchnumpy()
     frame_id, row = frames_of(rows["bucket"].astype(np.int64), rows["mask"].astype(np.int64))
     code = rows["code"].astype(np.int64)[row]
     order = np.argsort(frame_id, kind="stable")

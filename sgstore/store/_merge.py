@@ -10,6 +10,7 @@ import os
 import secrets
 import shutil
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -20,7 +21,7 @@ from sgstore.records import dataclass
 from sgstore.store._joins import tables_folder
 from sgstore.store._locking import default_memory, spill_folder, translated, without_faults
 from sgstore.store._packing import SEQ_BITS
-from sgstore.store._rows import Batches, arrays
+from sgstore.store._rows import Batches, arrays, write_parquet
 from sgstore.store._staging import scratch
 from sgstore.store._steps import interruptible
 from sgstore.vocabulary import NAMES
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
 
+    from sgstore.store._classes import CodedClasses
     from sgstore.store._file import StoreFile
     from sgstore.store._rows import Given, Parameters
 
@@ -50,6 +52,7 @@ class PartFile:
     Attributes
     ----------
     path : Path
+        There is no file if there are no rows.
     columns, types : tuple of str
         Of the rows; types as the database calls them.
     rows : int
@@ -70,6 +73,13 @@ class PartFile:
         """The part that plain values describe."""
         columns, types = tuple(values["columns"]), tuple(values["types"])
         return cls(Path(values["path"]), columns, types, values["rows"])
+
+    def moved(self, folder: Path) -> PartFile:
+        """Move it into another folder, where it stays until others have come, too."""
+        to = folder / self.path.name
+        if self.rows:
+            self.path.replace(to)
+        return replace(self, path=to)
 
 
 _PART: Final = quoted(":part")
@@ -99,7 +109,8 @@ def write_part(
     made = _making(sql, len(columns))
     table: Any = made, values
     with file.asked(_written, [*given, table]) as (place, kinds, rows):
-        shutil.move(place, to)
+        if rows:
+            shutil.move(place, to)
     return PartFile(to, tuple(columns), kinds, rows)
 
 
@@ -120,12 +131,14 @@ def _written(connection: DuckDBPyConnection) -> tuple[Path, tuple[str, ...], int
     rows, *known = connection.execute(f"SELECT {counted} FROM {_PART}").fetchall()[0]
     for name, number in zip(whole, known, strict=True):
         kinds[name] = kinds[name] if number else _NOTHING
-    listed = [f"CAST({n} AS {_EXACT[k]}) AS {n}" if k in _EXACT else n for n, k in kinds.items()]
-    tables_folder().mkdir(mode=0o700, parents=True, exist_ok=True)
     place = tables_folder() / f"part-{secrets.token_hex(8)}.parquet"
-    connection.execute(
-        f"COPY (SELECT {', '.join(listed)} FROM {_PART}) TO {literal(str(place))} (FORMAT parquet)"
-    )
+    if rows:
+        tables_folder().mkdir(mode=0o700, parents=True, exist_ok=True)
+        listed = [
+            f"CAST({n} AS {_EXACT[k]}) AS {n}" if k in _EXACT else n for n, k in kinds.items()
+        ]
+        copied = f"SELECT {', '.join(listed)} FROM {_PART}"
+        connection.execute(f"COPY ({copied}) TO {literal(str(place))} (FORMAT parquet)")
     connection.execute(f"DROP TABLE {_PART}")
     return place, tuple(kinds.values()), rows
 
@@ -154,6 +167,18 @@ def write_classes(
         f"{of} WHERE {known} AND c.frame_id >> {SEQ_BITS} IN (SELECT unnest(CAST($2 AS BIGINT[])))"
     )
     return write_part(file, (sql, [abstraction, [*traces]]), ["class"], (), to)
+
+
+def write_rows(columns: Mapping[str, str], rows: Iterable[Sequence[Any]], to: Path) -> PartFile:
+    """Write rows that no statement gives, as :func:`write_part` does; ``columns``: with their types."""
+    names, types = [f"c{number}" for number in range(len(columns))], (*columns.values(),)
+    return PartFile(to, tuple(columns), types, write_parquet(names, rows, to, types))
+
+
+def write_coded(file: StoreFile, abstraction: str, to: Path) -> PartFile:
+    """Write the class of each frame in an abstraction, as :func:`merged_classes` reads it."""
+    columns = {"class": "VARCHAR", "bucket": "BIGINT", "mask": "BIGINT"}
+    return write_rows(columns, file.abstracted.masks(abstraction), to)
 
 
 Parts = dict[str, list[PartFile]]
@@ -208,7 +233,8 @@ def merged_file(
             return _written(connection)
 
         place, kinds, rows = interruptible(connection, step)
-    shutil.move(place, to)
+    if rows:
+        shutil.move(place, to)
     return PartFile(to, tuple(columns), kinds, rows)
 
 
@@ -218,6 +244,14 @@ def merged_arrays(
     """All columns of such a statement, as :func:`merged_parts` takes it; masked where something is NULL."""
     with _tables(parts, words) as connection:
         return arrays(connection, sql, _numbered(values))
+
+
+def merged_classes(parts: Sequence[PartFile]) -> CodedClasses:
+    """The classes of frames that parts tell, as rows of ``class``, ``bucket``, ``mask``."""
+    from sgstore.store._classes import classes_coded
+
+    with _tables({"parts": [*parts]}, {}) as connection:
+        return classes_coded(connection, "SELECT class, bucket, mask FROM parts")
 
 
 def _numbered(values: Sequence[Any]) -> dict[str, Any]:
@@ -249,7 +283,13 @@ def _rows_of(files: Sequence[PartFile]) -> str:
     common = [_common(set(kinds)) for kinds in zip(*(one.types for one in files), strict=True)]
     alike: dict[tuple[str, ...], list[Path]] = {}
     for one in files:
-        alike.setdefault(one.types, []).append(one.path)
+        if one.rows:
+            alike.setdefault(one.types, []).append(one.path)
+    if not alike:
+        none = (
+            f"CAST(NULL AS {k}) AS {quoted(n)}" for k, n in zip(common, first.columns, strict=True)
+        )
+        return f"SELECT {', '.join(none)} LIMIT 0"
     parts: list[str] = []
     for types, paths in alike.items():
         values = ("NULL" if t == _NOTHING else f"c{n}" for n, t in enumerate(types))
