@@ -8,25 +8,18 @@ from typing import TYPE_CHECKING
 
 import dying
 import pytest
-from oracle_worlds import random_world
+from dying import QUESTIONS
 from thorough import LONG
 
-from sgstore.collection import Collection, PartialAnswerError, pack
+from sgstore.collection import Collection, PartialAnswerError
 from sgstore.collection import _engines as engines
 from sgstore.collection import _worker as worker
 from sgstore.errors import StoreError
-from sgstore.store import StoreFile
 
 ray = pytest.importorskip("ray", reason="the extra ray is not installed")
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-QUESTIONS = [
-    "MATCH (a:Car)-[e:near|visible]->(b) RETURN type(e), b ORDER BY a.speed DESC, b.kind LIMIT 9",
-    "MATCH (a:Car)-[:near]->(b) RETURN b.kind AS k, COUNT(*) AS n, COUNT(DISTINCT b) ORDER BY n, k",
-    "MATCH (a:Car)-[:near]->(b) RETURN INTERVALS, b",
-]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -40,33 +33,22 @@ def _ray(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("fleet")
-    StoreFile.create(folder / "one.sgstore")
-    random_world(7, traces=6, frames=30, path=folder / "one.sgstore").connection.close()
-    assert len(pack(folder / "one.sgstore", folder / "fleet", bundle_traces=1).bundles) == 6
-    return folder / "fleet"
+    return dying.fleet(tmp_path_factory.mktemp("fleet"))
 
 
 def test_answers_of_ray_are_those_of_this_process(place: Path) -> None:
     with Collection(place) as here, Collection(place, engine="ray") as there:
-        for text in QUESTIONS:
-            assert there.find(text).rows() == here.find(text).rows() != []
-        check = "CHECK calm: FORALL (a:Car) ALWAYS a.speed < 8"
-        assert list(map(str, there.check(check))) == list(map(str, here.check(check)))
+        dying.agree(here, there)
         rows = [list(one.sql("SELECT count(*) FROM frames", each=True)) for one in (here, there)]
         assert sorted(rows[0]) == sorted(rows[1])
 
 
 def test_a_bundle_that_is_refused_is_named(place: Path, tmp_path: Path) -> None:
-    import shutil
-
-    shutil.copytree(place, tmp_path / "c")
-    bundle = min((tmp_path / "c" / "bundles").iterdir())
-    bundle.write_bytes(bundle.read_bytes()[:-1] + b"?")
+    bundle = dying.hurt_bundle(place, tmp_path / "c")
 
     with pytest.raises(PartialAnswerError, match="not as it was committed") as refused:
         Collection(tmp_path / "c", engine="ray").find(QUESTIONS[0]).rows()
-    assert [*refused.value.bundles] == [bundle.stem]
+    assert [*refused.value.bundles] == [bundle]
 
 
 @pytest.fixture
