@@ -106,7 +106,7 @@ def _meant_by(url: str) -> list[str]:
     inside = remote_names(fixed)
     bags = [name.removesuffix(f"/{METADATA}") for name in inside if name.endswith(f"/{METADATA}")]
     bags = [bag for bag in bags if bag_folder(Path(bag)) is not None]
-    files = [name for name in inside if name.lower().endswith(ENDINGS)]
+    files = [name for name in inside if is_recording(Path(name))]
     found = bags + [name for name in files if not name.startswith(tuple(f"{b}/" for b in bags))]
     if pattern:
         found = [name for name in found if _fits(name, url)]

@@ -50,7 +50,7 @@ MAX_PARTS: Final = 10_000
 
 _MARK: Final = b"rosbag2_bagfile_information"
 _BEGINNING: Final = 4096
-_FILES: Final = (".mcap", ".osi", ".zst")
+_FILES: Final = (".mcap", ".osi", ".zst", ".xml")
 _ENTRY: Final = re.compile(r"(?P<indent> *)(?P<dash>- +)?(?P<rest>\S.*?)\s*")
 _KEY: Final = re.compile(r"(relative_file_paths|storage_identifier|compression_mode)\s*:\s*(.*)")
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from functools import cache
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -19,7 +18,7 @@ import numpy as np
 from mcap.records import Channel, Schema
 
 from sgstore.errors import MapError, TraceError
-from sgstore.mcap import MESSAGE_HEAD, Findings, Loss, Messages, open_regular
+from sgstore.mcap import MESSAGE_HEAD, Findings, Loss, Messages, mark_of_open, open_regular
 from sgstore.readers.commonroad._document import (
     MAX_BYTES,
     ROOT,
@@ -56,9 +55,9 @@ def is_scenario(path: Path) -> bool:
     if not path.name.lower().endswith(ENDINGS):
         return False
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             return f"<{ROOT}".encode() in file.read(_HEAD)
-    except OSError:
+    except (OSError, TraceError):
         return False
 
 
@@ -97,8 +96,7 @@ class CommonRoadFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         with open_regular(path) as file:
-            status = os.fstat(file.fileno())
-            self.size, self.mtime_ns = status.st_size, status.st_mtime_ns
+            self.size, self.mtime_ns = mark_of_open(file)
             if self.size > MAX_BYTES:
                 raise TraceError(
                     f"larger than {MAX_BYTES:,} bytes, which no scenario is", path=path
