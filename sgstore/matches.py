@@ -26,7 +26,6 @@ from sgstore.lang import (
     compile_query,
     extents,
     for_people,
-    has_nodes,
     joined_rows,
     rewritten,
 )
@@ -43,7 +42,6 @@ from sgstore.store import (
     as_told_batches,
     write_batches,
 )
-from sgstore.truth_lanes import truth_lanes
 from sgstore.vocabulary import natural
 from sgstore.world import Clip, tolerance_ns
 
@@ -291,8 +289,7 @@ class Matches(Tabular):
 
     def _frames(self) -> Iterator[tuple[Any, ...]]:
         with self._compiled() as compiled:
-            limited = compiled.limited_to_frames
-            if limited is None:
+            if (limited := compiled.limited_to_frames) is None:
                 yield from self._stream(Compiled.frames, "frames")
                 return
             rows = self._stream(lambda _, window: limited.rows(window))
@@ -316,9 +313,10 @@ class Matches(Tabular):
 
     def parts(self, frame: FrameRef, binding: Mapping[str, int] | None = None) -> TruthLanes:
         """Intervals of each part of the pattern, for the nodes of a match; see :meth:`sgstore.Store.parts`."""
+        from sgstore.truth_lanes import truth_lanes  # with numpy, which a question does without
+
         with self._compiled() as compiled:
             found = self.bindings(frame) if binding is None else [dict(binding)]
-
             facts = next((t for t in compiled.catalog.traces if t.trace_id == frame.trace_id), None)
             window = None if facts is None else Window.of([facts.extent])
 
@@ -686,6 +684,8 @@ class UnionMatches(Matches):
 
     def parts(self, frame: FrameRef, binding: Mapping[str, int] | None = None) -> TruthLanes:
         """The lanes of truth of the part that has such a match in a frame; of the first where none has."""
+        from sgstore.lang import has_nodes
+
         given = (binding or {}).items()
         named = [p for p in self._parts if has_nodes(p._ready.bound, binding or {})] or self._parts  # noqa: SLF001
         matching = (p for p in named if any(given <= b.items() for b in p.bindings(frame)))

@@ -413,15 +413,21 @@ def unloaded(*names):
 
 import sgstore
 unloaded("numpy", "duckdb", "typer", "rich", "sgstore.cli")
-from sgstore.cli import run
+from sgstore.cli import run, spare_packages
 engine = ("numpy", "duckdb", "mcap", "lz4", "zstandard", "isal", "shapely", "networkx", "matplotlib", "lark")
 heavy = ("pydantic", "sgstore.lang", "sgstore.store", "sgstore.coverage", "sgstore.readers", "sgstore.roads")
+spare_packages()
 assert run(["--help"]) == 0
-unloaded(*engine, *heavy)
+unloaded(*engine, *heavy, "markdown_it", "pygments", "xml.etree.ElementTree")
+from rich.markdown import Markdown
+from rich.traceback import PathHighlighter, Traceback
+assert Markdown("*a*").markup == "*a*"
+assert PathHighlighter.highlights
+assert Traceback.extract(KeyError, KeyError("a"), None).stacks[0].exc_type == "KeyError"
 for module in [name for name in sys.modules if name.split(".")[0] in {"rich", "markdown_it"}]:
     del sys.modules[module]
 assert run(["find", sys.argv[1], "MATCH (e:Ego) WHERE e.speed > 5", "--count"]) == 0
-unloaded(*engine[2:], "pydantic", "rich", "sgstore.readers", "sgstore.roads", "sgstore.relations")
+unloaded("numpy", *engine[2:], "pydantic", "rich", "sgstore.readers", "sgstore.roads", "sgstore.relations")
 unloaded("sgstore.coverage", "sgstore.selection", "sgstore.draw", "sgstore.exporters._write", "sgstore.sgg")
 unloaded("sgstore.mcap._chunks", "sgstore.opendrive", "sgstore.config", "sgstore.sandbox")
 """

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final
 import typer
 
 import sgstore.cli._process as ending
+from sgstore.cli._help import spare_packages
 from sgstore.cli._options import ERROR, USAGE, Verbs, app
 from sgstore.cli._output import say, write_error
 from sgstore.cli._process import take_streams
@@ -83,6 +84,7 @@ def main() -> None:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Nothing of what is imported is ever garbage: to look for some while it comes takes a tenth of a short run.
     gc.set_threshold(50_000)
+    spare_packages()
     take_streams()
     try:
         ending.heed_signals()

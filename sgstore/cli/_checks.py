@@ -12,7 +12,6 @@ from dataclasses import asdict
 from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
-from xml.etree import ElementTree as Xml
 
 import typer
 from typer import Argument, Option
@@ -72,6 +71,8 @@ def write_junit(path: Path, verdicts: Iterable[Verdict]) -> None:
     ExportError
         The file cannot be written; what was there before is still there.
     """
+    from xml.etree import ElementTree as Xml  # few need it
+
     root = Xml.Element("testsuites", name="sgstore check")
     suites: dict[str, Xml.Element] = {}
     for one in verdicts:
