@@ -309,7 +309,7 @@ class Matches(Tabular):
             if name.endswith(".name")
         }
         found = [row for row in rows if row[0] == frame.frame_id]
-        return [{name: row[i] for i, name in names.items()} for row in found]
+        return [{n: row[i] for i, n in names.items() if row[i] is not None} for row in found]
 
     def parts(self, frame: FrameRef, binding: Mapping[str, int] | None = None) -> TruthLanes:
         """Intervals of each part of the pattern, for the nodes of a match; see :meth:`sgstore.Store.parts`."""

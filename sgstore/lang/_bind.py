@@ -14,6 +14,7 @@ from sgstore.lang import ir as o
 from sgstore.lang import syntax as s
 from sgstore.lang._bind_expressions import BINDERS, edge_attribute, node_attribute, parameter
 from sgstore.lang._bind_match_values import over_match
+from sgstore.lang._bind_stages import StageBinder
 from sgstore.lang._bind_temporal import StepScope, bind_sequence, settled, tense, timespan
 from sgstore.lang._catalog import TRACE_ATTRIBUTES, Catalog, Type
 from sgstore.lang._functions import FUNCTIONS, call, happens
@@ -81,7 +82,7 @@ def bind_query(
         session.refuse("USING END belongs to CHECK", match.settings[0].span)
     if settings.gaps == "unknown":
         session.refuse("USING GAPS unknown belongs to CHECK", match.settings[0].span)
-    query = _of_one_step(match, session) if _is_plain(match) else _of_steps(match, session)
+    query = _of_match(match, session)
     refuse_unused(session)
     refuse_strange(session, catalog)
     return replace(
@@ -93,6 +94,20 @@ def bind_query(
         policy=settings.policy or "all",
         gaps=settings.gaps or "break",
     )
+
+
+def _of_match(match: s.MatchClause, session: Session) -> b.Query:
+    if not match.later:
+        return _of_one_step(match, session) if _is_plain(match) else _of_steps(match, session)
+    if not _is_plain(match):
+        session.refuse(
+            "OPTIONAL MATCH and WITH go on from a pattern of one frame, and this is a sequence",
+            match.later[0].span,
+            "what a step finds is returned as it is; EXISTS {…} and COUNT {…} ask for what may be absent",
+        )
+    stages = StageBinder(match, session, bind_block, _columns)
+    result = stages.result(_result(match.returns, stages.names))
+    return b.Query(stages.scope(), result, frozenset(), stages=stages.stages())
 
 
 def _is_plain(match: s.MatchClause) -> bool:
@@ -521,7 +536,7 @@ def _result(returns: s.Returns | None, names: SymbolTable) -> b.Result:
     form = item.form if item is not None else "value"
     result = b.Result(
         form=_FORMS.get(form, "rows"),
-        columns=_columns(returns, inner),
+        columns=_columns(returns.items, inner),
         whole=any(item.form == "all" for item in returns.items),
         framed=form == "frames",
         distinct=returns.distinct,
@@ -548,9 +563,9 @@ def _special(returns: s.Returns, session: Session) -> s.Item | None:
     return special[0] if special else None
 
 
-def _columns(returns: s.Returns, names: SymbolTable) -> tuple[b.ReturnColumn, ...]:
+def _columns(items: Iterable[s.Item], names: SymbolTable) -> tuple[b.ReturnColumn, ...]:
     """The values to return; one that is counted of all matches may speak of those that it stands beside."""
-    items = [item for item in returns.items if item.form == "value"]
+    items = [item for item in items if item.form == "value"]
     found = [_column(item, names) for item in items]
     keys = _group_keys(found)
     columns: list[b.ReturnColumn] = []
@@ -580,7 +595,7 @@ def _of_groups(value: b.Bound, keys: Mapping[b.Bound, str]) -> b.Bound:
 def _column(item: s.Item, names: SymbolTable) -> b.ReturnColumn:
     assert item.value is not None  # noqa: S101 - the form of the item says so
     value = settled(names.bind(item.value), names.session)
-    if value.type is Type.list and not isinstance(value, b.Aggregate):
+    if value.type is Type.list and not (isinstance(value, b.Aggregate) or b.is_passed_on(value)):
         names.session.refuse("a list cannot be returned", item.span)
     text = names.session.text[item.value.span.start : item.value.span.end]
     return b.ReturnColumn(item.name or " ".join(text.split()), value)

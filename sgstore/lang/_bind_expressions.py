@@ -349,7 +349,7 @@ def _check_sides(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTa
             names.session.refuse("a comparison with NULL is never true", written.span, hint)
         if side.type is Type.list:
             hint = f"{where} IN […]" if prop else "write IN"
-            collected = isinstance(side, b.Aggregate)
+            collected = isinstance(side, b.Aggregate) or b.is_passed_on(side)
             names.session.refuse(
                 "a list cannot be compared", written.span, None if collected else hint
             )
@@ -422,7 +422,8 @@ def _kind(word: str, span: TextSpan, names: SymbolTable) -> str | None:
 
 def _null_test(e: s.NullTest, names: SymbolTable) -> b.Operation:
     operand = names.bind(e.operand)
-    if operand.type in {Type.node, Type.list}:
+    maybe = isinstance(operand, b.NodeValue) and operand.node in names.session.maybe
+    if operand.type in {Type.node, Type.list} and not maybe:
         hint = "what may be absent is asked by EXISTS {…}" if operand.type is Type.node else None
         names.session.refuse(f"a {operand.type.value} is never NULL", e.operand.span, hint)
     word = "IS NOT NULL" if e.negated else "IS NULL"

@@ -29,10 +29,12 @@ from sgstore.lang._external import SPAN, external_matches, nothing, with_places
 from sgstore.lang._operators import INFIX
 from sgstore.lang._parse import parse
 from sgstore.lang._rewrite import rewritten, unfold_paths
+from sgstore.lang._sql_stages import staged_matches
 from sgstore.lang._symbols import traces_in
 from sgstore.lang.ir import (
     FRAME_COLUMNS,
     INTERVAL_COLUMNS,
+    PASSED,
     WINDOWS,
     Aggregate,
     BlockValue,
@@ -46,6 +48,7 @@ from sgstore.lang.ir import (
     Happened,
     Kinds,
     LabelTest,
+    MatchStage,
     Node,
     NodeAttribute,
     NodeValue,
@@ -57,12 +60,14 @@ from sgstore.lang.ir import (
     ReturnColumn,
     Scope,
     SignalCall,
+    Stage,
     StepTime,
     Tense,
     TraceAttribute,
     Value,
     any_kinds,
     any_relation,
+    is_passed_on,
 )
 from sgstore.lang.syntax import CheckClause, MatchClause
 from sgstore.pair_numbers import as_written
@@ -192,9 +197,13 @@ def graph_of(parts: Sequence[tuple[Node | Edge, Record]]) -> tuple[list[Record],
     edges: dict[tuple[Any, ...], Record] = {}
     for part, known in parts:
         if isinstance(part, Node):
+            if "id" not in known:  # of an OPTIONAL MATCH
+                continue
             node = ids[part.key] = known["id"]
             record = nodes.setdefault(node, {"id": node, "variables": [], **known})
             record["variables"] += [part.key] if part.role == "named" else []
+            continue
+        if part.src not in ids or part.dst not in ids or (part.high == 1 and not known):
             continue
         ends: Record = {"source": ids[part.src], "target": ids[part.dst]}
         record = ends | {"relation": path_text(part)} | known
@@ -354,13 +363,38 @@ def statements_text(statements: tuple[Statement, ...]) -> str:
 
 def query_text(query: Query) -> str:
     """A bound query: what may be bound to what, under which conditions."""
-    lines = _scope(query.scope, "")
+    lines = [line for stage in query.stages for line in _stage(stage)]
+    lines += [] if query.stages else _scope(query.scope, "")
     result = query.result
     shown = [f"{column.name} = {value_text(column.value)}" for column in result.columns]
     lines.append(f"return {result.form}" + (f": {', '.join(shown)}" if shown else ""))
     if query.ego is not None:
         lines.append(f"ego {query.ego!r}")
     return "\n".join(lines)
+
+
+def _stage(stage: Stage) -> list[str]:
+    """A part of a query in several."""
+    if isinstance(stage, MatchStage):
+        return ["optional match" if stage.optional else "match", *_scope(stage.scope, "  ")]
+    nodes = [new if new == key else f"{key} AS {new}" for new, key in stage.nodes]
+    edges = [e.key if e.key == key else f"{key} AS {e.key}" for e, key in stage.edges]
+    values = [f"{value_text(column.value)} AS {column.name}" for column in stage.values]
+    lines = [f"with {'each ' * stage.grouped}{', '.join([*nodes, *edges, *values])}"]
+    keys = [
+        value_text(key.value) + " DESC" * key.descending
+        for key in stage.order
+        if not isinstance(key.value, str)
+    ]
+    lines += [f"  order by {', '.join(keys)}"] if keys else []
+    lines += [f"  skip {stage.skip}"] if stage.skip else []
+    lines += [] if stage.limit is None else [f"  limit {stage.limit}"]
+    return [*lines, *(f"  where {value_text(condition)}" for condition in stage.where)]
+
+
+def _passed(name: str) -> str:
+    """What a query calls a value that ``WITH`` passes on."""
+    return name.removeprefix(PASSED).rpartition(" ")[0]
 
 
 def _scope(scope: Scope, indent: str) -> list[str]:
@@ -479,8 +513,8 @@ def _leaf(value: Bound) -> str:
             text = node
         case NodeAttribute(node=owner) | EdgeAttribute(edge=owner):
             text = f"{owner}.{value.attribute.name}"
-        case FrameAttribute(attribute=attribute) if attribute.of_store:
-            text = attribute.name
+        case FrameAttribute(attribute=attribute) if attribute.of_store or is_passed_on(value):
+            text = _passed(attribute.name) if is_passed_on(value) else attribute.name
         case FrameAttribute(attribute=attribute):
             text = f"frame.{attribute.name}"
         case TraceAttribute(attribute=attribute):
@@ -599,6 +633,8 @@ class Compiled:
         self, query: Query, window: Window | None
     ) -> tuple[Query, SqlBuilder | None, results.Span | None]:
         """Return the finder of a query over several frames; ``None`` for any other query."""
+        if query.stages:
+            return query, staged_matches(query, self.catalog, window), None
         if not query.steps:
             return query, None, None
         query, places = with_places(query)

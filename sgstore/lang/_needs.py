@@ -267,7 +267,8 @@ def of_query(query: b.Query) -> tuple[Need, ...]:
     if query.unknown_is_false:
         return ()
     found: set[Need] = set()
-    steps = [(step.scope, step.when) for step in query.steps] or [(query.scope, ())]
+    steps = [(step.scope, step.when) for step in query.steps]
+    steps = steps or [(scope, ()) for scope in query.required]
     for scope, when in steps:
         found |= {Need(k, n.kinds, None) for k, n in scope.nodes.items() if n.kinds.one_a_frame}
         found |= _of_each([*scope.where, *when], scope.nodes, strict=False)

@@ -46,7 +46,12 @@ Compared = tuple[str, str]
 def compared_in_query(query: b.Query) -> list[Compared]:
     """Return the comparisons with texts in a bound query, each once."""
     returned = [column.value for column in query.result.columns]
-    found = list(_comparisons([*query.scope.where, *returned], query.scope))
+    found = list(_comparisons(returned, query.scope))
+    for scope in () if query.steps else query.patterns:
+        found += _comparisons(scope.where, scope)
+    for stage in query.stages:
+        if isinstance(stage, b.WithStage):
+            found += _comparisons(stage.expressions, stage.after)
     for step in query.steps:
         found += _comparisons([*step.scope.where, *step.when], step.scope)
     return list(dict.fromkeys(found))

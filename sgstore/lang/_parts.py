@@ -30,6 +30,7 @@ from sgstore.lang._results import (
     names_of,
     owner_of,
     sampled,
+    told_apart_by,
     with_bindings,
     with_owners,
 )
@@ -50,7 +51,9 @@ from sgstore.lang.ir import (
     Scope,
     SortKey,
     TraceAttribute,
+    WithStage,
     is_counted,
+    is_passed_on,
     walk,
     with_operands,
 )
@@ -219,7 +222,8 @@ class Pruning:
 
     def __init__(self, compiled: Compiled) -> None:
         query = compiled.query
-        self._scopes = [step.scope for step in query.steps if not step.absent] or [query.scope]
+        happen = [step.scope for step in query.steps if not step.absent]
+        self._scopes = happen or [*query.required]
         self._known: dict[tuple[object, ...], bool] = {}
         self._edges = [
             (edge, scope.kinds(edge.src), scope.kinds(edge.dst))
@@ -284,6 +288,8 @@ def class_questions(asked: Query | BoundCheck) -> tuple[ClassQuestion, ...]:
         values += [column.value for column in asked.returns]
     else:
         values = [*asked.scope.where, *asked.result.values]
+        for stage in asked.stages:
+            values += stage.expressions if isinstance(stage, WithStage) else stage.scope.where
         values += [v for step in asked.steps for v in (*step.scope.where, *step.when)]
     return tuple(dict.fromkeys(_class_questions(values)))
 
@@ -292,7 +298,7 @@ def _class_questions(values: Iterable[Bound]) -> Iterator[ClassQuestion]:
     for part in (part for value in values for part in walk(value)):
         if isinstance(part, BlockValue):
             yield from _class_questions(part.inside)
-        if not isinstance(part, FrameAttribute):
+        if not isinstance(part, FrameAttribute) or is_passed_on(part):
             continue
         attribute = part.attribute
         (column,) = attribute.columns.values()
@@ -373,6 +379,7 @@ def _bindings(query: Query) -> Iterator[Bound]:
     nodes = (key for key, node in query.scope.nodes.items() if node.role in roles)
     yield from (NodeValue(key) for key in sorted(nodes))
     yield from (EdgeRelation(key) for key in sorted(e.key for e in query.scope.edges if e.named))
+    yield from told_apart_by(query)
 
 
 def _per(result: Result, chosen: Sampling | None, hidden: _Hidden) -> Terms:

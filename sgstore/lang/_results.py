@@ -54,6 +54,8 @@ from sgstore.lang.ir import (
     TraceAttribute,
     Value,
     is_counted,
+    is_passed_on,
+    passed_values,
     walk,
     with_operands,
 )
@@ -363,6 +365,14 @@ def with_bindings(query: Query) -> Query:
     return replace(query, result=Result(form="intervals", columns=tuple(columns), whole=False))
 
 
+def told_apart_by(query: Query) -> list[FrameAttribute]:
+    """Values that ``WITH`` passed on by which the rows of a query are told apart."""
+    result = query.result
+    if result.whole:
+        return [one.value for one in result.columns if is_passed_on(one.value)]
+    return [] if result.distinct or result.framed else [*passed_values(query)]
+
+
 class _RowStatement:
     """Writes the statement of a query whose results are rows."""
 
@@ -388,6 +398,8 @@ class _RowStatement:
             for per in (_per(self.result, one) for one in (self.result.sample, self.result.top))
         )
         self.texts = dict[str, str]()  # of the columns by which matches are grouped
+        # What WITH passed on tells matches apart, too.
+        self.passed = told_apart_by(query)
 
     def statement(self) -> SqlStatement:
         values = [column.value for column in self.result.columns]
@@ -400,8 +412,9 @@ class _RowStatement:
         values += self.owners + self.top_owners
         values += [name for _, name in self._names()]
         wanted = [leaf for value in values for leaf in leaves(value)]
+        wanted += self.passed
         relation = frames_of(self.writer, self.query.scope, None, self.nodes, self.edges, wanted)
-        if any(_in_order(part) for value in values for part in walk(value)):
+        if any(in_order(part) for value in values for part in walk(value)):
             relation = self._placed(relation)
         outputs = self._outputs()
         names = [name for name, _ in outputs]
@@ -438,6 +451,7 @@ class _RowStatement:
         frame, writer = f'{_ROWS}."frame_id"', self.writer
         order = [frame_key(select, frame, writer.catalog, writer.window, writer.values)]
         order += [f"{_ROWS}.{column}" for column in columns_of(self.nodes, self.edges)]
+        order += [_column(one) for one in self.passed]
         select.columns.append(f'row_number() OVER (ORDER BY {", ".join(order)}) AS ":place"')
         return select.text()
 
@@ -490,6 +504,7 @@ class _RowStatement:
             del keys[own]
         moved = once and len(keys) > own
         bindings = [f"{_ROWS}.{column}" for column in columns_of(self.nodes, self.edges)]
+        bindings += [_column(one) for one in self.passed]
         keys += names if once or grouped else bindings
         sample, top = self.result.sample, self.result.top
         named = self._named_traces(keys, own) if grouped else []
@@ -600,7 +615,9 @@ class _IntervalStatement:
         value = _per(self.result, chosen)
         if isinstance(value, NodeValue):
             profile = Profile.of(self.query.scope.kinds(value.node), self.writer.catalog)
-            per.append(owner_text(per[0], profile, f'{_TRACE}."trace_id"', f'{_TRACE}."map_id"'))
+            owner = owner_text(per[0], profile, f'{_TRACE}."trace_id"', f'{_TRACE}."map_id"')
+            absent = bool(self.query.stages)
+            per.append(f"CASE WHEN {per[0]} IS NOT NULL THEN {owner} END" if absent else owner)
         return per
 
     def _told(self, value: Bound) -> str:
@@ -675,7 +692,7 @@ def _name_of(node: str, query: Query, catalog: Catalog) -> Bound:
     """The name of a node; that of an entity is put together late, for till then it is but two numbers."""
     name = NodeAttribute(node, _NAME, Type.text)
     profile = Profile.of(query.scope.kinds(node), catalog)
-    if query.steps or profile.mapped or profile.places != 1:
+    if query.steps or query.stages or profile.mapped or profile.places != 1:
         return name
     kind: Bound = NodeAttribute(node, NODE_ATTRIBUTES["kind"], Type.text)
     if len(profile.kinds) == 1:
@@ -787,7 +804,7 @@ def keyed(select: Select, names: list[str], keys: list[str]) -> list[str]:
     return [directed(name, descending) for name, descending in zip(inner, down, strict=True)]
 
 
-def _in_order(part: Bound) -> bool:
+def in_order(part: Bound) -> bool:
     """Tell whether it depends on the order in which matches come."""
     return isinstance(part, Aggregate) and part.word == "collect" and not part.distinct
 

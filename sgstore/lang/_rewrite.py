@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import combinations, pairwise
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.lang._catalog import (
     NODE_ATTRIBUTES,
@@ -31,12 +31,16 @@ from sgstore.lang.ir import (
     FrameAttribute,
     Kinds,
     LabelTest,
+    MatchStage,
     Node,
     NodeAttribute,
     NodeValue,
     Operation,
     Query,
+    Result,
+    ReturnColumn,
     Scope,
+    Stage,
     TraceAttribute,
     Value,
     any_kinds,
@@ -63,6 +67,14 @@ _MIRRORED: Final = {"=": "=", "<>": "<>", "<": ">", ">=": "<=", ">": "<", "<=": 
 
 def rewritten(query: Query, catalog: Catalog) -> Query:
     """The query after all rules."""
+    if query.stages:
+        return _staged(query, catalog)
+    query = _ruled(query, catalog)
+    query = replace(query, result=query.result.changed(_attributes))
+    return count_by_buckets(query, catalog)
+
+
+def _ruled(query: Query, catalog: Catalog) -> Query:
     unfold = partial(unfold_paths, injective=query.injective)
     for rule in (
         push_negations,
@@ -77,8 +89,57 @@ def rewritten(query: Query, catalog: Catalog) -> Query:
         ordered,
     ):
         query = _in_scopes(rule, query, catalog)
-    query = replace(query, result=query.result.changed(_attributes))
-    return count_by_buckets(query, catalog)
+    return query
+
+
+def _staged(query: Query, catalog: Catalog) -> Query:
+    """A query in several parts after all rules, each part by itself.
+
+    What is bound is narrowed to what the patterns leave of it. A node that may be absent is looked up by its
+    id, the ego too: that a frame has one does not say that it was found.
+    """
+    nothing = Scope({}, {}, (), (), frozenset())
+    kinds: dict[str, Kinds] = {}
+
+    def values(result: Result) -> Result:
+        ruled = _ruled(replace(query, scope=nothing, result=result, stages=()), catalog)
+        return ruled.result.changed(_attributes)
+
+    def told(scope: Scope) -> Scope:
+        nodes = {k: replace(n, kinds=kinds.get(k, n.kinds)) for k, n in scope.nodes.items()}
+        return replace(scope, nodes=nodes)
+
+    stages: list[Stage] = []
+    for stage in query.stages:
+        if isinstance(stage, MatchStage):
+            alone = replace(query, scope=stage.scope, result=Result(), stages=())
+            scope = _ruled(alone, catalog).scope
+            for key, node in scope.nodes.items():
+                either = Kinds(node.kinds.ego, node.kinds.every)
+                kinds[key] = either if stage.optional else node.kinds
+            stages.append(replace(stage, scope=scope))
+            continue
+        kinds |= {new: kinds[key] for new, key in stage.nodes}
+        result = Result(columns=stage.values)
+        order = tuple(replace(k, value=_expression(k.value, values)) for k in stage.order)
+        where = tuple(_expression(one, values) for one in stage.where)
+        stages.append(
+            replace(
+                stage,
+                before=told(stage.before),
+                after=told(stage.after),
+                values=values(result).columns,
+                order=order,
+                where=where,
+            )
+        )
+    scope = told(query.scope)
+    return replace(query, scope=scope, result=values(query.result), stages=tuple(stages))
+
+
+def _expression(value: Any, values: Callable[[Result], Result]) -> Any:
+    """A value after all rules for results."""
+    return values(Result(columns=(ReturnColumn("", value),))).columns[0].value
 
 
 _Rule = Callable[[Scope, Catalog], Scope]

@@ -48,6 +48,7 @@ from sgstore.lang._sql_masks import (
     folded,
     frames_with,
     held,
+    if_bound,
     in_mask,
     in_which,
     merged,
@@ -407,7 +408,8 @@ def frames(
     hidden = (bound | parts.late | ties) - nodes - edges - told
     hidden -= {key for key in hidden - ties if scope.kinds(key).one_a_frame}
     known = sql.found_in(scope)
-    if hidden or (known and not (known.nodes <= nodes and known.edges <= edges)):
+    bare = known and known.told and not (nodes or edges or wanted)
+    if hidden or bare or (known and not (known.nodes <= nodes and known.edges <= edges)):
         return "SELECT DISTINCT" + text.removeprefix("SELECT")
     return text
 
@@ -733,12 +735,14 @@ def _of_node(sql: SqlBuilder, join: Join, scope: Scope, node: str, attribute: At
         return join.nodes[node]
     if attribute.unit is DisplayUnit.owner:
         profile = Profile.of(scope.kinds(node), sql.catalog)
-        return owner_text(join.nodes[node], profile, f"{join.frame} >> 24", f'{FRAME}."map_id"')
+        owned = owner_text(join.nodes[node], profile, f"{join.frame} >> 24", f'{FRAME}."map_id"')
+        return if_bound(sql, join.nodes[node], owned)
     if attribute.unit is DisplayUnit.role:
         return role_text(join.frame, join.nodes[node])
     if attribute.unit is DisplayUnit.own:
         return own_text(attribute, join.frame, join.nodes[node])
-    return attribute_text(attribute, join.at[node])
+    value = attribute_text(attribute, join.at[node])
+    return if_bound(sql, join.nodes[node], value) if attribute.name == "is_ego" else value
 
 
 def _is_own(leaf: Leaf) -> TypeGuard[EdgeAttribute]:

@@ -384,6 +384,11 @@ class SqlBuilder:
     # The join of edges and nodes
 
 
+def if_bound(sql: SqlBuilder, node: str, value: str) -> str:
+    """A value that would be known of what is NULL, too, as a node of an ``OPTIONAL MATCH`` may be."""
+    return f"CASE WHEN {node} IS NOT NULL THEN {value} END" if sql.query.stages else value
+
+
 def expanded(text: str, nodes: frozenset[str], edges: frozenset[str], kinds: frozenset[str]) -> str:
     """A relation of the first phase, one row a frame, with the kinds of some nodes."""
     columns = [*columns_of(nodes, edges), *(quoted(f"{key}.kind") for key in sorted(kinds))]

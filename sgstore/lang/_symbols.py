@@ -89,6 +89,10 @@ class Session:
         Attributes of a client's own, by name.
     part : bool
         Whether the store is a part of a collection: see :attr:`sgstore.lang.Catalog.part`.
+    dropped : set of str
+        Names that a ``WITH`` does not pass on.
+    maybe : set of str
+        Keys of nodes that an ``OPTIONAL MATCH`` binds, or leaves NULL.
     the_ego : str or None
         The key of the ego, once the query has named it ``ego``, wherever that is.
     numbers, blocks : int
@@ -110,6 +114,8 @@ class Session:
     own: Mapping[str, Type] = field(default_factory=dict[str, Type])
     own_edges: Mapping[str, Type] = field(default_factory=dict[str, Type])
     part: bool = False
+    dropped: set[str] = field(default_factory=set[str])
+    maybe: set[str] = field(default_factory=set[str])
     the_ego: str | None = None
     numbers: int = 0
     blocks: int = 0
@@ -284,6 +290,8 @@ class SymbolTable:
         """Return a hint for a name that has no meaning here."""
         if self.session.calls:
             return f"{self.session.calls[-1]}() knows its parameters and ego only"
+        if name in self.session.dropped:
+            return f"WITH does not pass it on: WITH …, {name}"
         elsewhere = name.lower() in self.session.keys
         return variable_hint(name, self.visible(), elsewhere) or call_hint(name)
 

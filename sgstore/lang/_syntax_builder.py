@@ -435,12 +435,25 @@ def _sequence(span: TextSpan, children: Children) -> s.SequenceClause:
 
 
 def _match(span: TextSpan, children: Children) -> s.MatchClause:
-    settings, sequence, returns, order, sample, top, skip, limit = children
-    if any(part is not None for part in children[2:]):
+    settings, sequence, later, returns, order, sample, top, skip, limit = children
+    if any(part is not None for part in children[3:]):
         every = (s.Item("all", None, None, 0, 0, span),)
         distinct, items, having, at = returns or (False, every, None, span)
         returns = s.Returns(distinct, items, order or (), sample, limit, at, having, top, skip or 0)
-    return s.MatchClause(settings or (), sequence, returns, span)
+    return s.MatchClause(settings or (), sequence, returns, span, later or ())
+
+
+def _later_match(span: TextSpan, children: Children, *, optional: bool) -> s.LaterMatch:
+    paths, where = children
+    return s.LaterMatch(s.Block(paths, where, span), optional, span)
+
+
+def _with(span: TextSpan, children: Children) -> s.WithClause:
+    distinct, items, order, skip, limit, where = children
+    for item in items:
+        if item.form not in {"value", "all"}:
+            raise BuildError("WITH passes values and variables on", item.span, "WITH e, v, …")
+    return s.WithClause(distinct is not None, items, order or (), skip or 0, limit, where, span)
 
 
 def _union(span: TextSpan, children: Children) -> s.UnionClause:
@@ -562,6 +575,10 @@ BUILDERS: Final[dict[str, Callable[[TextSpan, Children], Any]]] = {
     "params": _all,
     "param": _param,
     "match": _match,
+    "later": _all,
+    "optional": partial(_later_match, optional=True),
+    "again": partial(_later_match, optional=False),
+    "with": _with,
     "union": _union,
     "check": _check,
     "quantifier": _quantifier,

@@ -83,8 +83,10 @@ def parts_of(query: b.Query, given: Mapping[str, int]) -> Iterator[PatternPart]:
             known = ", ".join(key for key in keys.values() if not key.startswith("#"))
             raise QueryNameError(f"the pattern has no node '{name}'", hint=f"it has: {known}")
     pins = {keys[name.lower()]: number for name, number in given.items()}
+    if query.stages:
+        pins = {key: number for key, number in pins.items() if key in query.first.nodes}
     if not query.steps:
-        yield from _parts(query, query.scope, (), pins, 0, None)
+        yield from _parts(query, query.first, (), pins, 0, None)
     for number, step in enumerate(query.steps, start=1):
         yield from _parts(query, step.scope, step.when, pins, number, step)
 
@@ -95,7 +97,7 @@ def has_nodes(query: b.Query, names: Iterable[str]) -> bool:
 
 
 def _keys_of(query: b.Query) -> dict[str, str]:
-    scopes = [query.scope, *(step.scope for step in query.steps)]
+    scopes = [query.scope, *query.patterns]
     return {key.lower(): key for scope in scopes for key in scope.nodes}
 
 
@@ -114,7 +116,13 @@ def _parts(
         later = tuple(one for one in when if any(atom is one for atom in atoms))
         relations = query.relations & _relations([*part.edges], [*part.where, *later])
         asked = replace(
-            query, scope=part, result=b.Result(), relations=relations, steps=(), links=()
+            query,
+            scope=part,
+            result=b.Result(),
+            relations=relations,
+            steps=(),
+            links=(),
+            stages=(),
         )
         if later and step is not None:
             alone = replace(step, scope=part, when=later, hold=None, absent=False)

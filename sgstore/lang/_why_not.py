@@ -396,7 +396,7 @@ class WhyNotSteps:
 def why_not(query: b.Query, view: FrameView, text: str = "") -> WhyNot | WhyNotSteps:
     """Explain how far a bound pattern, written as ``text``, holds in a graph; of a sequence, each step."""
     if not query.steps:
-        return _in_frame(query.scope, query, view)
+        return _in_frame(query.first, query, view)
     texts = (" ".join(text[step.span.start : step.span.end].split()) for step in query.steps)
     steps = tuple(_in_frame(step.scope, query, view) for step in query.steps)
     return WhyNotSteps(tuple(texts), steps)
@@ -426,7 +426,7 @@ def looked_up(query: b.Query) -> list[b.FrameAttribute]:
                 elif isinstance(leaf, b.FrameAttribute) and leaf.attribute.of_store:
                     found[leaf.attribute.name] = leaf
 
-    for scope in (query.scope, *(step.scope for step in query.steps)):
+    for scope in (query.scope, *query.patterns):
         look(scope)
     return list(found.values())
 

@@ -9,67 +9,36 @@ unnamed nodes begin with ``#``.
 
 from __future__ import annotations
 
-from dataclasses import field, replace
-from typing import TYPE_CHECKING, Any, Final, Literal
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final, Literal, TypeGuard
 
-from sgstore.lang._catalog import NODE_ATTRIBUTES, Attribute, Type
+from sgstore.lang._catalog import NODE_ATTRIBUTES, Attribute, DisplayUnit, Type
+from sgstore.lang._durations import BoundHold, Length  # noqa: TC001  they are of this module
+from sgstore.lang._ir_leaves import (
+    Choices,
+    EdgeAttribute,
+    EdgeRelation,
+    FrameAttribute,
+    Happened,
+    LabelTest,
+    NodeAttribute,
+    NodeValue,
+    PairNumber,
+    TraceAttribute,
+    Value,
+)
+from sgstore.lang._kind_sets import (
+    Kinds,  # noqa: TC001
+    any_kinds,  # noqa: F401
+    any_relation,  # noqa: F401
+    ego_kinds,  # noqa: F401
+)
 from sgstore.records import dataclass
-from sgstore.vocabulary import KINDS, RELATIONS, entity_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from sgstore.errors import TextSpan
-
-
-@dataclass(frozen=True, slots=True)
-class Kinds:
-    """Kinds that a node may have: if it is the ego, and if it is not."""
-
-    ego: frozenset[str]
-    other: frozenset[str]
-
-    def __and__(self, more: Kinds) -> Kinds:
-        return Kinds(self.ego & more.ego, self.other & more.other)
-
-    def __or__(self, more: Kinds) -> Kinds:
-        return Kinds(self.ego | more.ego, self.other | more.other)
-
-    def __invert__(self) -> Kinds:
-        every = any_kinds()
-        return Kinds(every.ego - self.ego, every.other - self.other)
-
-    def __bool__(self) -> bool:
-        return bool(self.ego or self.other)
-
-    def only(self, kinds: frozenset[str]) -> Kinds:
-        """Those of some kinds."""
-        return Kinds(self.ego & kinds, self.other & kinds)
-
-    @property
-    def every(self) -> frozenset[str]:
-        """All kinds, whether ego or not."""
-        return self.ego | self.other
-
-    @property
-    def one_a_frame(self) -> bool:
-        """Tell whether there is no more than one such node in a frame, for it must be the ego."""
-        return not self.other
-
-
-def any_kinds() -> Kinds:
-    """Return all kinds that are known now: readers, settings and stores may add some."""
-    return Kinds(entity_kinds(), frozenset(KINDS))
-
-
-def ego_kinds() -> Kinds:
-    """Return all kinds that are known now, of the ego alone."""
-    return Kinds(entity_kinds(), frozenset())
-
-
-def any_relation() -> frozenset[str]:
-    """Return all relations that are known now: stores and settings may add some."""
-    return frozenset(RELATIONS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,126 +92,6 @@ class Edge:
 
 
 # Expressions --------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Value:
-    """A constant.
-
-    Attributes
-    ----------
-    value, type
-    closed : bool
-        Whether it is a canonical word of the vocabulary, not a text of the user's.
-    unit : str
-        ``s`` or ``frames`` if it was written as a length of time, such as ``2s``; no part of what it is.
-    span : TextSpan or None
-        Where a length of time was written.
-    """
-
-    value: int | float | str | bool | None
-    type: Type
-    closed: bool = False
-    unit: str = field(default="", compare=False)
-    span: TextSpan | None = field(default=None, compare=False)
-
-
-@dataclass(frozen=True, slots=True)
-class Choices:
-    """A list of constants, after ``IN``."""
-
-    items: tuple[Value, ...]
-    type: Type = Type.list
-
-
-@dataclass(frozen=True, slots=True)
-class NodeValue:
-    """A node itself."""
-
-    node: str
-    type: Type = Type.node
-
-
-@dataclass(frozen=True, slots=True)
-class NodeAttribute:
-    """An attribute of a node."""
-
-    node: str
-    attribute: Attribute
-    type: Type
-
-
-@dataclass(frozen=True, slots=True)
-class LabelTest:
-    """Test that a node, bound outside, has a label."""
-
-    node: str
-    kinds: Kinds
-    type: Type = Type.boolean
-
-
-@dataclass(frozen=True, slots=True)
-class EdgeRelation:
-    """The relation that an edge variable is bound to."""
-
-    edge: str
-    type: Type = Type.text
-
-
-@dataclass(frozen=True, slots=True)
-class EdgeAttribute:
-    """An attribute of an edge from an entity to a lane."""
-
-    edge: str
-    attribute: Attribute
-    type: Type
-
-
-@dataclass(frozen=True, slots=True)
-class FrameAttribute:
-    """``frame.name``."""
-
-    attribute: Attribute
-    type: Type
-
-
-@dataclass(frozen=True, slots=True)
-class TraceAttribute:
-    """``trace.name``."""
-
-    attribute: Attribute
-    type: Type
-
-
-@dataclass(frozen=True, slots=True)
-class PairNumber:
-    """A number of an ordered pair of entities."""
-
-    function: str
-    a: str
-    b: str
-    type: Type = Type.number
-
-
-@dataclass(frozen=True, slots=True)
-class Happened:
-    """Test that something is recorded as having happened in a frame.
-
-    Attributes
-    ----------
-    kind : str
-        Of the event: one of :data:`sgstore.vocabulary.EVENT_KINDS`; or the name of a table of a user's own.
-    nodes : tuple of str
-        To whom: none, one or two.
-    table : tuple of str
-        Of a table: the columns that say to whom, as many as there are nodes; for no node one that is empty.
-        Empty: it is an event of the recording, which says it of two in either order.
-    """
-
-    kind: str
-    nodes: tuple[str, ...]
-    table: tuple[str, ...] = ()
-    type: Type = Type.boolean
 
 
 @dataclass(frozen=True, slots=True)
@@ -586,14 +435,101 @@ class Result:
 
 
 @dataclass(frozen=True, slots=True)
+class MatchStage:
+    """A pattern of a query in several parts.
+
+    Attributes
+    ----------
+    scope : Scope
+        What stands in ``MATCH``; its outer nodes are those of the stages before that it speaks of.
+    optional : bool
+        Whether what goes before stays where it has no match.
+    """
+
+    scope: Scope
+    optional: bool
+
+
+@dataclass(frozen=True, slots=True)
+class WithStage:
+    """``WITH``: what of the matches so far is passed on, frame by frame.
+
+    Attributes
+    ----------
+    before, after : Scope
+        Nodes and edges that are bound before and after it; without conditions.
+    nodes : tuple of (str, str)
+        Keys of the nodes that it passes on, after and before.
+    edges : tuple of (Edge, str)
+        The edges that it passes on, and their keys before.
+    values : tuple of ReturnColumn
+        What it works out.
+    places : tuple of FrameAttribute
+        What stands for each of them behind it.
+    grouped : bool
+        Whether what is not passed on ends here, each combination of the rest being there once: with an
+        aggregate, or with ``DISTINCT``.
+    order : tuple of SortKey
+    skip : int
+    limit : int or None
+        Of the rows of each frame.
+    where : tuple of Bound
+    """
+
+    before: Scope
+    after: Scope
+    nodes: tuple[tuple[str, str], ...]
+    edges: tuple[tuple[Edge, str], ...]
+    values: tuple[ReturnColumn, ...]
+    places: tuple[FrameAttribute, ...]
+    grouped: bool
+    order: tuple[SortKey, ...] = ()
+    skip: int = 0
+    limit: int | None = None
+    where: tuple[Bound, ...] = ()
+
+    @property
+    def expressions(self) -> tuple[Bound, ...]:
+        """All expressions in it."""
+        order = (key.value for key in self.order if not isinstance(key.value, str))
+        return (*(column.value for column in self.values), *order, *self.where)
+
+    def changed(self, change: Callable[[Bound], Bound]) -> WithStage:
+        """The same with a change made to every expression."""
+        values = tuple(replace(column, value=change(column.value)) for column in self.values)
+        order = tuple(
+            replace(key, value=change(key.value))
+            for key in self.order
+            if not isinstance(key.value, str)
+        )
+        return replace(self, values=values, order=order, where=tuple(map(change, self.where)))
+
+
+Stage = MatchStage | WithStage
+
+PASSED: Final = ":with "
+"""What the names of values begin with that ``WITH`` passes on."""
+
+
+def passed_on(name: str, kind: Type) -> FrameAttribute:
+    """What stands for a value that ``WITH`` passes on, each time another."""
+    return FrameAttribute(Attribute(name, kind, {}, "", DisplayUnit.whole), kind)
+
+
+def is_passed_on(value: Bound) -> TypeGuard[FrameAttribute]:
+    """Tell whether something stands for a value that ``WITH`` passes on."""
+    return isinstance(value, FrameAttribute) and value.attribute.name.startswith(PASSED)
+
+
+@dataclass(frozen=True, slots=True)
 class Query:
     """A bound query.
 
     Attributes
     ----------
     scope : Scope
-        What stands in ``MATCH``; of a query with steps, their nodes and the edges that have names, without
-        conditions.
+        What stands in ``MATCH``; of a query with steps or stages, their nodes and the edges that have names,
+        without conditions.
     result : Result
     relations : frozenset of str
         Relations that it names, anywhere: what a trace must be able to answer.
@@ -611,6 +547,8 @@ class Query:
         Which matches of a sequence are told: ``all``, ``first``, ``longest``.
     gaps : str
         Whether a gap in the recording ends a run (``break``) or not (``bridge``).
+    stages : tuple of MatchStage and WithStage
+        Of a query with ``OPTIONAL MATCH`` or ``WITH``: its parts, the first of which is a pattern.
     """
 
     scope: Scope
@@ -623,6 +561,34 @@ class Query:
     links: tuple[StepLink, ...] = ()
     policy: str = "all"
     gaps: str = "break"
+    stages: tuple[Stage, ...] = ()
+
+    @property
+    def patterns(self) -> tuple[Scope, ...]:
+        """All its patterns: of its steps, of its stages, or the one that it is."""
+        stages = (stage.scope for stage in self.stages if isinstance(stage, MatchStage))
+        found = (*(step.scope for step in self.steps), *stages)
+        return found or (self.scope,)
+
+    @property
+    def required(self) -> tuple[Scope, ...]:
+        """The patterns of a frame without which there is no match: all but those of ``OPTIONAL MATCH``."""
+        stages = (s for s in self.stages if isinstance(s, MatchStage) and not s.optional)
+        return tuple(stage.scope for stage in stages) or (self.scope,)
+
+    @property
+    def first(self) -> Scope:
+        """The pattern of a frame that it begins with."""
+        return self.required[0]
+
+
+def passed_values(query: Query) -> tuple[FrameAttribute, ...]:
+    """What stands for the values that matches of a query have in the end."""
+    found: tuple[FrameAttribute, ...] = ()
+    for stage in query.stages:
+        if isinstance(stage, WithStage):
+            found = stage.places if stage.grouped else found + stage.places
+    return found
 
 
 def is_one_of(value: Bound, numbers: Iterable[int]) -> Operation:
@@ -729,59 +695,6 @@ def blocks_of(expression: Bound) -> tuple[BlockValue, ...]:
 
 
 # Bound forms of what happens over time: the steps and links of a sequence, and checks -----------
-
-
-@dataclass(frozen=True, slots=True)
-class Length:
-    """A length of time: ``amount`` nanoseconds, or frames."""
-
-    amount: int
-    frames: bool
-
-
-_COMPARE: Final[Mapping[str, Callable[[Any, int, int], Any]]] = {
-    ">=": lambda length, amount, by: length >= amount - by,
-    ">": lambda length, amount, by: length > amount + by,
-    "<=": lambda length, amount, by: length <= amount + by,
-    "<": lambda length, amount, by: length < amount - by,
-    "=": lambda length, amount, by: abs(length - amount) <= by,
-}
-"""Comparisons, what differs by no more than a tolerance being the same."""
-
-
-@dataclass(frozen=True, slots=True)
-class BoundHold:
-    """Duration that a step must have: from the first to the last frame of its run.
-
-    Attributes
-    ----------
-    comparison : str
-    length : Length
-        In frames: how many there are.
-    inclusive : bool
-        Whether the time of one median period is added to that of the run.
-    """
-
-    comparison: str
-    length: Length
-    inclusive: bool
-
-    def fits(self, length: Any, tolerance: int) -> Any:
-        """Tell whether a run that is so long lasts as it must.
-
-        Parameters
-        ----------
-        length : int or (R,) int
-            Nanoseconds, or frames.
-        tolerance : int
-            Of times; ns.
-
-        Returns
-        -------
-        bool or (R,) bool
-        """
-        by = 0 if self.length.frames else tolerance
-        return _COMPARE[self.comparison](length, self.length.amount, by)
 
 
 @dataclass(frozen=True, slots=True)

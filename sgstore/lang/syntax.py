@@ -457,13 +457,36 @@ class SequenceClause:
 
 
 @dataclass(frozen=True, slots=True)
+class LaterMatch:
+    """``OPTIONAL MATCH …``, or ``MATCH …`` behind one or behind ``WITH``."""
+
+    block: Block
+    optional: bool
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class WithClause:
+    """``WITH DISTINCT items ORDER BY … SKIP … LIMIT … WHERE …``."""
+
+    distinct: bool
+    items: tuple[Item, ...]
+    order: tuple[Sort, ...]
+    skip: int
+    limit: int | None
+    where: Expression | None
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
 class MatchClause:
-    """``USING … MATCH … WHERE … THEN … RETURN …``."""
+    """``USING … MATCH … WHERE … THEN … OPTIONAL MATCH … WITH … RETURN …``."""
 
     settings: tuple[Setting, ...]
     sequence: SequenceClause
     returns: Returns | None
     span: TextSpan
+    later: tuple[LaterMatch | WithClause, ...] = ()
 
     @property
     def block(self) -> Block:

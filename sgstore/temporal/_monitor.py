@@ -470,6 +470,13 @@ def _bound(
         if isinstance(one, Define):
             defined.append(one)
         elif isinstance(one, MatchClause):
+            if one.later:
+                raise QueryError(
+                    "a monitor tells when a pattern is there, and OPTIONAL MATCH and WITH are about its rows",
+                    text=text,
+                    span=one.later[0].span,
+                    hint="they are asked of a store, by find; EXISTS {…} and COUNT {…} can be watched",
+                )
             queries.append(bind_query(text, [*defined, one], catalog, given([*defined, one])))
     return checks, queries
 

@@ -1,0 +1,228 @@
+"""SQL of queries in several parts: ``OPTIONAL MATCH``, ``WITH``, and a ``MATCH`` behind them.
+
+Each part makes a relation of the one before it: one row a frame and match, with the nodes and edges that are
+bound, and the values that ``WITH`` passed on. What is returned is asked of the last one as of matches that are
+known (:attr:`SqlBuilder.found`): a node that is NULL has no rows in any table, so all its values are NULL.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from sgstore.lang._aggregates import PLACE
+from sgstore.lang._formulas import (
+    Leaf,
+    Select,
+    column_of,
+    columns_of,
+    expression_text,
+    leaves,
+    nested,
+)
+from sgstore.lang._plan import SharedRelation
+from sgstore.lang._results import directed, in_order
+from sgstore.lang._sql_frames import frames
+from sgstore.lang._sql_masks import SqlBuilder, folded
+from sgstore.lang.ir import (
+    Bound,
+    GroupKey,
+    MatchStage,
+    Query,
+    Result,
+    Scope,
+    WithStage,
+    is_counted,
+    is_passed_on,
+    walk,
+)
+from sgstore.quoting import quoted
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from sgstore.lang._catalog import Catalog
+    from sgstore.lang._plan import Window
+
+
+def staged_matches(query: Query, catalog: Catalog, window: Window | None) -> SqlBuilder:
+    """A builder for a query in several parts, whose matches are a relation before the statement.
+
+    Parameters
+    ----------
+    query : Query
+        Rewritten.
+    catalog : Catalog
+    window : Window or None
+    """
+    sql = SqlBuilder(query, catalog, window)
+    rows: SharedRelation | None = None
+    for stage in query.stages:
+        if isinstance(stage, WithStage):
+            assert rows is not None  # noqa: S101 - a query begins with a pattern
+            rows = _passed(sql, query, rows, stage)
+        else:
+            rows = _first(sql, query, stage) if rows is None else _joined(sql, query, rows, stage)
+    sql.query, sql.found = query, rows
+    return sql
+
+
+# Patterns -----------------------------------------------------------------------------------------
+
+
+def _first(sql: SqlBuilder, query: Query, stage: MatchStage) -> SharedRelation:
+    nodes, edges = _bound(stage.scope)
+    sql.query, sql.found = replace(query, scope=stage.scope, result=Result(), stages=()), None
+    text = frames(sql, stage.scope, None, nodes, edges)
+    return SharedRelation(sql.share(text, "match"), nodes, edges)
+
+
+def _joined(
+    sql: SqlBuilder, query: Query, rows: SharedRelation, stage: MatchStage
+) -> SharedRelation:
+    """The rows so far with the matches of a further pattern beside them."""
+    whole = stage.scope
+    late = [one for one in whole.where if _speaks_of_passed(one)]
+    scope = replace(whole, where=tuple(one for one in whole.where if one not in late))
+    outer = frozenset(scope.outer)
+    # Conditions of blocks in it are looked for in the query, but it is not the outermost scope.
+    sql.query, sql.found = replace(query, scope=replace(scope), result=Result(), stages=()), None
+    given = _given(sql, rows, outer) if outer else None
+    nodes, edges = _bound(scope)
+    wanted = [leaf for one in late for leaf in leaves(one) if not is_passed_on(leaf)]
+    text = frames(sql, scope, given, nodes | outer, edges, wanted)
+    more = quoted(":more")
+    select = Select(['":rows".*'])
+    select.columns += [f"{more}.{column}" for column in columns_of(nodes, edges)]
+    select.join(f'{quoted(rows.name)} AS ":rows"', [])
+    on = [f'{more}.{column} = ":rows".{column}' for column in ('"frame_id"', *columns_of(outer))]
+
+    def leaf(found: Leaf) -> str:
+        table = '":rows"' if is_passed_on(found) else more
+        return f"{table}.{quoted(column_of(found))}"
+
+    on += [expression_text(one, leaf, sql.values) for one in late]
+    select.join(nested(text, ":more"), on, "LEFT JOIN" if stage.optional else "JOIN")
+    name = sql.share(select.text(), "optional" if stage.optional else "match")
+    return SharedRelation(name, rows.nodes | nodes, rows.edges | edges, rows.told)
+
+
+def _bound(scope: Scope) -> tuple[frozenset[str], frozenset[str]]:
+    """Nodes and edges of its own by which the matches of a pattern are told apart."""
+    nodes = frozenset(key for key, node in scope.nodes.items() if node.role != "hidden")
+    return nodes, frozenset(edge.key for edge in scope.edges if edge.named)
+
+
+def _given(sql: SqlBuilder, rows: SharedRelation, outer: frozenset[str]) -> SharedRelation:
+    """What the outer nodes of a pattern are bound to, as masks; where one is NULL it has no match."""
+    keys = columns_of(outer)
+    known = [f"{key} IS NOT NULL" for key in keys]
+    each = Select(['"frame_id"', *keys], [quoted(rows.name)], known, distinct=True)
+    return SharedRelation(sql.share(folded(each.text(), keys), "outside"), outer, frozenset())
+
+
+def _speaks_of_passed(condition: Bound) -> bool:
+    return any(is_passed_on(part) for part in walk(condition))
+
+
+# WITH ---------------------------------------------------------------------------------------------
+
+
+def _passed(
+    sql: SqlBuilder, query: Query, rows: SharedRelation, stage: WithStage
+) -> SharedRelation:
+    """The rows that ``WITH`` passes on."""
+    values = [column.value for column in stage.values]
+    collected = any(in_order(part) for value in values for part in walk(value))
+    text = _of_rows(sql, query, rows, stage.before, values)
+    if collected:
+        order = ", ".join(['"frame_id"', *columns_of(rows.nodes, rows.edges), *_told(rows)])
+        place = PLACE.rpartition(".")[2]
+        placed = Select(["*", f"row_number() OVER (ORDER BY {order}) AS {place}"])
+        placed.join(nested(text, ":matches"), [])
+        text = placed.text()
+    select = Select(['":rows"."frame_id"'], [nested(text, ":rows")])
+    nodes, edges = dict(stage.nodes), {edge.key: key for edge, key in stage.edges}
+    kept = stage.grouped
+    if not kept:
+        nodes = {key: key for key in sorted(rows.nodes)} | nodes
+        edges = {key: key for key in sorted(rows.edges)} | edges
+    ids = {f"{new}.id": f"{key}.id" for new, key in nodes.items()}
+    ids |= {f"{new}.type": f"{key}.type" for new, key in edges.items()}
+    select.columns += [f'":rows".{quoted(key)} AS {quoted(new)}' for new, key in ids.items()]
+    texts: dict[str, str] = {}
+    groups = list(range(1, len(select.columns) + 1))
+    columns = zip(stage.values, stage.places, strict=True)
+    # A value by which rows are grouped comes before what is counted beside it, and has the same text there.
+    for column, place in sorted(columns, key=lambda one: is_counted(one[0].value)):
+        texts[column.name] = expression_text(column.value, _leaf_of(texts), sql.values)
+        select.columns.append(f"{texts[column.name]} AS {quoted(column_of(place))}")
+        if not is_counted(column.value):
+            groups.append(len(select.columns))
+    if any(map(is_counted, values)):
+        select.group = [str(group) for group in groups]
+    else:
+        select.distinct = kept
+    told = {place: column_of(place) for place in stage.places}
+    if not kept:
+        select.columns += [f'":rows".{column}' for column in _told(rows)]
+        told = {**rows.told, **told}
+    found = SharedRelation(
+        sql.share(select.text(), "with"), frozenset(nodes), frozenset(edges), told
+    )
+    return _chosen(sql, query, found, stage)
+
+
+def _told(rows: SharedRelation) -> list[str]:
+    return [quoted(column) for column in rows.told.values()]
+
+
+def _of_rows(
+    sql: SqlBuilder, query: Query, rows: SharedRelation, scope: Scope, values: Iterable[Bound]
+) -> str:
+    """The rows so far, with what some values are made of."""
+    asked = replace(query, scope=scope, result=Result(), stages=())
+    sql.query, sql.found = asked, rows
+    wanted: list[Leaf] = [leaf for value in values for leaf in leaves(value)]
+    return frames(sql, scope, None, rows.nodes, rows.edges, [*wanted, *rows.told])
+
+
+def _leaf_of(texts: dict[str, str]) -> Callable[[Leaf], str]:
+    def leaf(found: Leaf) -> str:
+        if isinstance(found, GroupKey):
+            return texts[found.name]
+        return f'":rows".{quoted(column_of(found))}'
+
+    return leaf
+
+
+def _chosen(
+    sql: SqlBuilder, query: Query, rows: SharedRelation, stage: WithStage
+) -> SharedRelation:
+    """The first rows of each frame, and those of them of which the condition is true."""
+    columns = ['"frame_id"', *columns_of(rows.nodes, rows.edges), *_told(rows)]
+    if stage.skip or stage.limit is not None:
+        keys = [
+            (key.value, key.descending) for key in stage.order if not isinstance(key.value, str)
+        ]
+        text = _of_rows(sql, query, rows, stage.after, [key for key, _ in keys])
+        leaf = _leaf_of({})
+        order = [directed(expression_text(k, leaf, sql.values), down) for k, down in keys]
+        order += [f'":rows".{column}' for column in columns[1:]]
+        by = f"ORDER BY {', '.join(order)}" if order else ""
+        rank = f'row_number() OVER (PARTITION BY ":rows"."frame_id" {by}) AS ":rank"'
+        ranked = Select([*(f'":rows".{column}' for column in columns), rank])
+        ranked.join(nested(text, ":rows"), [])
+        first = Select(
+            list(columns), [nested(ranked.text(), ":ranked")], [f'":rank" > {stage.skip}']
+        )
+        if stage.limit is not None:
+            first.where.append(f'":rank" <= {stage.skip + stage.limit}')
+        rows = replace(rows, name=sql.share(first.text(), "chosen"))
+    if stage.where:
+        text = _of_rows(sql, query, rows, stage.after, stage.where)
+        select = Select([f'":rows".{column}' for column in columns], [nested(text, ":rows")])
+        leaf = _leaf_of({})
+        select.where = [expression_text(one, leaf, sql.values) for one in stage.where]
+        rows = replace(rows, name=sql.share(select.text(), "chosen"))
+    return rows

@@ -1,0 +1,405 @@
+"""Queries in several parts by their definition: ``OPTIONAL MATCH``, ``WITH``, ``MATCH`` behind them, paths.
+
+Frame by frame, a query has a list of rows; each part makes another list of it. Patterns are searched
+exhaustively, as in :mod:`oracle`. ``python -m oracle_parts 5000`` (in this folder) tries that many random
+queries on random worlds.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections import Counter
+from itertools import groupby
+from typing import TYPE_CHECKING, Any
+
+from oracle import (
+    FREE,
+    LINKS,
+    Edge,
+    Entity,
+    Search,
+    asked,
+    assignments,
+    difference,
+    free_names,
+    named_nodes,
+    shown,
+    with_worlds,
+)
+from oracle_after import is_counted, rounded, said
+from oracle_patterns import Writer
+
+from sgstore.lang import parse
+from sgstore.lang import syntax as s
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from oracle import Binding
+    from oracle_worlds import World
+
+
+class Row(Search):
+    """A match of all parts so far: variables, and values that ``WITH`` passed on; ``None`` is NULL."""
+
+    def __init__(self, search: Search, binding: Binding, passed: Binding) -> None:
+        super().__init__(search.frame, search.graph, search.injective)
+        self.binding, self.passed = binding, passed
+
+    def of(self, e: s.Expression) -> Any:
+        """A value, or which entity it is."""
+        value = self.value(e, self.binding)
+        node = isinstance(e, s.Variable) and e.name not in self.passed
+        return Entity(self.frame.trace.owner(value), value) if node and value is not None else value
+
+    def value(self, e: s.Expression, binding: Binding) -> Any:
+        if isinstance(e, s.Variable) and e.name in self.passed:
+            return self.passed[e.name]
+        return super().value(e, binding)
+
+    def owned(self, owner: str, name: str, binding: Binding) -> Any:
+        if owner in binding and binding[owner] is None:
+            return None
+        return super().owned(owner, name, binding)
+
+    def call(self, e: s.Call, binding: Binding) -> Any:
+        if e.name == "type" and binding[e.arguments[0].name] is None:  # type: ignore[union-attr]
+            return None
+        if e.name == "dist" and None in [self.value(one, binding) for one in e.arguments]:
+            return None
+        return super().call(e, binding)
+
+    def matches(
+        self, block: s.Block, outside: Binding, apart: tuple[str, ...] = ()
+    ) -> Iterator[Binding]:
+        if all(outside.get(name, "") is not None for name in free_names(block)):
+            yield from super().matches(block, outside, apart)
+
+    def found(self, block: s.Block) -> list[Binding]:
+        return list(self.matches(block, self.binding))
+
+
+def rows_of(match: s.MatchClause, world: World, text: str) -> list[Row]:
+    """The rows of a query before ``RETURN``."""
+    rows = [Row(search, binding, {}) for search, binding in assignments(match, world)]
+    for part in match.later:
+        if isinstance(part, s.WithClause):
+            frames = groupby(rows, key=lambda row: row.frame.frame_id)
+            rows = [row for _, some in frames for row in passed_on(part, list(some), text)]
+        else:
+            rows = [row for one in rows for row in joined(part, one)]
+    return rows
+
+
+def joined(part: s.LaterMatch, row: Row) -> list[Row]:
+    found = row.found(part.block)
+    if not found and part.optional:
+        edges = [edge.name for path in part.block.paths for edge in path.edges if edge.name]
+        names = [*(name for name, _ in named_nodes(part.block)), *edges]
+        found = [{**dict.fromkeys(names), **row.binding}]
+    return [Row(row, binding, row.passed) for binding in found]
+
+
+def passed_on(clause: s.WithClause, rows: list[Row], text: str) -> list[Row]:
+    """The rows of a frame behind ``WITH``."""
+    every = [
+        s.Item("value", s.Variable(n, clause.span), n, 0, 0, clause.span) for n in names_of(rows)
+    ]
+    items = [one for item in clause.items for one in (every if item.form == "all" else [item])]
+    named = {item.name or said(item.value, text): item.value for item in items}
+    counted = any(map(is_counted, named.values()))
+    if counted or clause.distinct:
+        found = [renamed(members, named, {}) for members in grouped(rows, named).values()]
+    else:
+        found = [renamed([row], named, {**row.binding}) for row in rows]
+    for sort in reversed(clause.order):
+        known = [row for row in found if row.of(sort.value) is not None]
+        unknown = [row for row in found if row.of(sort.value) is None]
+        known.sort(key=lambda row: shown((row.of(sort.value),))[0], reverse=sort.descending)
+        found = known + unknown
+    end = None if clause.limit is None else clause.skip + clause.limit
+    found = found[clause.skip : end]
+    if clause.where is not None:
+        found = [row for row in found if row.value(clause.where, row.binding) is True]
+    if not (counted or clause.distinct):
+        found = [
+            renamed([row], {n: s.Variable(n, clause.span) for n in named}, {}) for row in found
+        ]
+    return found
+
+
+def names_of(rows: list[Row]) -> list[str]:
+    names = {**rows[0].binding, **rows[0].passed} if rows else {}
+    return [name for name in names if name[:1] != "#" and name != "ego"]
+
+
+def grouped(rows: list[Row], named: dict[str, Any]) -> dict[tuple[Any, ...], list[Row]]:
+    plain = [value for value in named.values() if not is_counted(value)]
+    found: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        key = tuple(hashed(row.of(value)) for value in plain)
+        found.setdefault(key, []).append(row)
+    return found
+
+
+def hashed(value: Any) -> Any:
+    if isinstance(value, list):
+        return tuple(value)
+    return (value.relation, id(value.attributes)) if isinstance(value, Edge) else value
+
+
+def renamed(members: list[Row], named: dict[str, Any], binding: Binding) -> Row:
+    """A row of what is passed on of some rows; ``ego`` is always bound."""
+    first = members[0]
+    # What is not passed on may still be asked behind WITH, where each row is one as before.
+    passed = {k: v for k, v in first.passed.items() if k not in named} if binding else {}
+    binding = dict(binding)
+    if "ego" in first.binding:
+        binding["ego"] = first.binding["ego"]
+    for name, value in named.items():
+        if isinstance(value, s.Variable) and value.name in first.binding:
+            binding[name] = first.binding[value.name]
+            continue
+        counted = is_counted(value)
+        binding.pop(name, None)
+        passed[name] = aggregated(value, members) if counted else first.of(value)
+    return Row(first, binding, passed)
+
+
+def aggregated(e: Any, members: list[Row]) -> Any:
+    """An aggregate, or arithmetic of aggregates."""
+    match e:
+        case s.Arithmetic(first=first, rest=((sign, term),)):
+            one, other = aggregated(first, members), aggregated(term, members)
+            both = one is not None and other is not None
+            return (one + other if sign == "+" else one - other) if both else None
+        case s.Constant(value=value):
+            return value
+        case s.CountAll():
+            return len(members)
+    known = [value for value in (row.of(e.arguments[0]) for row in members) if value is not None]
+    known = list(dict.fromkeys(known)) if e.distinct else known
+    if e.name.lower() == "count":
+        return len(known)
+    if not known:
+        return None
+    return {"min": min, "max": max, "sum": math.fsum}[e.name.lower()](known)
+
+
+def returned(text: str, world: World) -> Counter[tuple[Any, ...]]:
+    """The rows after ``RETURN``, as often as they are returned."""
+    match = parse(text)[-1]
+    assert isinstance(match, s.MatchClause)
+    assert match.returns is not None
+    rows = rows_of(match, world, text)
+    named = {str(i): item.value for i, item in enumerate(match.returns.items)}
+    counted = [is_counted(value) for value in named.values()]
+    if not any(counted):
+        found = [tuple(hashed(row.of(value)) for value in named.values()) for row in rows]
+        kept = dict.fromkeys(found) if match.returns.distinct else found
+        return Counter(rounded(shown(row)) for row in kept)
+    groups = grouped(rows, named)
+    if all(counted):
+        groups.setdefault((), [])
+    result = Counter[tuple[Any, ...]]()
+    for key, members in groups.items():
+        told = iter(shown(key))
+        row = [aggregated(v, members) if is_counted(v) else next(told) for v in named.values()]
+        result[rounded(tuple(row))] += 1
+    return result
+
+
+def listed(text: str, world: World) -> set[tuple[Any, ...]]:
+    """The rows of whole matches: frame, and what the names mean."""
+    match = parse(text)[-1]
+    assert isinstance(match, s.MatchClause)
+    found: set[tuple[Any, ...]] = set()
+    for row in rows_of(match, world, text):
+        both = {**row.binding, **row.passed}
+        told = {n: v for n, v in both.items() if n[:1] != "#" and n != "ego"}
+        values = [v.relation if isinstance(v, Edge) else v for _, v in sorted(told.items())]
+        found.add((row.frame.frame_id, *rounded(tuple(values))))
+    return found
+
+
+# Random queries -----------------------------------------------------------------------------------
+
+
+SIMPLE = (
+    ("(a:Car)", ["a"]),
+    ("(a:Entity)", ["a"]),
+    ("(a)-[:near]->(b)", ["a", "b"]),
+    ("(a:Vehicle)-[:isIn]->(b:Lane)", ["a", "b"]),
+    ("(a:Car), (b:Entity)", ["a", "b"]),
+    ("(a:Vehicle)-[:near|visible]-()", ["a"]),
+    ("(a:Ego)", ["a"]),
+)
+
+
+class PartsWriter(Writer):
+    """Writes queries in several parts, without what depends on an order that nothing says."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        self.values: list[str] = []
+
+    def whole(self) -> str:
+        text = self.query() if self.rng.random() < 0.3 else self.simple()
+        kinds = self.rng.choice(
+            ("o", "o", "oo", "w", "w", "ow", "wo", "wm", "wmo", "owm", "ww", "om")
+        )
+        for place, kind in enumerate(kinds):
+            text += (
+                self.passing() if kind == "w" else self.further("def" if place else "abcd", kind)
+            )
+        return text
+
+    def simple(self) -> str:
+        """A pattern that most frames have."""
+        text, nodes = self.rng.choice(SIMPLE)
+        self.nodes += nodes
+        return f"MATCH {text}"
+
+    def further(self, letters: str, kind: str) -> str:
+        edges, self.edges = self.edges, []  # an edge is known only where it is bound
+        before = set(self.nodes)
+        text = self.block(letters, depth=2)
+        own = [name for name in self.nodes if name not in before]
+        if self.values and self.rng.random() < 0.4 and own:
+            sign = self.rng.choice(("<", ">=", "<>"))
+            word = "AND" if " WHERE " in text else "WHERE"
+            text += f" {word} {self.rng.choice(own)}.id {sign} {self.rng.choice(self.values)}"
+        self.edges = edges + self.edges
+        return f" {'OPTIONAL ' if kind == 'o' else ''}MATCH {text}"
+
+    def passing(self) -> str:
+        nodes = [n for n in self.nodes if n != "ego"]
+        kept = self.rng.sample(nodes, self.rng.randint(0, min(2, len(nodes))))
+        called = {n: f"r{len(self.seen)}{n}" if self.rng.random() < 0.2 else n for n in kept}
+        items, values = [n if n == c else f"{n} AS {c}" for n, c in called.items()], []
+        pool = nodes or ["ego"]
+        a, b = self.rng.choice(pool), self.rng.choice(pool)
+        counted = self.rng.random() < 0.5
+        some = [f"{a}.id", f"{a}.kind", f"{b}.x", f"COUNT {{({a})-[:near]->()}}", "frame.seq % 3"]
+        of_all = [
+            "COUNT(*)",
+            f"COUNT({b})",
+            f"COUNT(DISTINCT {a})",
+            f"MAX({a}.x)",
+            f"SUM({b}.width)",
+        ]
+        of_all += [f"MAX({a}.id) - MIN({b}.id)", *(f"MAX({v})" for v in self.values)]
+        some += self.values
+        chosen = self.rng.sample(of_all, self.rng.choice((1, 2))) if counted else []
+        chosen += self.rng.sample(some, self.rng.choice((0, 1)) if chosen or kept else 1)
+        for value in chosen:
+            name = f"n{len(self.seen)}"
+            self.seen.append(name)
+            items.append(f"{value} AS {name}")
+            if ".kind" not in value:
+                values.append(name)
+        distinct = not counted and self.rng.random() < 0.3
+        text = f" WITH {'DISTINCT ' * distinct}{', '.join(items)}"
+        kept = list(called.values())
+        unnamed = [*kept, *self.nodes] if not (counted or distinct) else kept
+        self.values, self.edges = values, []
+        if (counted or distinct) and self.rng.random() < 0.3:
+            keys = [*values, *(f"{name}.id" for name in kept)]
+            told = (item.rpartition(" ")[2] for item in items)
+            kinds = [name for name in told if name not in (*values, *kept)]
+            text += f" ORDER BY {', '.join(k + self.rng.choice(('', ' DESC')) for k in [*keys, *kinds])}"
+            text += self.rng.choice((" LIMIT 1", " LIMIT 2", " SKIP 1", " SKIP 1 LIMIT 1"))
+        if self.rng.random() < 0.5 and (values or kept):
+            tests = [f"{value} {self.rng.choice('<>')} 1" for value in values]
+            tests += [f"{name}.x > 101" for name in unnamed if name != "ego"]
+            tests += [f"{name}.is_ego" for name in kept]
+            text += f" WHERE {self.rng.choice(tests)}" if tests else ""
+        self.nodes = list(kept)
+        return text
+
+    @property
+    def seen(self) -> list[str]:
+        return self.__dict__.setdefault("_seen", [])
+
+    def told(self) -> str:
+        names = [name for name in self.nodes if name != "ego"]
+        some = [*names, *(f"{n}.x" for n in names), *(f"{n}.kind" for n in names)]
+        some += [*(f"{n}.is_ego" for n in names), *self.values, "frame.seq", "trace.name"]
+        some += [f"{n}.name" for n in names] + [f"type({edge})" for edge in self.edges]
+        some += [f"COUNT {{({n})-[:near]-()}}" for n in names]
+        some += [f"EXISTS {{({n})-[:isIn]->(:Lane)}}" for n in names]
+        if len(names) > 1:
+            some += [f"dist({names[0]}, {names[-1]})", f"{names[0]} = {names[-1]}"]
+        chosen = self.rng.sample(some, min(len(some), self.rng.choice((1, 2, 3))))
+        if self.rng.random() < 0.4:
+            counted = [
+                "COUNT(*)",
+                *(f"COUNT({n})" for n in names),
+                *(f"SUM({v})" for v in self.values),
+            ]
+            counted += [f"COUNT(DISTINCT {n})" for n in names] + [f"MAX({n}.y)" for n in names]
+            chosen = [*chosen[:1], *self.rng.sample(counted, min(2, len(counted)))]
+            return f" RETURN {', '.join(chosen)}"
+        return f" RETURN {self.rng.choice(('', 'DISTINCT '))}{', '.join(chosen)}"
+
+
+def disagreement_of_parts(text: str, world: World) -> tuple[str, int]:
+    """What the compiled query and the definition do not agree on; how many rows there are."""
+    from sgstore.lang import compile_query
+
+    statement = compile_query(text, world.catalog).rows()
+    wanted = returned(text, world)
+    found = Counter(rounded(row) for row in asked(statement, world))
+    return ("" if found == wanted else difference("rows", found, wanted)), len(wanted)
+
+
+def disagreement_of_matches(text: str, world: World) -> tuple[str, int]:
+    """The same of whole matches, and of the number of frames."""
+    from sgstore.lang import compile_query
+
+    compiled = compile_query(text, world.catalog)
+    statement = compiled.rows()
+    wanted = listed(text, world)
+    names = [n for n in statement.columns[5:] if not n.endswith(".name") and n != "ego"]
+    keep = [statement.columns.index(name) for name in sorted(names)]
+    rows = asked(statement, world)
+    found = Counter((row[0], *rounded(tuple(row[i] for i in keep))) for row in rows)
+    if found != Counter(wanted):
+        return difference("matches", found, Counter(wanted)), 0
+    ((many,),) = asked(compiled.count(), world)
+    frames = len({row[0] for row in wanted})
+    return ("" if many == frames else f"{many} frames, wanted {frames}"), frames
+
+
+def try_many_parts(first: int, count: int) -> Counter[str]:
+    """Random queries on random worlds."""
+    from sgstore.errors import QueryError
+
+    seen = Counter[str]()
+    for number, world in with_worlds(first, count):
+        writer = PartsWriter(number)
+        text = writer.whole()
+        LINKS.clear()
+        FREE.clear()
+        try:
+            if number % 3:
+                text += writer.told()
+                problem, rows = disagreement_of_parts(text, world)
+            else:
+                problem, rows = disagreement_of_matches(text, world)
+        except QueryError as error:
+            seen["refused"] += 1
+            seen[error.reason.split("'")[0]] += 1
+            continue
+        except Exception as error:
+            error.add_note(f"query {number}: {text}")
+            raise
+        seen["tried"] += 1
+        seen["with rows"] += rows > 0
+        assert not problem, f"query {number}: {text}\n{problem}"
+    return seen
+
+
+if __name__ == "__main__":
+    print(dict(try_many_parts(int((sys.argv[2:] or ["0"])[0]), int(sys.argv[1]))))

@@ -1,0 +1,128 @@
+"""Queries in several parts: ``OPTIONAL MATCH``, ``WITH``, and what all that asks does with them."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+from oracle_parts import disagreement_of_matches, disagreement_of_parts, try_many_parts
+from oracle_worlds import World, random_world
+from recordings import Recorder, car
+from thorough import LONG
+
+from sgstore.cli import run as run_verb
+from sgstore.errors import QueryError
+from sgstore.ingest import ingest
+from sgstore.query import Store
+from sgstore.temporal import Monitor
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+
+@pytest.mark.parametrize("first", range(0, 600, 50) if LONG else [50])
+def test_random_queries_find_what_their_definition_says(first: int) -> None:
+    seen = try_many_parts(first, 50 if LONG else 25)
+
+    assert seen["tried"] > 15
+    assert seen["with rows"] > 5
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return random_world(3, traces=3, frames=6)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "OPTIONAL MATCH (v)-[:near]->(w:Car) WITH v, w WHERE w IS NULL RETURN v, v.name",
+        "OPTIONAL MATCH (v)-[d:near|visible]->(w) RETURN v, type(d), w.speed, w.is_ego",
+        "WITH v.kind AS k, COUNT(*) AS n WHERE n > 1 RETURN k, n",
+        "WITH DISTINCT v.kind AS k WITH COUNT(*) AS n RETURN n, COUNT(*)",
+        "WITH v AS w OPTIONAL MATCH (w)-[:isIn]->(l:Lane) RETURN w, l",
+        "WITH v, COUNT {(v)-[:near]->()} AS n MATCH (w:Entity) WHERE w.id > n RETURN v, w",
+        "WITH * WHERE v.x > 101 RETURN COUNT(v)",
+    ],
+)
+def test_parts_are_what_their_definition_says(text: str, world: World) -> None:
+    problem, rows = disagreement_of_parts(f"MATCH (v:Entity) {text}", world)
+
+    assert problem == ""
+    assert rows
+    assert (
+        disagreement_of_matches(f"MATCH (v:Entity) {text.partition(' RETURN')[0]}", world)[0] == ""
+    )
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
+    """Four cars that drive behind one another at 10 m/s; from the tenth frame on the last one is gone."""
+    folder = tmp_path_factory.mktemp("parts")
+    with Recorder(folder / "run.mcap") as recorder:
+        for number in range(20):
+            places = (0, 12, 25, 40)[: 3 if number >= 10 else 4]
+            cars = [car(7 + i, x + number, v=(10, 0)) for i, x in enumerate(places)]
+            recorder.ground_truth(number / 10, cars, host=7)
+    ingest(folder / "x.sgstore", [folder / "run.mcap"])
+    with Store(folder / "x.sgstore") as opened:
+        yield opened
+
+
+def test_what_is_absent_is_null_in_every_form(store: Store, tmp_path: Path) -> None:
+    text = "MATCH (e:Ego) OPTIONAL MATCH (v:Car) WHERE v.x - e.x > 30"
+    matches = store.find(text)
+
+    assert matches.count() == len(matches.rows()) == 20
+    assert [row.v for row in matches] == [3] * 10 + [None] * 10
+    assert [row.v_name for row in matches][9:11] == ["car 3", None]
+    assert matches.numpy()["v"].mask.tolist() == [False] * 10 + [True] * 10
+    assert [(one.frames, one.values["v"]) for one in matches.intervals()] == [(10, 3), (10, None)]
+    assert matches.bindings(store.file.frame("run#12")) == [{"e": 0}]
+    assert [sorted(graph.nodes) for graph in matches.subgraphs()][9:11] == [[0, 3], [0]]
+    assert matches.csv(tmp_path / "x.csv") == matches.parquet(tmp_path / "x.parquet") == 20
+    assert [lane.part.text for lane in matches.parts(store.file.frame("run#2")).lanes] == [
+        "(e:Ego)"
+    ]
+    assert (
+        store.find(f"{text} RETURN v.name AS v, INTERVALS HAVING frames > 5").rows()[1][-1] is None
+    )
+    assert store.find(f"{text} RETURN DISTINCT v").rows() == [(3,), (None,)]
+
+
+def test_with_counts_and_chooses_in_each_frame(store: Store) -> None:
+    counted = "MATCH (e:Ego), (v:Car) WITH e, COUNT(v) AS many WHERE many > 2"
+    nearest = "MATCH (e:Ego), (v:Car) WITH e, v ORDER BY dist(e, v) DESC LIMIT 1"
+
+    assert [(row.seq, row.many) for row in store.find(counted)] == [(i, 3) for i in range(10)]
+    assert [one.frames for one in store.find(f"{counted} RETURN INTERVALS").intervals()] == [10]
+    found = store.find(f"{nearest} RETURN v.name AS last, COUNT(*) AS frames").rows()
+    assert found == [("car 2", 10), ("car 3", 10)]
+    listed = store.find("MATCH (v:Car) WITH collect(v.name) AS names RETURN DISTINCT names").rows()
+    assert [len(row.names) for row in listed] == [3, 4]
+
+
+def test_a_shell_shows_what_is_absent(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    text = "MATCH (e:Ego) WHERE frame.seq IN [9, 10] OPTIONAL MATCH (v:Car) WHERE v.x > 45 RETURN v.name AS v"
+
+    assert run_verb(["find", str(store.file.path), text, "--json"]) == 0
+
+    assert json.loads(capsys.readouterr().out) == [{"v": "car 3"}, {"v": None}]
+
+
+def test_why_not_and_explain_speak_of_the_parts(store: Store) -> None:
+    text = (
+        "MATCH (e:Ego) WHERE e.speed > 20 OPTIONAL MATCH (v:Car) WITH e, COUNT(v) AS n WHERE n > 1"
+    )
+
+    assert "e.speed > 20" in str(store.why_not("run#3", text))
+    explained = store.find(text).explain()
+    assert "optional match" in explained
+    assert "with each e, count(v) AS n\n  where (n > 1)" in explained
+
+
+def test_a_monitor_refuses_parts() -> None:
+    with pytest.raises(QueryError, match="a monitor tells when a pattern is there"):
+        Monitor("MATCH (e:Ego) OPTIONAL MATCH (v:Car)")
