@@ -26,7 +26,7 @@ help:
 	@echo "make soak    one writer and eight readers on one store for ten minutes"
 	@echo "make pyg     PyTorch Geometric reads what is exported for it, and a small network learns from it (downloads torch)"
 	@echo "make viewers  Rerun's reader looks at what is exported for it (downloads Rerun)"
-	@echo "make maps    the package lanelet2 beside what we make of its example map (downloads it)"
+	@echo "make maps    the package lanelet2 and SUMO beside what we make of their maps and recordings (downloads both)"
 	@echo "make oracle  100,000 random patterns and formulas against exhaustive search, 12,000 pairs of graphs against networkx (hours)"
 	@echo "make cluster  1,000 random questions of collections; S3, Ray, Spark, and faults of all (an hour; installs ray, pyspark, obstore, moto)"
 	@echo "make duckdb-versions  every construct of the language under DuckDB 1.5 and 2.0: equal answers (minutes)"
@@ -86,7 +86,7 @@ EDGES := commonroad coverage coverage_docs derive derive_using like locks select
   draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap export_scenarios export_rerun export_viewers exports exports_docs timeline \
   assistant notebook carla_live collection collection_landing collection_ray collection_remote collection_spark importing junit lang_sgl pytest_plugin record sample \
   docs_house docs_queries lang_docs packaging views_page library cookbook textmate tck \
-  lanelet2 autoware fuzz mutants serve report parts sandbox_pool
+  lanelet2 autoware sumo fuzz mutants serve report parts sandbox_pool
 tests-of = $(foreach name,$(1),tests/test_$(name).py)
 
 # A file of tests at a time in each process: what its tests share is made once. The longest come first
@@ -151,8 +151,9 @@ viewers: $(VENV)/.base
 # Likewise: readers of maps and simulators, each the oracle of what we read of it.
 maps: $(VENV)/.base
 	@test -x build/maps/bin/python || $(BIN)/python -m venv build/maps || $(BIN)/python -m virtualenv -q build/maps
-	@build/maps/bin/python -m pip install -q --disable-pip-version-check -e . lanelet2==1.2.3
+	@build/maps/bin/python -m pip install -q --disable-pip-version-check -e . lanelet2==1.2.3 eclipse-sumo==1.28.0 libsumo==1.28.0
 	build/maps/bin/python tests/oracle_lanelet2.py
+	build/maps/bin/python tests/oracle_sumo.py
 
 # Files of tests that try more where SGSTORE_LONG is set (tests/thorough.py).
 LONG := collection collection_landing collection_ray commonroad collection_spark temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \

@@ -11,6 +11,7 @@ from sgstore.lanelet2 import lanelet2_text, read_projector_info
 from sgstore.mcap import Loss
 from sgstore.opendrive import SIGNS, read_map
 from sgstore.roads import OF_LANES
+from sgstore.sumo_net import is_sumo_net, sumo_net_text
 
 if TYPE_CHECKING:
     from sgstore.config import Signs
@@ -40,7 +41,7 @@ _ENCODING: Final = re.compile(rb"""\s*<\?xml[^>]{0,100}\sencoding=["']([A-Za-z0-
 
 
 def read_map_file(path: str | Path, signs: Signs = SIGNS) -> RoadMap:
-    """The road map in an OpenDRIVE or Lanelet2 file; ``signs`` as in :func:`sgstore.opendrive.read_map`.
+    """The road map in an OpenDRIVE, Lanelet2 or SUMO file; ``signs`` as in :func:`sgstore.opendrive.read_map`.
 
     Points of a Lanelet2 map lie where ``local_x`` and ``local_y`` say. Else ``map_projector_info.yaml`` beside
     it tells how latitude and longitude become metres, as Autoware has it; else they are those of UTM.
@@ -61,6 +62,8 @@ def read_map_file(path: str | Path, signs: Signs = SIGNS) -> RoadMap:
     try:
         if _LANELETS.search(text[:_LOOKED_AT]):
             text = lanelet2_text(text, _projection(path.with_name(PROJECTOR_INFO)))
+        elif is_sumo_net(text):
+            text = sumo_net_text(text)
         return read_map(text, path.name, signs)
     except MapError as error:
         raise MapError(f"{path}: {error}") from error

@@ -98,6 +98,7 @@ READERS: Final = Registry(
         autoware="autoware._trace:AutowareTrace",
         foxglove="foxglove._trace:FoxgloveTrace",
         commonroad="commonroad._trace:CommonRoadTrace",
+        sumo="sumo._trace:SumoTrace",
     ),
     "flavour",
 )

@@ -38,6 +38,7 @@ import commonroad_scenarios
 import fuzz_texts
 import numpy as np
 import recordings
+import sumo_recordings
 import zstandard
 from foxglove_scenes import SceneRecorder, cube
 from mcap.reader import make_reader
@@ -172,6 +173,7 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     "carla": lambda path: carla_recordings.drive(path, FRAMES, everything=True),
     "autoware": lambda path: autoware_recordings.drive(path, FRAMES),
     "commonroad": commonroad,
+    "sumo": lambda path: sumo_recordings.as_mcap(path, sumo_recordings.drive(FRAMES)),
 }
 FLAVOURS = [*WRITERS, ".osi", ".osi.zst", ".xml"]
 """Flavours of recordings."""

@@ -19,6 +19,7 @@ import commonroad_scenarios
 import numpy as np
 import pytest
 import recordings
+import sumo_recordings
 from foxglove_scenes import SceneRecorder, cube
 from mcap.reader import make_reader
 from opendrive_maps import a_map, a_road, line
@@ -88,8 +89,9 @@ EXAMPLES = {
     "foxglove protobuf": lambda path: scene(path, "protobuf"),
     "foxglove json": lambda path: scene(path, "json"),
     "commonroad": steps,
+    "sumo": lambda path: sumo_recordings.as_mcap(path, sumo_recordings.drive(25)),
 }
-NO_EGO = {"commonroad"}
+NO_EGO = {"commonroad", "sumo"}
 """Flavours that tell nobody to be the ego."""
 
 
@@ -530,7 +532,7 @@ def test_a_flavour_that_cannot_be_loaded_is_named_only_where_it_is_needed(
 def test_what_nobody_reads_is_answered_with_the_flavours_there_are(tmp_path: Path) -> None:
     with pytest.raises(
         TraceError,
-        match=r"flavour known \(osi, carla, autoware, foxglove, commonroad\).*'world' \(toybox",
+        match=r"flavour known \(osi, carla, autoware, foxglove, commonroad, sumo\).*'world' \(toybox",
     ):
         open_trace(toybox(tmp_path / "toys.mcap"))
 

@@ -35,7 +35,7 @@ from sgstore.exporters._clips import ChannelCount, WrittenClip, clip_name, tool
 from sgstore.exporters._layout import LAYOUT, layout
 from sgstore.exporters._mcap_graphs import GRAPH, SCENE, Added, is_added
 from sgstore.files import working_folder
-from sgstore.mcap import CLIP, HEAD, READ_ERRORS, Loss, McapFile, digest_of, near
+from sgstore.mcap import CLIP, HEAD, READ_ERRORS, Loss, digest_of, near
 from sgstore.readers import open_recording
 from sgstore.world import Clip, TraceReport, tolerance_ns
 
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
     from sgstore.exporters._labels import Export
     from sgstore.exporters._mcap_graphs import ClipMessage
-    from sgstore.readers import CommonRoadFile, OsiFile
+    from sgstore.readers import RecordingFile
     from sgstore.store import StoredTrace
     from sgstore.world import MessageRefs
 
@@ -121,9 +121,7 @@ class _Surveyed:
     losses: list[Loss] = field(default_factory=list[Loss])
 
 
-def _survey(
-    recording: McapFile | OsiFile | CommonRoadFile, trace: StoredTrace, context: MessageRefs
-) -> _Surveyed:
+def _survey(recording: RecordingFile, trace: StoredTrace, context: MessageRefs) -> _Surveyed:
     digest = digest_of(trace.path)
     if trace.digest and digest != trace.digest:
         raise ExportError(f"{trace.path}: the file has changed since it was ingested")
@@ -174,7 +172,7 @@ class _Cutting:
 
     def __init__(
         self,
-        recording: McapFile | OsiFile | CommonRoadFile,
+        recording: RecordingFile,
         source: _Surveyed,
         clip: Clip,
         told: dict[str, str],

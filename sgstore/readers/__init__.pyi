@@ -16,6 +16,7 @@ from ._media import read_carried as read_carried
 from ._media import record_reader as record_reader
 from ._registry import ENDINGS as ENDINGS
 from ._registry import READERS as READERS
+from ._registry import RecordingFile as RecordingFile
 from ._registry import RecordingReader as RecordingReader
 from ._registry import is_recording as is_recording
 from ._registry import on_map as on_map
@@ -56,6 +57,7 @@ __all__ = [
     "OsiFile",
     "POSE",
     "READERS",
+    "RecordingFile",
     "RecordingReader",
     "Sensor",
     "SensorCloud",

@@ -710,8 +710,8 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
         ego, _ = self._known.get(self._ego or frame.ego, (-1, None))
         self._has_ego |= ego in moving
         rows = [*moving.values(), *self._late.values()]
-        numbers = np.array([e.numbers for e in rows], np.float64).reshape(len(rows), -1)
-        values = numbers[:, : len(POSE)].copy() if rows else np.zeros((0, len(POSE)))
+        values = np.array([e.numbers[: len(POSE)] for e in rows], np.float64)
+        values = values.reshape(len(rows), len(POSE))
         values[len(moving) :, _MOTION] = np.nan_to_num(values[len(moving) :, _MOTION])
         return FrameRows(
             frame.time_ns,

@@ -21,6 +21,8 @@ from sgstore.readers.commonroad._file import read_messages as _read_scenario_mes
 from sgstore.readers.osi._file import ENDINGS as _OSI_ENDINGS
 from sgstore.readers.osi._file import OsiFile
 from sgstore.readers.osi._file import read_message as _read_osi_message
+from sgstore.readers.sumo._file import SumoFile, is_fcd
+from sgstore.readers.sumo._file import read_messages as _read_steps
 from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
@@ -33,6 +35,10 @@ if TYPE_CHECKING:
 
 ENDINGS: Final = (".mcap", *_OSI_ENDINGS, *_SCENARIO_ENDINGS)
 """How the names of recordings end, where a folder is searched for them; see :func:`is_recording`."""
+
+
+RecordingFile = McapFile | OsiFile | CommonRoadFile | SumoFile
+"""A file of messages, whatever it is."""
 
 
 class RecordingReader(Protocol):
@@ -70,13 +76,14 @@ def readers() -> Iterator[RecordingReader]:
 def is_recording(path: Path) -> bool:
     """Return whether a file in a folder is a recording, by its name; of an XML file by its beginning, too."""
     name = path.name.lower()
-    return name.endswith(ENDINGS) and (not name.endswith(_SCENARIO_ENDINGS) or is_scenario(path))
+    xml = name.endswith(_SCENARIO_ENDINGS)
+    return name.endswith(ENDINGS) and (not xml or is_scenario(path) or is_fcd(path))
 
 
-def open_recording(path: str | Path) -> McapFile | OsiFile | CommonRoadFile:
+def open_recording(path: str | Path) -> RecordingFile:
     """A file of messages: MCAP by how it begins, a single-channel OSI file by how its name ends.
 
-    A CommonRoad scenario, which is one XML document, is told as messages.
+    A CommonRoad scenario or SUMO's floating-car data, each of which is one XML document, is told as messages.
 
     Raises
     ------
@@ -86,6 +93,8 @@ def open_recording(path: str | Path) -> McapFile | OsiFile | CommonRoadFile:
     path = Path(path)
     if is_scenario(path):
         return CommonRoadFile(path)
+    if is_fcd(path):
+        return SumoFile(path)
     return OsiFile(path) if _is_single_channel(path) else McapFile(path)
 
 
@@ -186,6 +195,9 @@ def read_messages(
     """
     if is_scenario(path):
         yield from _read_scenario_messages(path, ((at, length) for _, at, length in places))
+        return
+    if is_fcd(path):
+        yield from _read_steps(path, ((at, length) for _, at, length in places))
         return
     if not _is_single_channel(path):
         yield from messages_at(path, places)

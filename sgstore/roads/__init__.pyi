@@ -5,6 +5,7 @@ from ._drawn import drawn_outlines as drawn_outlines
 from ._lanes import Sections as Sections
 from ._lanes import run_of as run_of
 from ._lane_lines import END as END
+from ._lane_lines import MAX_LANES as MAX_LANES
 from ._lane_lines import MAX_POINTS as MAX_POINTS
 from ._lane_lines import START as START
 from ._lane_lines import Area as Area
@@ -25,6 +26,7 @@ from ._lanes import Edge as Edge
 from ._lanes import PlainLane as PlainLane
 from ._lanes import PlainCrosswalk as PlainCrosswalk
 from ._lanes import PlainSignal as PlainSignal
+from ._lanes import cross_sections as cross_sections
 from ._lanes import edges_of as edges_of
 from ._lanes import painted_across as painted_across
 from ._lanes import plain_nodes as plain_nodes
@@ -61,6 +63,7 @@ __all__ = [
     "LaneHits",
     "LaneLine",
     "LanePoints",
+    "MAX_LANES",
     "MAX_NAME",
     "MAX_POINTS",
     "MapEdges",
@@ -78,6 +81,7 @@ __all__ = [
     "Sections",
     "about_lanes",
     "conflicts",
+    "cross_sections",
     "edges_of",
     "first_sections",
     "is_lane_text",

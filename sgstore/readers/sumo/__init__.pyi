@@ -1,0 +1,3 @@
+# The face of this package: what others may import from it.
+
+__all__ = []

@@ -1,0 +1,227 @@
+"""Files of SUMO's floating-car data (``--fcd-output``) in the words of an MCAP file: a message for each step.
+
+The file is one XML document, of any length. It is read piece by piece, and cut where a time step begins and
+ends; what is in one is understood by whoever reads the message. A step that is larger than a bound, and what
+stands behind a cut, is a loss.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final, Self
+
+import numpy as np
+from mcap.records import Channel, Schema
+
+from sgstore.errors import TraceError
+from sgstore.mcap import MESSAGE_HEAD, RUN_MESSAGES, Findings, Loss, Messages, open_regular
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from pathlib import Path
+    from typing import BinaryIO
+
+    from mcap.records import Metadata
+
+    from sgstore.mcap import RecordPlace
+
+STEP: Final = "sumo.Timestep"
+"""Schema of the messages."""
+MAX_STEP: Final = 64 << 20
+"""Greatest size of a time step; bytes. One of 100,000 vehicles takes 20 MB."""
+
+_ENDING: Final = ".xml"
+_CHANNEL: Final = 1
+_PIECE: Final = 1 << 20
+_HEAD: Final = 1 << 16
+_RUN_BYTES: Final = 1 << 20
+_BEGIN: Final = re.compile(rb"<timestep\b[^>]{0,1000}?(/?)>")
+_TIME: Final = re.compile(rb"""\stime\s*=\s*["']([0-9.:eE+-]{1,40})["']""")
+_CLOSE: Final = b"</timestep>"
+
+
+def is_fcd(path: Path) -> bool:
+    """Return whether a file is floating-car data of SUMO, by its name and its first element."""
+    if not path.name.lower().endswith(_ENDING):
+        return False
+    try:
+        with path.open("rb") as file:
+            return b"<fcd-export" in file.read(_HEAD)
+    except OSError:
+        return False
+
+
+def time_ns(step: bytes) -> int | None:
+    """The time of a time step; ns. ``None``: it tells none. SUMO writes seconds, or as an option ``h:m:s``."""
+    found = _TIME.search(step[:1000])
+    if found is None:
+        return None
+    seconds = 0.0
+    try:
+        for part in found[1].decode().split(":"):
+            seconds = seconds * 60 + float(part)
+    except ValueError:
+        return None
+    return round(seconds * 1e9) if abs(seconds) < 1e9 else None
+
+
+class SumoFile:
+    """Floating-car data, read once or more often, in the words of an MCAP file.
+
+    Parameters
+    ----------
+    path : Path
+
+    Attributes
+    ----------
+    path, size, mtime_ns
+        The file, its size in bytes, its time of change.
+    schemas, channels : dict
+        One channel, ``/sumo/fcd``, with its schema.
+    counts : None
+        How many steps there are is known when they were read.
+    window : tuple of int
+        All log times there are.
+    profile, compression : str
+    metadata, attachments
+        What an MCAP file that holds the same has: no profile, zstd, nothing beside the messages.
+
+    Raises
+    ------
+    TraceError
+        The file cannot be opened.
+    """
+
+    window = (0, (1 << 63) - 1)
+    profile, compression = "", "zstd"
+    counts = None
+    metadata: Final[Mapping[RecordPlace, Metadata]] = MappingProxyType({})
+    attachments: tuple[RecordPlace, ...] = ()
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = open_regular(path)
+        status = os.fstat(self._file.fileno())
+        self.size, self.mtime_ns = status.st_size, status.st_mtime_ns
+        self.schemas = {_CHANNEL: Schema(id=_CHANNEL, data=b"", encoding="", name=STEP)}
+        self.channels = {
+            _CHANNEL: Channel(
+                id=_CHANNEL,
+                topic="/sumo/fcd",
+                message_encoding="xml",
+                metadata={},
+                schema_id=_CHANNEL,
+            )
+        }
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def pieces(self, place: RecordPlace) -> Iterator[memoryview]:
+        """The bytes of an attachment; there are none."""
+        del place
+        return iter(())
+
+    def walk(
+        self,
+        report: Findings,
+        wanted: Callable[[int], bool] | None = None,
+        keep: Callable[[int], bool] | None = None,
+    ) -> Iterator[Messages]:
+        """All time steps, in order; what cannot be used goes to ``report``.
+
+        ``offset`` of a message is its place in the file.
+        """
+        del keep
+        if wanted is not None and not wanted(-1):
+            return
+        held: list[tuple[int, int, bytes]] = []
+        size = number = 0
+        for place, data in _steps(self._file, report):
+            time = time_ns(data)
+            if time is None or time < 0:
+                report.lose(Loss("a time step without a time", bytes=len(data)))
+                continue
+            held.append((place, time, data))
+            size += len(data)
+            if size > _RUN_BYTES or len(held) >= RUN_MESSAGES:
+                yield _messages(held, number)
+                number, held, size = number + len(held), [], 0
+        if held:
+            yield _messages(held, number)
+
+
+def read_messages(path: Path, places: Iterable[tuple[int, int]]) -> Iterator[bytes]:
+    """The data of time steps of a file: (offset, length) of each, as :meth:`SumoFile.walk` tells them.
+
+    Raises
+    ------
+    TraceError
+        The file cannot be read, or there is no step of that length there: the file was replaced.
+    """
+    with open_regular(path) as file:
+        for offset, length in places:
+            file.seek(max(offset, 0))
+            data = file.read(length) if 0 < length <= MAX_STEP and offset >= 0 else b""
+            if len(data) != length or not data.startswith(b"<timestep"):
+                reason = f"no time step of {length} bytes at {offset} there: the file was replaced"
+                raise TraceError(reason, path=path)
+            yield data
+
+
+def _messages(held: list[tuple[int, int, bytes]], number: int) -> Messages:
+    data = {place: step for place, _, step in held}
+    times = [time for _, time, _ in held]
+    return Messages(
+        chunk_offset=-1,
+        channel=np.full(len(held), _CHANNEL, np.int64),
+        sequence=number + np.arange(len(held)),
+        log_time_ns=np.array(times, np.int64),
+        publish_time_ns=np.array(times, np.uint64),
+        offset=np.array([*data], np.int64),
+        length=np.array([len(step) for step in data.values()], np.int64),
+        read=lambda at, _length: memoryview(data[at - MESSAGE_HEAD.itemsize]),
+    )
+
+
+def _steps(file: BinaryIO, report: Findings) -> Iterator[tuple[int, bytes]]:
+    """Place and bytes of each time step, from its tag to its end."""
+    file.seek(0)
+    rest, place = b"", 0  # what was read and not used, and where it begins in the file
+    while True:
+        piece = file.read(_PIECE)
+        rest += piece
+        used = 0
+        while (begin := _BEGIN.search(rest, used)) is not None:
+            stop = begin.end()
+            if not begin[1]:
+                close = rest.find(_CLOSE, stop)
+                if close < 0:
+                    break
+                stop = close + len(_CLOSE)
+            yield place + begin.start(), rest[begin.start() : stop]
+            used = stop
+        if not piece:
+            left = rest[used:]
+            if b"<timestep" in left:
+                report.lose(Loss("the file ends inside a time step", bytes=len(left)))
+            elif b"</fcd-export>" not in left:
+                report.lose(Loss("the file ends before its last element does", bytes=0))
+            return
+        if begin is None:
+            used = max(used, len(rest) - 1100)  # a tag may be cut
+        elif len(rest) - begin.start() > MAX_STEP:
+            report.lose(Loss(f"a time step larger than {MAX_STEP:,} bytes", bytes=len(rest)))
+            used = len(rest)
+        else:
+            used = begin.start()
+        rest, place = rest[used:], place + used

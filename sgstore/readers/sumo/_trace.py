@@ -1,0 +1,159 @@
+"""SUMO's floating-car data: ``sumo --fcd-output drive.fcd.xml``.
+
+A frame is a time step, at its own time. SUMO tells where the middle of the front bumper is, and a direction
+clockwise from north; our position is the middle of the box. How large a vehicle is stands in no step: it is
+what SUMO takes for its kind, unless attributes ``length``, ``width`` and ``height`` tell it. What a vehicle is,
+is told by the name of its type.
+
+Source: SUMO documentation, "FCDOutput", "Vehicle Type Parameter Defaults" and "Vehicle Signaling" (Eclipse,
+EPL-2.0).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, ClassVar, Final
+
+from sgstore.markup import MarkupError, MarkupParser
+from sgstore.readers._base import FramesTrace, TraceMessage
+from sgstore.readers.sumo._file import STEP, time_ns
+from sgstore.step import Frame
+from sgstore.vocabulary import TypeMeaning, type_meanings
+
+if TYPE_CHECKING:
+    from sgstore.world import Channel
+
+MAX_ENTITIES: Final = 1_000_000
+
+SIZES: Final = {
+    "car": (5.0, 1.8, 1.5),
+    "van": (6.5, 2.16, 2.86),
+    "truck": (7.1, 2.4, 2.4),
+    "trailer": (16.5, 2.55, 4.0),
+    "bus": (12.0, 2.5, 3.4),
+    "motorcycle": (2.2, 0.9, 1.5),
+    "bicycle": (1.6, 0.65, 1.7),
+    "train": (22.0, 2.4, 3.2),
+    "person": (0.215, 0.478, 1.719),
+}
+"""Length, width and height that SUMO takes for vehicles of a kind; m."""
+
+_WORDS: Final = (
+    *((word, "person") for word in ("pedestrian", "pedtype", "person", "walker")),
+    *((word, "motorcycle") for word in ("motorcycle", "moped", "motorbike")),
+    *((word, "bicycle") for word in ("bicycle", "bike", "cycl")),
+    *((word, "trailer") for word in ("trailer", "semitrailer")),
+    *((word, "truck") for word in ("truck", "lorry", "hgv")),
+    *((word, "bus") for word in ("bus", "coach")),
+    *((word, "train") for word in ("tram", "rail", "train", "subway")),
+    *((word, "van") for word in ("delivery", "van")),
+    *((word, "car") for word in ("passenger", "taxi", "car", "default_vehtype", "vehtype")),
+)
+"""Parts of names of types → kinds, the first that fits."""
+_SIGNALS: Final = {"light_right": 0x1, "light_left": 0x2, "light_brake": 0x8}
+_BACK: Final = 0x80
+_SPECIAL: Final = (("emergency", "emergency"), ("police", "emergency"), ("taxi", "taxi"))
+
+
+def meaning_of(type_name: str, *, walks: bool) -> TypeMeaning:
+    """Meaning of a type: that which the vocabulary has, else by words in its name."""
+    name = type_name.lower().partition("@")[0]
+    known = type_meanings().get(name)
+    if known is not None:
+        return known
+    special = next((what for word, what in _SPECIAL if word in name), "")
+    if walks:
+        return TypeMeaning("person")
+    found = next((kind for word, kind in _WORDS if word in name), "vehicle")
+    return TypeMeaning("car" if found == "vehicle" and special else found, special)
+
+
+class SumoTrace(FramesTrace):
+    """Floating-car data of SUMO. Nobody is the ego unless ``ego`` names a vehicle."""
+
+    name: ClassVar[str] = "sumo"
+
+    @staticmethod
+    def role(channel: Channel) -> str:
+        """Return the role of a channel."""
+        return "ground_truth" if channel.schema == STEP else "payload"
+
+    def frame(self, message: TraceMessage) -> Frame:
+        """Return the frame that a time step tells."""
+        time = time_ns(message.data)
+        frame = Frame(message.log_time_ns if time is None else time)
+        step = _TimeStep(frame)
+        try:
+            parser = MarkupParser(step.start, step.end, most=MAX_ENTITIES, whose="recordings")
+            parser.feed(message.data, last=True)
+        except MarkupError as error:
+            raise ValueError(str(error)) from error
+        return frame
+
+
+class _TimeStep:
+    """Handler of events of XML: vehicles, persons and containers become entities of a frame."""
+
+    def __init__(self, frame: Frame) -> None:
+        self._frame = frame
+        self._idents: set[str] = set()
+
+    def start(self, tag: str, told: dict[str, str]) -> None:
+        """An element starts."""
+        if tag not in {"vehicle", "person", "container"} or "x" not in told:
+            return
+        ident = told["id"]
+        while ident in self._idents:  # SUMO has vehicles and persons of one name
+            ident = f"{tag} {ident}"
+        self._idents.add(ident)
+        walks = tag == "person"
+        type_name = told.get("type", "")
+        meaning = (
+            TypeMeaning("prop", "", tag)
+            if tag == "container"
+            else meaning_of(type_name, walks=walks)
+        )
+        size = SIZES.get(meaning.kind, (math.nan,) * 3)
+        length = _number(told, "length", size[0])
+        width, height = _number(told, "width", size[1]), _number(told, "height", size[2])
+        heading = math.radians(90.0 - _number(told, "angle"))
+        ahead = (math.cos(heading), math.sin(heading))
+        back = 0.0 if math.isnan(length + heading) else length / 2
+        speed, push = _number(told, "speed"), _number(told, "acceleration")
+        # SUMO does not let vehicles slide: they move where they look to. Of a lane change it knows no more.
+        way = ahead if math.isfinite(heading) else (math.nan, math.nan)
+        self._frame.add(
+            ident,
+            meaning.kind,
+            float(told["x"]) - back * (ahead[0] if back else 0.0),
+            float(told["y"]) - back * (ahead[1] if back else 0.0),
+            _number(told, "z", 0.0) + (0.0 if math.isnan(height) else height / 2),
+            heading=math.degrees(heading),
+            length=length,
+            width=width,
+            height=height,
+            vx=speed * way[0],
+            vy=speed * way[1],
+            ax=push * way[0],
+            ay=push * way[1],
+            lights=_lights(told),
+            special=meaning.special,
+            subkind=meaning.subkind,
+            type_name=type_name,
+        )
+
+    def end(self, _tag: str) -> None:
+        """An element ends."""
+
+
+def _lights(told: dict[str, str]) -> list[str] | None:
+    """Lights that are on, where ``--fcd-output.signals`` tells them."""
+    if "signals" not in told:
+        return None
+    mask = int(told["signals"])
+    lit = [name for name, bit in _SIGNALS.items() if mask & bit]
+    return [*lit, "light_reverse"] if mask & _BACK else lit
+
+
+def _number(told: dict[str, str], key: str, otherwise: float = math.nan) -> float:
+    return float(told[key]) if key in told else otherwise

@@ -1,0 +1,157 @@
+"""SUMO's floating-car data and networks; ``oracle_sumo.py`` compares them with SUMO itself."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from carla_recordings import idents, kinds, read, reasons, states
+from sumo_recordings import NET, drive, export, step, vehicle
+from test_lanelet2 import edges, row_of
+
+import sgstore
+from sgstore.errors import MapError, TraceError
+from sgstore.ingest import recordings
+from sgstore.map_files import read_map_file
+from sgstore.readers import open_trace, read_message
+from sgstore.readers.sumo import _file
+from sgstore.sumo_net import sumo_net_text
+from sgstore.vocabulary import VEHICLE_LIGHTS
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def told(frame: dict[str, Any], ident: str, *names: str) -> list[float]:
+    return [round(float(frame[ident][name]), 6) for name in names]
+
+
+def test_steps_are_frames_with_the_middles_of_boxes_behind_the_bumpers(tmp_path: Path) -> None:
+    info, blocks, report = read(written(tmp_path / "drive.fcd.xml", drive(30)))
+
+    frames = states(blocks)
+    assert (info.flavour, info.ego, len(frames), report.losses) == ("sumo", "", 30, [])
+    assert kinds(blocks) == {"car": "car", "bus": "bus", "ped": "person"}
+    assert told(frames[3], "car", "x", "y", "heading", "vx", "vy", "length") == [
+        *(20.5, -4.8, 0.0, 10.0, 0.0, 5.0)
+    ]
+    assert told(frames[3], "bus", "x", "heading", "vx") == [53.0, round(-math.pi, 6), -10.0]
+    assert told(frames[3], "ped", "y", "vy") == [round(-7.37 - 0.215 / 2, 6), 0.1]
+    assert blocks[0].time_ns[:2].tolist() == [0, 100_000_000]
+
+
+def test_what_a_step_tells_beyond_places_is_taken(tmp_path: Path) -> None:
+    things = (
+        vehicle("a", 1, 1, acceleration=-2.0, signals=0x2 | 0x8, z=4.0, length=4.0, height=2.0),
+        vehicle("a", 5, 5, tag="person", type="ped"),
+        vehicle("p", 9, 9, type="police@dist"),
+        vehicle("b", 9, 1, tag="container"),
+        vehicle("lorry1", 20, 1, type="my_lorry"),
+    )
+    path = written(tmp_path / "one.xml", export(step(7, *things), step(8)))
+
+    _, blocks, _ = read(path)
+
+    frame, empty = states(blocks)
+    assert kinds(blocks) == {
+        "a": "car",
+        "person a": "person",
+        "p": "car",
+        "b": "prop",
+        "lorry1": "truck",
+    }
+    assert told(frame, "a", "x", "z", "ax") == [-1.0, 5.0, -2.0]
+    lit = {n for i, n in enumerate(VEHICLE_LIGHTS) if frame["a"]["lights"] >> i & 1}
+    assert lit == {"light_left", "light_brake"}
+    assert empty == {}
+
+
+def test_a_long_file_is_read_in_pieces_and_a_step_is_found_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = written(tmp_path / "drive.xml", drive(40))
+    whole = read(path)
+    monkeypatch.setattr(_file, "_PIECE", 77)
+    monkeypatch.setattr(_file, "_RUN_BYTES", 900)
+
+    pieces = read(path)
+
+    assert idents(pieces[1]) == idents(whole[1])
+    assert [told(f, "car", "x") for f in states(pieces[1])] == [[17.5 + i] for i in range(40)]
+    refs = whole[1][0].messages
+    place = {"chunk_offset": -1, "offset": int(refs.offset[5]), "length": int(refs.length[5])}
+    assert read_message(path, **place).startswith(b'<timestep time="0.50">')
+    with pytest.raises(TraceError, match="the file was replaced"):
+        read_message(path, **{**place, "offset": 3})
+
+
+def test_a_file_that_is_cut_keeps_its_whole_steps_and_says_so(tmp_path: Path) -> None:
+    text = drive(9)
+    cut = written(tmp_path / "cut.xml", text[: text.index('time="0.60"') + 90])
+    odd = written(
+        tmp_path / "odd.xml", export(step(0, vehicle("a", 1, 1)), "<timestep><x/></timestep>")
+    )
+
+    assert read(cut)[2].frames == 6
+    assert "ends inside a time step" in reasons(read(cut)[2])
+    assert "without a time" in reasons(read(odd)[2])
+
+
+def test_a_folder_has_recordings_of_sumo_but_not_its_other_files(tmp_path: Path) -> None:
+    fcd = written(tmp_path / "drive.xml", drive(3))
+    written(tmp_path / "town.net.xml", NET)
+    written(tmp_path / "routes.xml", "<routes/>")
+
+    assert recordings([tmp_path]) == [fcd]
+
+
+def test_a_network_is_a_road_map(tmp_path: Path) -> None:
+    road_map = read_map_file(written(tmp_path / "town.net.xml", NET))
+
+    nodes = road_map.nodes
+    assert edges(road_map, "travelsTo") == {
+        *(("A_1", ":J_0_0"), (":J_0_0", "C_0"), ("A_2", ":J_1_0"), (":J_1_0", "D_0"))
+    }
+    assert {("A_2", "A_1"), ("A_1", "A_0")} <= edges(road_map, "toLeftOf")
+    assert ("A_2", "B_0") in edges(road_map, "opposes")
+    assert edges(road_map, "laneChange") == {("A_1", "A_2"), ("A_2", "A_1")}
+    types = {name: kind for name, kind in zip(nodes.name, nodes.lane_type, strict=True) if kind}
+    assert (types["A_0"], types["A_1"], types["B_0"]) == ("sidewalk", "driving", "bus")
+    assert nodes.speed_limit[row_of(road_map, "A_1", "lane")] == 13.89
+    assert nodes.junction[row_of(road_map, ":J_1_0", "lane")] == "J"
+    crossing = row_of(road_map, ":J_c0_0", "crosswalk")
+    assert road_map.outlines()[crossing].bounds == (94.0, -8.0, 98.0, 1.0)
+    assert edges(road_map, "controlsTrafficOf") == {("J", ":J_0_0"), ("J", ":J_1_0")}
+    assert road_map.warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("<net ", "not XML"),
+        ("<net/>", "without lanes"),
+        ("<routes/>", "expected <net>"),
+        (NET.replace("<net ", "<!DOCTYPE net []><net "), "document type declaration"),
+    ],
+)
+def test_what_is_no_network_is_refused(text: str, reason: str) -> None:
+    with pytest.raises(MapError, match=reason):
+        sumo_net_text(text)
+
+
+def test_a_drive_and_its_network_make_scene_graphs(tmp_path: Path) -> None:
+    net = written(tmp_path / "town.net.xml", NET)
+    store = sgstore.open(tmp_path / "drives.sgstore", create=True)
+    store.ingest(written(tmp_path / "drive.xml", drive(12)), road_map=net, egos=["car"])
+
+    rows = store.find("MATCH (p:Person)-[:isIn]->(l:Lane) RETURN p.ident AS who, l.name AS lane")
+
+    assert [(row.who, row.lane) for row in rows] == [("ped", "A_0")] * 12
+    with open_trace(tmp_path / "drive.xml", ego="bus") as trace:
+        assert next(trace.blocks()).ego[0] >= 0
