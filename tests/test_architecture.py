@@ -50,7 +50,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"collection"}),
     frozenset({"demo", "locks", "notebook", "sandbox"}),
     frozenset({"coverage", "pytest_plugin"}),
-    frozenset({"assistant", "diff", "selection"}),
+    frozenset({"assistant", "criticality", "diff", "selection"}),
     frozenset({"serve"}),
     frozenset({"cli"}),
 )

@@ -324,6 +324,21 @@ def et(a: Mover, b: Mover) -> float | None:
     return None if on is None or on[1] < 0 else on[1] - on[0]
 
 
+def ttk(a: Mover, b: Mover) -> float | None:
+    (low, high), (first, last) = (shadow(box, a.heading + math.pi / 2) for box in (a, b))
+    if a.seen(b).real < 0 and last > low and high > first:
+        gap = max(shadow(a, a.heading)[0] - shadow(b, a.heading)[1], 0)
+        speed = a.along(b.velocity) - a.along(a.velocity)
+        return gap / speed - speed / (2 * 8) if speed > 0 else None
+    own, other = stay(a, b), stay(b, a)
+    if own is None or other is None or own[0] > other[1] or other[0] > own[1]:
+        return None
+    if own[1] < 0 or other[0] <= 0:
+        return None
+    short = (own[1] - other[0]) * abs(a.velocity)
+    return other[0] - math.sqrt(2 * short / 8)
+
+
 def psd(a: Mover, b: Mover) -> float | None:
     on, speed = stay(a, b), abs(a.velocity)
     if on is None or on[1] < 0 or speed <= 0.1:
@@ -395,6 +410,8 @@ DEFINITIONS: dict[str, Callable[[Mover, Mover], float | None]] = {
     "spret": spret,
     "et": et,
     "psd": psd,
+    "ttk": ttk,
+    "msd": lambda a, b: stopping(abs(a.velocity), 11.5),
     "delta_v": lambda a, b: abs((a.velocity + b.velocity) / 2 - a.velocity),
     "ci": ci,
     "rss_lon": rss_lon,
@@ -540,6 +557,28 @@ def test_the_predicted_encroachment_is_that_of_sampled_boxes_and_strips() -> Non
         assert numbers["pret"][i] == pytest.approx(wanted, abs=3 * step, nan_ok=True)
         if ends[0][1] >= 0:
             assert numbers["et"][i] == pytest.approx(ends[0][1] - ends[0][0], abs=3 * step)
+
+
+def test_who_kicks_down_in_time_has_left_when_the_other_one_comes() -> None:
+    a, b = random_movers(3000, 61)
+    numbers = PairNumbers(a, b)
+    wait, comes = numbers["ttk"], numbers["enters_b"]
+    apt = (wait > 0) & np.isnan(numbers["trail"])
+    distance = (
+        numbers["pace"] * comes + 8 * (comes - wait) ** 2 / 2
+    )  # and not before it waited so long
+    leaves = numbers["pace"] * (numbers["cross_a"] + numbers["stay_a"])
+
+    assert apt.sum() > 30
+    assert distance[apt] == pytest.approx(leaves[apt])
+    for row in np.flatnonzero(apt)[:40]:
+        when, way = comes[row], a[row, 6:8] / np.hypot(*a[row, 6:8])
+        for late, touches in ((-0.02, False), (0.02, True)):
+            went = numbers["pace"][row] * when + 8 * (when - wait[row] - late) ** 2 / 2
+            there = a[row].copy()
+            there[:2] += way * went
+            on = shapely.intersects(moved(there, np.zeros(1))[0], strip_of(b[row]))
+            assert on == touches
 
 
 def moved(box: Floats, times: Floats) -> Any:

@@ -7,10 +7,10 @@ statements, layer by layer, because DuckDB shares named columns and not repeated
 entity follows from its columns.
 
 One more number is one more entry of ``NUMBERS`` in the file of its family: ``_boxes`` has those of the view
-``pairs``; measures of criticality are in ``_encounter``, ``_following``, ``_crossing`` and ``_rss``. These look
-ahead from one moment: at constant velocity, at constant acceleration or at the worst that bounded accelerations
-can do. Expressions that numbers share stand in ``PARTS``, under the usual symbols of that literature (``v1``,
-``a2``) where it has some.
+``pairs``; measures of criticality are in ``_encounter``, ``_following``, ``_crossing``, ``_rss`` and
+``_evading``. These look ahead from one moment: at constant velocity, at constant acceleration or at the worst
+that bounded accelerations can do. Expressions that numbers share stand in ``PARTS``, under the usual symbols
+of that literature (``v1``, ``a2``) where it has some.
 """
 
 import lazy_loader

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 import sgstore.pair_numbers._boxes as boxes
 import sgstore.pair_numbers._crossing as crossing
 import sgstore.pair_numbers._encounter as encounter
+import sgstore.pair_numbers._evading as evading
 import sgstore.pair_numbers._following as following
 import sgstore.pair_numbers._rss as rss
 from sgstore.pair_numbers._ways import WAYS
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
     from sgstore.pair_numbers._declared import PairFunction
 
-_FAMILIES: Final = (boxes, encounter, following, crossing, rss)
+_FAMILIES: Final = (boxes, encounter, following, crossing, rss, evading)  # new columns come behind
 
 PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
     name: one for family in _FAMILIES for name, one in family.NUMBERS.items()

@@ -1,0 +1,119 @@
+"""Tracks of two entities, and when the footprint of one is where that of the other one is at another time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.pair_numbers import PairNumbers
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sgstore.world import Bools, Floats, Ints
+
+_BLOCK: Final = 16
+"""States that are bounded by one circle."""
+_TOGETHER: Final = 256
+"""Pairs of such circles that are looked into at once."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """States of an entity in the frames of a trace that have it.
+
+    Attributes
+    ----------
+    times : (n,) float64
+        Ascending; s.
+    states : (n, 10) float64
+        ``x, y, z, heading, length, width, vx, vy, ax, ay``, as :class:`~sgstore.pair_numbers.PairNumbers` takes
+        them.
+    """
+
+    times: Floats
+    states: Floats
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @cached_property
+    def circles(self) -> tuple[Floats, Floats, Floats]:
+        """Centre and radius of a circle around the footprints of each block of states."""
+        count = -(-len(self) // _BLOCK)
+        rows = np.minimum(np.arange(count * _BLOCK), len(self) - 1).reshape(count, _BLOCK)
+        x, y = self.states[rows, 0], self.states[rows, 1]
+        reach = np.hypot(self.states[rows, 4], self.states[rows, 5]) / 2
+        middle_x, middle_y = x.mean(axis=1), y.mean(axis=1)
+        away = np.hypot(x - middle_x[:, None], y - middle_y[:, None]) + reach
+        return middle_x, middle_y, away.max(axis=1)
+
+
+@dataclass(frozen=True)
+class Encounter:
+    """Two entities of one trace, of which a is the one that is judged.
+
+    Attributes
+    ----------
+    a, b : Track
+        Their tracks; they need not begin or end together.
+    """
+
+    a: Track
+    b: Track
+
+    @cached_property
+    def together(self) -> tuple[Ints, Ints]:
+        """Rows of a and of b in the frames that have both."""
+        _, rows_a, rows_b = np.intersect1d(
+            self.a.times, self.b.times, assume_unique=True, return_indices=True
+        )
+        return rows_a, rows_b
+
+    @property
+    def times(self) -> Floats:
+        """(T,): times of the frames that have both; s."""
+        return self.a.times[self.together[0]]
+
+    @cached_property
+    def numbers(self) -> PairNumbers:
+        """Numbers of the pair in the frames that have both."""
+        rows_a, rows_b = self.together
+        return PairNumbers(self.a.states[rows_a], self.b.states[rows_b])
+
+    @cached_property
+    def known(self) -> bool:
+        """Whether the footprints are known in every frame."""
+        return not any(np.isnan(one.states[:, [0, 1, 3, 4, 5]]).any() for one in (self.a, self.b))
+
+    def crossings(self) -> Iterator[tuple[Ints, Ints]]:
+        """Rows of a and of b whose footprints overlap or touch, each at its own time; some thousand at once."""
+        if not self.known:
+            return
+        (x1, y1, r1), (x2, y2, r2) = self.a.circles, self.b.circles
+        near = np.hypot(x1[:, None] - x2, y1[:, None] - y2) <= (r1[:, None] + r2) * (1 + 1e-9)
+        blocks_a, blocks_b = np.nonzero(near)
+        inner = np.arange(_BLOCK)
+        for start in range(0, len(blocks_a), _TOGETHER):
+            part = slice(start, start + _TOGETHER)
+            rows_a = (blocks_a[part, None] * _BLOCK + inner)[:, :, None]
+            rows_b = (blocks_b[part, None] * _BLOCK + inner)[:, None, :]
+            rows_a, rows_b = (one.ravel() for one in np.broadcast_arrays(rows_a, rows_b))
+            there = (rows_a < len(self.a)) & (rows_b < len(self.b))
+            rows_a, rows_b = rows_a[there], rows_b[there]
+            on = _touch(self.a.states[rows_a], self.b.states[rows_b])
+            yield rows_a[on], rows_b[on]
+
+
+def _touch(a: Floats, b: Floats) -> Bools:
+    """(K,): whether the boxes of each pair overlap or touch."""
+    apart = np.hypot(a[:, 0] - b[:, 0], a[:, 1] - b[:, 1])
+    reach = (np.hypot(a[:, 4], a[:, 5]) + np.hypot(b[:, 4], b[:, 5])) / 2
+    found = apart <= reach * (1 + 1e-9)
+    numbers = PairNumbers(a[found], b[found])
+    beyond = np.maximum.reduce([numbers[f"out{axis}"] for axis in (1, 2, 3, 4)])
+    found[found] = beyond <= 0
+    return found

@@ -1,0 +1,26 @@
+"""Headway as it was recorded: until a was where b is now.
+
+headway_recorded(t) (s) = min { t′ − t : t′ ≥ t, the footprint of a at t′ touches the one of b at t }. Source:
+Jansson, Collision Avoidance Theory, 2005, whose path is the recorded one here, so that it may bend.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from sgstore.criticality._encounter import Encounter
+    from sgstore.world import Floats
+
+
+def headway_recorded(of: Encounter) -> Floats:
+    """(T,): the time until a came to where b is, of each frame that has both; s. NaN: it never did."""
+    comes = np.full(len(of.b), np.inf)
+    for rows_a, rows_b in of.crossings():
+        later = of.a.times[rows_a] - of.b.times[rows_b]
+        ahead = later >= 0
+        np.minimum.at(comes, rows_b[ahead], later[ahead])
+    found = comes[of.together[1]]
+    return np.where(np.isfinite(found), found, np.nan)

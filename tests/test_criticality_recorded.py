@@ -1,0 +1,305 @@
+"""Measures of what was recorded: against frames looked at one by one, a raster, and definitions."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import shapely
+from thorough import LONG
+
+from sgstore.criticality import (
+    RECORDED,
+    Encounter,
+    Track,
+    cpi,
+    crash_probability,
+    dce_recorded,
+    encounters,
+    encroachment,
+    et_recorded,
+    headway_recorded,
+    pet,
+    recorded,
+    tet,
+    tit,
+    ttc_recorded,
+    ttce_recorded,
+)
+from sgstore.errors import ConfigError
+from sgstore.geometry import corners
+from sgstore.vocabulary import VEHICLES
+
+if TYPE_CHECKING:
+    from sgstore.query import Store
+    from sgstore.world import Floats
+
+STEP = 0.1
+
+
+def clock(frames: int) -> Floats:
+    return np.arange(frames, dtype=np.float64) * np.float64(STEP)
+
+
+def bend(rng: np.random.Generator, frames: int, **fixed: float) -> Track:
+    """A drive on an arc about the origin's surroundings, which stands for a while in some."""
+    speed, heading, turn = rng.uniform(2, 14), rng.uniform(-3, 3), rng.normal(0, 0.15)
+    times = clock(frames)
+    pace = np.where((times > 1) & (times < 1 + rng.uniform(-1, 1.5)), 0.0, speed)
+    angle = heading + turn * np.cumsum(pace) * STEP / 5
+    states = np.zeros((frames, 10))
+    for axis, way in enumerate((np.cos(angle), np.sin(angle))):
+        along = np.cumsum(pace * way) * STEP
+        states[:, axis] = along - along[frames // 2] + rng.normal(0, 3)
+        states[:, 6 + axis] = pace * way
+        states[:, 8 + axis] = np.gradient(pace * way, STEP)
+    states[:, 3] = angle
+    states[:, 4:6] = (fixed.get("length", 4.5), fixed.get("width", 1.8))
+    return Track(times, states)
+
+
+def boxes(track: Track) -> Any:
+    return shapely.polygons(corners(track.states[:, [0, 1, 3, 4, 5]]))
+
+
+def drives(count: int, seed: int, frames: int = 45) -> list[Encounter]:
+    rng = np.random.default_rng(seed)
+    found = [Encounter(bend(rng, frames), bend(rng, frames)) for _ in range(count)]
+    walker = {"length": 0.6, "width": 0.6}
+    return [*found, Encounter(bend(rng, frames), bend(rng, frames, **walker))]
+
+
+COUNT = 200 if LONG else 40
+
+
+def first(values: Any) -> float:
+    return float(values[0]) if len(values) else math.nan
+
+
+@pytest.mark.parametrize("seed", range(10 if LONG else 1))
+def test_encroachment_is_that_of_all_frames_with_all_others(seed: int) -> None:
+    kinds = {"known": 0, "unknown": 0}
+    for one in drives(COUNT, seed):
+        a, b = boxes(one.a), boxes(one.b)
+        on = shapely.intersects(a[:, None], b[None, :])
+
+        spans: list[tuple[float, float]] = []
+        for track, inside in ((one.a, on.any(axis=1)), (one.b, on.any(axis=0))):
+            rows = np.flatnonzero(inside)
+            enters = float(track.times[rows[0]]) if len(rows) and rows[0] > 0 else math.nan
+            last = rows[-1] + 1 if len(rows) else len(track)
+            leaves = float(track.times[last]) if last < len(track) else math.nan
+            spans.append((enters, leaves))
+        (enters_a, leaves_a), (enters_b, leaves_b) = spans
+        wanted = math.nan
+        if leaves_a <= enters_b:
+            wanted = enters_b - leaves_a
+        elif leaves_b <= enters_a:
+            wanted = enters_a - leaves_b
+
+        found = encroachment(one)
+        assert (found.enters_a, found.leaves_a) == pytest.approx(spans[0], nan_ok=True)
+        assert (found.enters_b, found.leaves_b) == pytest.approx(spans[1], nan_ok=True)
+        assert pet(one) == pytest.approx(wanted, nan_ok=True)
+        assert et_recorded(one) == pytest.approx(leaves_a - enters_a, nan_ok=True)
+        assert pet(Encounter(one.b, one.a)) == pytest.approx(wanted, nan_ok=True)
+        kinds["unknown" if math.isnan(wanted) else "known"] += 1
+
+    assert min(kinds.values()) > COUNT / 8
+
+
+def raster(track: Track, cell: float) -> dict[tuple[int, int], list[int]]:
+    """Cells that the footprint covers, with the frames in which it does: cell by cell, by half planes."""
+    found: dict[tuple[int, int], list[int]] = {}
+    for frame, (x, y, _, heading, length, width, *_) in enumerate(track.states.tolist()):
+        reach = math.hypot(length, width) / 2
+        low, high = ([math.floor((p + s * reach) / cell) for p in (x, y)] for s in (-1, 1))
+        i, j = np.mgrid[low[0] : high[0] + 1, low[1] : high[1] + 1]
+        dx, dy = (i + 0.5) * cell - x, (j + 0.5) * cell - y
+        along = dx * math.cos(heading) + dy * math.sin(heading)
+        across = dy * math.cos(heading) - dx * math.sin(heading)
+        on = (np.abs(along) <= length / 2) & (np.abs(across) <= width / 2)
+        for place in zip(i[on].tolist(), j[on].tolist(), strict=True):
+            found.setdefault(place, []).append(frame)
+    return found
+
+
+def test_the_post_encroachment_time_is_that_of_a_raster() -> None:
+    known = 0
+    for whole in drives(40, seed=71):
+        one = Encounter(*(Track(t.times[::2], t.states[::2]) for t in (whole.a, whole.b)))
+        cells = [raster(track, 0.1) for track in (one.a, one.b)]
+        shared = cells[0].keys() & cells[1].keys()
+        if not shared:
+            continue
+        frames = [sorted({f for place in shared for f in told[place]}) for told in cells]
+        (enters_a, leaves_a), (enters_b, leaves_b) = ((f[0], f[-1] + 1) for f in frames)
+        steps, ends = enters_b - leaves_a, (enters_b, leaves_a)
+        if steps < 0:
+            steps, ends = enters_a - leaves_b, (enters_a, leaves_b)
+        if ends[0] < 2 or ends[1] > len(one.a) - 2:
+            continue
+        # A cell's middle is on a footprint a little later than the footprint is on the cell.
+        if steps > 2:
+            assert pet(one) == pytest.approx(steps * 2 * STEP, abs=2 * 2 * STEP + 1e-9)
+            known += 1
+        elif steps < -2:
+            assert math.isnan(pet(one))
+
+    assert known > 2
+
+
+def test_one_after_the_other_over_a_crossing() -> None:
+    times = clock(100)
+
+    def straight(speed: float, start: float, heading: float) -> Track:
+        states = np.zeros((100, 10))
+        along = start + speed * times
+        states[:, 0], states[:, 1] = along * math.cos(heading), along * math.sin(heading)
+        states[:, 3:6] = heading, 4, 2
+        states[:, 6:8] = speed * math.cos(heading), speed * math.sin(heading)
+        return Track(times, states)
+
+    # The first one has its rear, 2 m behind, beyond the other's side, 1 m from the middle, after 23.05 m.
+    # The second one's front, 2 m ahead, comes to the first one's side after 46.95 m: 4.7 s.
+    one = Encounter(straight(10, -20.05, 0), straight(10, -50.05, math.pi / 2))
+
+    assert encroachment(one).leaves_a == pytest.approx(2.4)
+    assert encroachment(one).enters_b == pytest.approx(4.8)
+    assert pet(one) == pytest.approx(2.4)
+    assert et_recorded(one) == pytest.approx(2.4 - 1.8)
+    assert math.isnan(first(ttc_recorded(one)))
+
+
+def test_what_follows_is_looked_up_frame_by_frame() -> None:
+    met = 0
+    for one in drives(COUNT, seed=72):
+        a, b = boxes(one.a), boxes(one.b)
+        gap = shapely.distance(a, b)
+        on = shapely.intersects(a[:, None], b[None, :])
+        for found, wanted in (
+            (
+                ttc_recorded(one),
+                [first(np.flatnonzero(gap[t:] == 0) * STEP) for t in range(len(a))],
+            ),
+            (dce_recorded(one), [gap[t:].min() for t in range(len(a))]),
+            (ttce_recorded(one), [STEP * gap[t:].argmin() for t in range(len(a))]),
+            (
+                headway_recorded(one),
+                [first(np.flatnonzero(on[t:, t]) * STEP) for t in range(len(a))],
+            ),
+        ):
+            assert found == pytest.approx(np.array(wanted), abs=1e-9, nan_ok=True)
+        met += bool((gap == 0).any())
+
+    assert COUNT / 8 < met < COUNT
+
+
+def test_exposure_adds_up_the_time_to_collision() -> None:
+    exposed = 0
+    for one in drives(COUNT, seed=73):
+        ttc = one.numbers["ttc"].tolist()
+        low = [t for t in ttc[:-1] if t <= 2]
+
+        assert tet(one) == pytest.approx(STEP * len(low))
+        assert tit(one) == pytest.approx(STEP * sum(2 - t for t in low))
+        exposed += bool(low)
+
+    assert exposed > COUNT / 4
+
+
+def test_the_crash_potential_is_the_mean_of_what_was_drawn() -> None:
+    rng = np.random.default_rng(74)
+    drawn = rng.normal(8.45, 1.40, 400_000)
+    drawn = drawn[(drawn >= 4.23) & (drawn <= 12.68)]
+    asked = np.array([0, 4.2, 5, 7, 8.45, 10, 12, 12.7, 40, math.nan])
+
+    found = crash_probability(asked)
+
+    wanted = [(drawn < one).mean() for one in asked[:-1]]
+    assert found[:-1] == pytest.approx(np.array(wanted), abs=3e-3)
+    assert math.isnan(found[-1])
+
+
+def following(gap: Floats, speed: float, other: float) -> Encounter:
+    """One behind the other, with gaps of one's choice."""
+    frames = len(gap)
+    times, a, b = clock(frames), *np.zeros((2, frames, 10))
+    a[:, 4:6] = b[:, 4:6] = 4, 2
+    a[:, 6], b[:, 6], b[:, 0] = speed, other, gap + 4
+    return Encounter(Track(times, a), Track(times, b))
+
+
+def test_the_crash_potential_of_frames() -> None:
+    # (10 m/s)² / 2d: 10, 5 and 2.5 m/s²; touching; overlapping in another place behind
+    of = following(np.array([5.0, 10, 20, 0, -40]), 20, 10)
+
+    wanted = [*crash_probability(np.array([10.0, 5, 2.5])), 1, 0]
+    assert cpi(of) == pytest.approx(np.mean(wanted))
+    of.b.states[1, 8] = math.nan
+    fresh = Encounter(of.a, of.b)
+    assert cpi(fresh) == pytest.approx(np.mean([wanted[i] for i in (0, 2, 3, 4)]))
+
+
+def test_tracks_need_not_begin_or_end_together() -> None:
+    (one, *_) = drives(1, seed=75, frames=60)
+    part = Encounter(
+        Track(one.a.times[:40], one.a.states[:40]), Track(one.b.times[10:], one.b.states[10:])
+    )
+
+    assert part.times == pytest.approx(one.a.times[10:40])
+    assert dce_recorded(part)[0] == pytest.approx(np.min(one.numbers["gap"][10:40]))
+    on = shapely.intersects(boxes(part.a)[:, None], boxes(part.b)[None, :])
+    assert math.isnan(encroachment(part).enters_a) == (not on.any() or bool(on[0].any()))
+
+
+def test_what_has_no_size_encroaches_on_nothing_that_is_known() -> None:
+    (one, *_) = drives(1, seed=76)
+    one.b.states[:, 4] = math.nan
+
+    assert math.isnan(pet(one))
+    assert np.isnan(dce_recorded(one)).all()
+    assert np.isnan(headway_recorded(one)).all()
+
+
+def test_a_store_tells_the_measures_of_its_egos(open_town: Store) -> None:
+    table = recorded(open_town)
+
+    assert table.columns == ("trace", "src", "dst", "kind", *RECORDED)
+    sql = """SELECT trace, dst, min(gap) FROM criticality JOIN frames USING (frame_id)
+      WHERE src_is_ego GROUP BY ALL"""
+    nearest = {row[:2]: row[2] for row in open_town.sql(sql).values}
+    told = {(row["trace"], row["dst"]): row for row in table.dicts()}
+    assert len(told) > 5
+    for key, row in told.items():
+        if key in nearest:
+            assert row["dce_recorded"] == pytest.approx(nearest[key], abs=1e-6)
+    assert {row["kind"] for row in told.values()} <= {*VEHICLES, "person", "animal"}
+    (trace,) = {trace for trace, _ in told}
+    assert len([*encounters(open_town, trace)]) == len(told)
+
+
+def test_a_measure_that_is_none_is_refused(open_town: Store) -> None:
+    with pytest.raises(ConfigError, match="no recorded measure: 'ttc'; expected some of pet"):
+        recorded(open_town, ["ttc"])
+
+
+PAGE = Path(__file__).parents[1] / "docs" / "criticality.md"
+
+
+def test_the_page_lists_the_recorded_measures() -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    begin, end = "<!-- recorded, made from sgstore/criticality -->\n", "<!-- end of recorded -->"
+    rows = "".join(f"| `{name}` | {one.doc} | {one.unit} |\n" for name, one in RECORDED.items())
+    head, rest = page.split(begin)
+    table = f"| measure | is | unit |\n|---|---|---|\n{rows}"
+    expected = f"{head}{begin}{table}{end}{rest.partition(end)[2]}"
+    if os.environ.get("SGSTORE_UPDATE_GOLDEN"):
+        PAGE.write_text(expected, encoding="utf-8")
+        page = expected
+
+    assert page == expected
