@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -285,13 +285,26 @@ class _StackEntry:
 
 
 def parse(text: str) -> tuple[Statement, ...]:
-    """The statements of a text.
+    """The statements of a text; those of the last short ones are remembered.
 
     Raises
     ------
     QuerySyntaxError
         The text is not a sentence of the language.
     """
+    return _parsed_once(text) if len(text) <= _SHORT else _parsed(text)
+
+
+_SHORT: Final = 4_000
+"""Longest text whose statements are remembered; characters."""
+
+
+@lru_cache(maxsize=64)
+def _parsed_once(text: str) -> tuple[Statement, ...]:
+    return _parsed(text)
+
+
+def _parsed(text: str) -> tuple[Statement, ...]:
     if len(text) > MAX_LENGTH:
         reason = f"the text has {len(text)} characters, more than {MAX_LENGTH}"
         raise QuerySyntaxError(reason)
