@@ -72,7 +72,7 @@ class Killer(threading.Thread):
         self.killed = 0
 
     def run(self) -> None:
-        until = time.monotonic() + 60
+        until = time.monotonic() + 300  # engines may start slowly
         while time.monotonic() < until:
             marks = sorted(self.folder.iterdir())
             if len(marks) > self.number:
