@@ -7,7 +7,6 @@ stands behind a cut, is a loss.
 
 from __future__ import annotations
 
-import os
 import re
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Self
@@ -16,7 +15,15 @@ import numpy as np
 from mcap.records import Channel, Schema
 
 from sgstore.errors import TraceError
-from sgstore.mcap import MESSAGE_HEAD, RUN_MESSAGES, Findings, Loss, Messages, open_regular
+from sgstore.mcap import (
+    MESSAGE_HEAD,
+    RUN_MESSAGES,
+    Findings,
+    Loss,
+    Messages,
+    mark_of_open,
+    open_regular,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -47,9 +54,9 @@ def is_fcd(path: Path) -> bool:
     if not path.name.lower().endswith(_ENDING):
         return False
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             return b"<fcd-export" in file.read(_HEAD)
-    except OSError:
+    except (OSError, TraceError):
         return False
 
 
@@ -103,8 +110,7 @@ class SumoFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file = open_regular(path)
-        status = os.fstat(self._file.fileno())
-        self.size, self.mtime_ns = status.st_size, status.st_mtime_ns
+        self.size, self.mtime_ns = mark_of_open(self._file)
         self.schemas = {_CHANNEL: Schema(id=_CHANNEL, data=b"", encoding="", name=STEP)}
         self.channels = {
             _CHANNEL: Channel(
