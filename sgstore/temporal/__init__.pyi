@@ -12,6 +12,7 @@ from ._checks import verdict_columns as verdict_columns
 from ._checks import verdict_rows as verdict_rows
 from ._formula import Formula as Formula
 from ._matches import TemporalMatches as TemporalMatches
+from ._monitor import FrameSource as FrameSource
 from ._monitor import Monitor as Monitor
 from ._monitor import opened as opened
 from ._robustness import Robustness as Robustness
@@ -22,6 +23,7 @@ from ._signals import evaluate as evaluate
 __all__ = [
     "CheckRun",
     "Formula",
+    "FrameSource",
     "FrameTime",
     "Monitor",
     "MonitorEvent",

@@ -69,6 +69,8 @@ class FrameSource:
         What is odd; more comes while frames are read.
     losses : list of str
         What could not be read.
+    live : bool
+        Whether frames come in their time.
     """
 
     name: str
@@ -76,6 +78,7 @@ class FrameSource:
     frames: Iterator[Frame]
     warnings: list[str] = field(default_factory=list[str])
     losses: list[str] = field(default_factory=list[str])
+    live: bool = False
 
 
 @contextmanager
@@ -133,7 +136,7 @@ def _live(source: str, ego: str) -> FrameSource:
     except ValueError as error:
         raise TraceError(f"{source}: {error}; expected {LIVE}host:port") from error
     live = LiveWorld(connect(host, port).get_world(), ego)
-    told = FrameSource(live.map_name, live.road_map, iter(()))
+    told = FrameSource(live.map_name, live.road_map, iter(()), live=True)
 
     def frames() -> Iterator[Frame]:
         while True:
@@ -172,6 +175,8 @@ class Monitor:
     sgsm_compat : bool
         Whether a check is violated in each frame with which the trace, if it ended there, would violate it; as
         :meth:`sgstore.query.Store.check` has it. Nothing resets such a violation.
+    on_step : callable, optional
+        Is told of every frame, after its events: when it was, and its graphs, one for each of :attr:`egos`.
 
     Attributes
     ----------
@@ -203,11 +208,12 @@ class Monitor:
         period_s: float | None = None,
         called: str | Sequence[str] = "pattern",
         sgsm_compat: bool = False,
+        on_step: Callable[[FrameTime, Sequence[SceneGraph]], object] | None = None,
     ) -> None:
         config = config or Config()
         self.generator = SceneGraphGenerator(road_map, config)
         self.trace = trace
-        self._on_event = on_event
+        self._on_event, self._on_step = on_event, on_step
         answers = frozenset(self.generator.answers)
         reach = RelationScope.of(config.as_dict())
         catalog = Catalog(traces=(TraceFacts(0, trace, "", answers, reach),))
@@ -276,7 +282,11 @@ class Monitor:
         classed : bool
             Whether they are the last ones of :attr:`generator`, which can then be asked for their classes.
         """
-        return self._tell(*self._ask(graphs, classed=classed))
+        here, people = self._ask(graphs, classed=classed)
+        events = self._tell(here, people)
+        if self._on_step is not None:
+            self._on_step(here, graphs)
+        return events
 
     def _ask(
         self, graphs: Sequence[SceneGraph], *, classed: bool = False
@@ -320,6 +330,11 @@ class Monitor:
     def egos(self) -> tuple[str, ...]:
         """The ids of the egos whose graphs are looked at; empty: the ego of the frame."""
         return tuple(self._egos)
+
+    @property
+    def patterns(self) -> dict[str, Query]:
+        """The patterns that are looked for, by name, as they are bound."""
+        return {follow.name: follow.query for _, follow, _ in self._follows}
 
     @property
     def status(self) -> dict[str, str]:

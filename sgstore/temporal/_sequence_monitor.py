@@ -284,7 +284,7 @@ class SequenceMonitor:
     """
 
     def __init__(self, name: str, query: Query, questions: QueryCache, pulse: StreamClock) -> None:
-        self.name, self._query = name, query
+        self.name, self.query = name, query
         self._questions, self._pulse = questions, pulse
         one = BoundStep(query.scope, (), None, absent=False, span=TextSpan(0, 0))
         self._steps: Sequence[BoundStep] = query.steps or (one,)
@@ -312,7 +312,7 @@ class SequenceMonitor:
     def step(self, here: FrameTime, people: NodeNames) -> list[MonitorEvent]:
         """A frame has come, and the questions were asked of it: what is known from it on."""
         self._conditions.step()
-        gap = self._pulse.gap and self._query.gaps != "bridge"
+        gap = self._pulse.gap and self.query.gaps != "bridge"
         for number in range(len(self._steps)):
             now = self._now(number)
             held = self._held[number]
@@ -429,7 +429,7 @@ class SequenceMonitor:
                 waiting = run
             elif isinstance(ways, tuple):
                 self._told[key] = run
-                if self._query.policy == "first":
+                if self.query.policy == "first":
                     self._over.add(key)
                 yield ways
 
@@ -441,12 +441,12 @@ class SequenceMonitor:
         steps, following = self._steps, at + 1
         if following == len(steps):
             return (place,)
-        link, absent = self._query.links[at], None
+        link, absent = self.query.links[at], None
         if steps[following].absent:
             absent = self._of(following, binding) or StepState(self._pulse)
             if following + 1 == len(steps):
                 return self._unfollowed(place, link, absent)
-            link, following = self._query.links[following], following + 1
+            link, following = self.query.links[following], following + 1
         held = self._of(following, binding)
         stop = (
             next((a.number for a in absent.places if a.number > place.number), NEVER)
@@ -454,7 +454,7 @@ class SequenceMonitor:
             else NEVER
         )
         found = self._reached(place, link, held, stop)
-        latest = self._query.policy == "longest"
+        latest = self.query.policy == "longest"
         open_end = not self._closed(place, link, held, stop)
         if latest and open_end:
             return OPEN
@@ -590,11 +590,11 @@ class SequenceMonitor:
         return found, [columns.index(name) for name in common]
 
     def _kept(self, key: Key, places: list[StepFrame]) -> list[StepFrame]:
-        if not self._query.links:
+        if not self.query.links:
             return [p for p in places if p.number >= self._pulse.tick.number]
-        link, absent = self._query.links[0], self._steps[1].absent
+        link, absent = self.query.links[0], self._steps[1].absent
         open_ended = link.kind == "until" or (link.kind == "then" and link.within is None)
-        if open_ended and not absent and self._query.policy != "longest":
+        if open_ended and not absent and self.query.policy != "longest":
             # Whatever follows a later frame of a run follows its first one.
             runs: dict[int, StepFrame] = {}
             for place in places:
@@ -610,14 +610,14 @@ class SequenceMonitor:
         following = at + 1
         if following == len(self._steps):
             return False
-        link = self._query.links[at]
+        link = self.query.links[at]
         if self._steps[following].absent:
             if any(held.undecided < NEVER for _, held in self._agreeing(following, binding)):
                 return True
             following += 1
             if following == len(self._steps):
                 return not self._closed(place, replace(link, kind="then", after=None), None, NEVER)
-            link = self._query.links[at + 1]
+            link = self.query.links[at + 1]
         if not self._closed(place, link, None, NEVER):
             return True
         for key, held in self._agreeing(following, binding):
