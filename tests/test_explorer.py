@@ -180,6 +180,13 @@ def test_lanes_are_the_parts_of_the_pattern(page: Any, town_store: Path) -> None
     assert [text.lstrip("✓✗? ").strip() for text in texts] == [one.part.text for one in lanes.lanes]
     assert page.locator(".timeline .lane[data-holds=true]").count() == len(lanes.lanes)
     seen(page, "scene")
+    page.get_by_role("tab", name="neighbours").click()
+    graph = store.graph(f"town#{first.start_seq}")
+    bound = [first.values["e"], first.values["v"]]
+    met = {n for a, b, _ in graph.edges if {a, b} & {*bound} for n in (a, b)}
+    shown = page.locator("svg[aria-label=Neighbours] g rect").count()
+    assert len(bound) < shown <= len(met)
+    seen(page, "neighbours")
     page.get_by_role("button", name="Beside").click()
     expect(page.locator(".views .above canvas")).to_have_count(2)
     expect(page.locator(".views .chip")).to_have_text(["town.sgstore", "town.sgstore"])
@@ -219,8 +226,9 @@ def test_from_a_mistake_to_a_test_set(
     tag_a_frame(page, place)
     keep_what_is_ticked(page, written, place.stem)
     page.get_by_role("button", name="Compare").click()
+    page.get_by_text("Nothing differs").wait_for()
+    page.get_by_role("button", name="Tables").click()
     page.get_by_text("Frame by frame").wait_for()
-    seen(page, f"compare-{place.stem}")
 
 
 def mend_a_mistake(page: Any, query: str) -> None:
@@ -305,6 +313,25 @@ def test_names_of_recordings_stay_text(
     assert name in time_shown(page).inner_text()
     assert page.locator("img[src=x], body script:not([src])").count() == 0
     assert asked == []
+
+
+def test_what_two_queries_differ_in_is_a_gallery(page: Any, town_store: Path) -> None:
+    other = "MATCH (e:Ego)-[:near]->(v:Vehicle)"
+    search(page, NEAR)
+    page.get_by_role("button", name="Compare").click()
+    page.get_by_label("Query of B").fill(other)
+    page.get_by_label("Query of B").press("Enter")
+    store = Store(town_store)
+    a, b = ({frame.seq for frame in store.find(query).frames()} for query in (NEAR, other))
+    told = f"{len(a)} frames in A, {len(b)} in B; only in A {len(a - b)}, only in B {len(b - a)}"
+    expect(page.locator(".compare .status")).to_contain_text(told)
+    tile = page.locator(".tile[data-index^='B ']").first
+    tile.locator("canvas[data-painted]").wait_for()
+    seen(page, "compare")
+    tile.click()
+    expect(page.locator(".cm-content")).to_have_text(other)
+    seq = min(b - a)
+    expect(time_shown(page)).to_contain_text(f"town#{seq} ")
 
 
 def test_coverage_is_shown_and_a_gap_is_a_query(page: Any) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import socket
-import struct
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +15,7 @@ pytest.importorskip("httpx")
 
 import httpx
 import numpy as np
+from columns_read import unpacked
 from probes import PROBES
 from thorough import LONG
 
@@ -23,12 +23,17 @@ from sgstore.query import Store
 from sgstore.serve import Explorer, application, serve
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
     from pathlib import Path
 
 HOST = "127.0.0.1:8123"
 TOKEN = "a-token-of-the-tests"
 NEAR = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle)"
+# They take much time and little memory.
+RUNAWAY = "SELECT max((a.range * b.range) % 7) FROM range(1000000) a, range(1000000) b"
+LONG_CHECK = (
+    "CHECK x: ALWAYS NOT EXISTS {(a), (b), (c), (d) WHERE a.x + b.x + c.x + d.x > 1000000000}"
+)
 
 
 class Page:
@@ -44,6 +49,26 @@ class Page:
         async with httpx.AsyncClient(transport=transport, base_url=f"http://{HOST}") as client:
             return await client.request(method, path, headers=headers, **how)
 
+    async def leave(self, path: str, body: dict[str, Any], after: float) -> None:
+        """Ask, and go away after a while; s."""
+        headers = {"host": HOST, "cookie": f"sgstore-8123={TOKEN}"}
+        headers |= {"content-type": "application/json"}
+        raw = [(name.encode(), value.encode()) for name, value in headers.items()]
+        about = {"type": "http", "method": "POST", "path": path, "query_string": b""}
+        asgi = {"asgi": {"version": "3.0", "spec_version": "2.3"}, "http_version": "1.1"}
+        messages = [{"type": "http.request", "body": json.dumps(body).encode()}]
+
+        async def receive() -> dict[str, Any]:
+            if messages:
+                return messages.pop()
+            await asyncio.sleep(after)
+            return {"type": "http.disconnect"}
+
+        async def send(_: object) -> None:
+            pass
+
+        await self.app({**about, **asgi, "headers": raw}, receive, send)
+
     def ask(self, method: str, path: str, **how: Any) -> httpx.Response:
         return asyncio.run(self.send(method, path, **how))
 
@@ -57,20 +82,6 @@ class Page:
         found = self.post("/api/find", text=text, **body)
         assert found.status_code == 200, found.text
         return [json.loads(line) for line in found.text.splitlines()]
-
-
-def unpacked(data: bytes) -> tuple[dict[str, Any], Mapping[str, np.ndarray[Any, Any]]]:
-    """The header and the columns of bytes, read as the page reads them."""
-    length, zero = struct.unpack_from("<II", data)
-    assert zero == 0
-    header, place = json.loads(data[8 : 8 + length]), (8 + length + 7) // 8 * 8
-    columns = {}
-    for name, kind, many in header["columns"]:
-        column = np.frombuffer(data, f"<{kind}", many, place)
-        columns[name] = column
-        place = (place + column.nbytes + 7) // 8 * 8
-    assert place == len(data)
-    return header, columns
 
 
 @pytest.fixture(scope="module")
@@ -206,6 +217,14 @@ def test_sql_is_answered_in_the_same_place(page: Page) -> None:
 
     assert (answer["kind"], answer["columns"], answer["rows"]) == ("sql", ["n"], [[750]])
     assert "ms" in ms
+
+
+def test_numbers_that_json_has_no_word_for_are_texts(page: Page) -> None:
+    answer, _ = page.find("SELECT 'inf'::DOUBLE AS a, '-inf'::DOUBLE AS b, 'nan'::DOUBLE AS c")
+    check = page.post("/api/check", text="CHECK p: ALWAYS FALSE IMPLIES TRUE ROBUSTNESS")
+
+    assert answer["rows"] == [["inf", "-inf", "nan"]]
+    assert check.json()["verdicts"][0]["robustness"].startswith("inf")
 
 
 @pytest.mark.parametrize(
@@ -396,7 +415,7 @@ def result_of(text: str) -> Any:
 def test_coverage_is_that_of_the_verb(page: Page, store: Store) -> None:
     from sgstore.coverage import ChosenFrames, classed, classes
 
-    told = result_of(page.post("/api/coverage", what="classes").text)
+    told = page.post("/api/coverage", what="classes").json()
     table = classes(classed(ChosenFrames("town.sgstore", store), "RSV"))
 
     assert told["of"] == len(table.rows)
@@ -407,7 +426,7 @@ def test_clips_become_a_test_set(page: Page, store: Store) -> None:
     from sgstore.locks import read_lock, verify
 
     clips = [["town", 10, 40], ["town", 30, 60], ["town", 100, 120]]
-    told = result_of(page.post("/api/select", clips=clips).text)
+    told = page.post("/api/select", clips=clips).json()
     assert (told["frames"], told["clips"]) == (51 + 21, 3)
     assert told["bytes"] > 0
     assert 0 < told["kept"]["rows"][0][3] <= 1
@@ -544,13 +563,10 @@ def test_what_reaches_beyond_the_store_is_refused(
 
 
 def test_many_questions_at_once_are_refused_and_cancelled(page: Page) -> None:
-    # Takes much time and little memory.
-    runaway = "SELECT max((a.range * b.range) % 7) FROM range(1000000) a, range(1000000) b"
-
     async def flood() -> tuple[list[int], float]:
         asked = [
             asyncio.create_task(
-                page.send("POST", "/api/find", json={"text": runaway, "id": f"r{i}"})
+                page.send("POST", "/api/find", json={"text": RUNAWAY, "id": f"r{i}"})
             )
             for i in range(10)
         ]
@@ -566,3 +582,22 @@ def test_many_questions_at_once_are_refused_and_cancelled(page: Page) -> None:
     assert sorted(codes) == [200] * 8 + [503] * 2
     assert waited < 10
     assert page.find("SELECT 1 AS x")[0]["rows"] == [[1]]
+
+
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [
+        ("/api/find", {"text": RUNAWAY}),
+        ("/api/check", {"text": LONG_CHECK}),
+        ("/api/export", {"clips": [["town", 2 * i, 2 * i] for i in range(300)], "name": "left"}),
+    ],
+)
+def test_what_a_browser_has_left_ends(page: Page, path: str, body: dict[str, Any]) -> None:
+    asyncio.run(page.leave(path, body, 0.2))
+    # What was asked is stopped: its thread is free again at once.
+    began, explorer = time.monotonic(), page.explorer
+    while explorer.busy and time.monotonic() - began < 10:
+        time.sleep(0.05)
+    assert time.monotonic() - began < 5
+    assert page.find("SELECT 1 AS x")[0]["rows"] == [[1]]
+    assert not (explorer.write_to / "left").exists()  # type: ignore[operator]

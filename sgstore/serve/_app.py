@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import threading
 import time
 import uuid
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,15 +22,17 @@ from sgstore.errors import QueryError, SgstoreError, SqlError, StoreError
 from sgstore.query import Store
 from sgstore.sandbox import SandboxPool
 from sgstore.serve._guard import Guard
-from sgstore.serve._measures import differing, exported, locked_clips, measured, measured_clips
+from sgstore.serve._measures import differing, exported, locked_clips
 from sgstore.serve._notes import Note, NotesFile, write_table
 from sgstore.serve._reads import Reads
 from sgstore.serve._requests import Fields, RequestError
+from sgstore.serve._wire import as_json
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Mapping
+    from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 
     from starlette.requests import Request
+    from starlette.types import Receive, Scope, Send
 
     Endpoint = Callable[[Request], Awaitable[Response]]
 
@@ -56,6 +57,75 @@ _TYPES: Final = {
     ".txt": "text/plain",
 }
 _NONCE: Final = "{{nonce}}"
+_SCRIPT: Final = "js/main.js"
+
+
+class _Answer(StreamingResponse):
+    """Answer that comes in parts; whatever ends it, the browser that has left, too, ends what makes it."""
+
+    def __init__(
+        self, parts: AsyncGenerator[bytes], ended: Callable[[], None], media_type: str
+    ) -> None:
+        super().__init__(parts, media_type=media_type)
+        self._parts, self._ended = parts, ended
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._ended()
+            with suppress(RuntimeError):  # it runs: then it ends by itself
+                await self._parts.aclose()
+
+
+class _Question:
+    """A question to a sandbox that is under way: its replies, as they come.
+
+    Parameters
+    ----------
+    pool : function
+        Gives the sandboxes; it may take its time.
+    question : mapping
+    key : str
+        What it is cancelled by.
+    """
+
+    def __init__(
+        self, pool: Callable[[], SandboxPool], question: Mapping[str, Any], key: str
+    ) -> None:
+        self._pool, self._question, self._key = pool, question, key
+        self._asked: SandboxPool | None = None
+        self._gone = threading.Event()
+        self._loop = asyncio.get_running_loop()
+        self._found: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
+
+    def ask(self) -> None:
+        """Ask, in a thread of its own; an error is a reply."""
+        tell = partial(self._loop.call_soon_threadsafe, self._found.put_nowait)
+        try:
+            self._asked = self._pool()
+            if self._gone.is_set():
+                return
+            for reply in self._asked.ask(self._question, self._key):
+                tell(reply)
+        except SgstoreError as error:
+            tell({"error": error.as_dict()})
+        except BaseException:
+            tell({"error": {"error": "SgstoreError", "reason": "the question failed"}})
+            raise
+        finally:
+            tell(None)
+
+    async def replies(self) -> AsyncGenerator[dict[str, Any]]:
+        """The replies, in order."""
+        while (reply := await self._found.get()) is not None:
+            yield reply
+
+    def end(self) -> None:
+        """Cancel it, if it is not answered yet."""
+        self._gone.set()  # it may not have begun
+        if self._asked is not None:
+            self._asked.cancel(self._key)
 
 
 class Explorer:
@@ -69,6 +139,11 @@ class Explorer:
         A second store, to compare with.
     write_to : Path, optional
         Folder that locks and clips may be written below; without it nothing is written but tags.
+
+    Attributes
+    ----------
+    busy : int
+        Questions and longer pieces of work that are under way.
 
     Raises
     ------
@@ -92,7 +167,8 @@ class Explorer:
         if other is not None:
             self._pools["b"] = self._pool(other)
         self._threads = ThreadPoolExecutor(MOST_QUESTIONS + 2, "sgstore question")
-        self._under_way = 0
+        self._counting = threading.Lock()
+        self.busy = 0
 
     def close(self) -> None:
         """End the sandboxes, and give the stores back."""
@@ -136,49 +212,36 @@ class Explorer:
 
     # What somebody typed -------------------------------------------------------------------------
 
-    async def replies(
-        self, question: Mapping[str, Any], key: str = "", side: str = "a"
-    ) -> AsyncIterator[dict[str, Any]]:
-        """Replies of a sandbox, as they come; an error is one of them. Who stops reading cancels.
+    def _ask(self, question: Mapping[str, Any], key: str = "", side: str = "a") -> _Question:
+        """A question that is asked from now on.
 
         Raises
         ------
         RequestError
             There are too many questions under way.
         """
-        if self._under_way >= MOST_QUESTIONS:
-            raise RequestError(f"{MOST_QUESTIONS} questions are under way; try again later", 503)
-        self._under_way += 1
-        key, loop = key or uuid.uuid4().hex, asyncio.get_running_loop()
-        found: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
-        tell = partial(loop.call_soon_threadsafe, found.put_nowait)
-        pools: list[SandboxPool] = []
-        gone = threading.Event()
+        pool = partial(self.pool, side, str(question.get("text", "")))
+        asked = _Question(pool, question, key or uuid.uuid4().hex)
+        self._begin(asked.ask)
+        return asked
 
-        def ask() -> None:
+    def _begin(self, work: Callable[[], None]) -> None:
+        """Have something done in a thread."""
+        with self._counting:
+            if self.busy >= MOST_QUESTIONS:
+                raise RequestError(
+                    f"{MOST_QUESTIONS} questions are under way; try again later", 503
+                )
+            self.busy += 1
+
+        def run() -> None:
             try:
-                pools.append(self.pool(side, str(question.get("text", ""))))
-                if gone.is_set():
-                    return
-                for reply in pools[0].ask(question, key):
-                    tell(reply)
-            except SgstoreError as error:
-                tell({"error": error.as_dict()})
-            except BaseException:
-                tell({"error": {"error": "SgstoreError", "reason": "the question failed"}})
-                raise
+                work()
             finally:
-                tell(None)
+                with self._counting:
+                    self.busy -= 1
 
-        try:
-            self._threads.submit(ask)
-            while (reply := await found.get()) is not None:
-                yield reply
-        finally:
-            self._under_way -= 1
-            gone.set()  # it may not have begun
-            for pool in pools:
-                pool.cancel(key)
+        self._threads.submit(run)
 
     async def find(self, request: Request) -> Response:
         """Matches of a pattern, or rows of SQL: lines of JSON, as they come."""
@@ -188,21 +251,17 @@ class Explorer:
         question = {"ask": kind, "text": text, "parameters": fields.parameters()}
         key, side = fields.text("id", ""), fields.one_of("side", *self._pools)
         started = time.perf_counter()
-        found = self.replies(question, key, side)
-        first = await anext(found, {})
+        asked = self._ask(question, key, side)
 
-        async def lines() -> AsyncIterator[bytes]:
-            try:
-                reply: dict[str, Any] | None = {"kind": kind, **first}
-                while reply is not None:
-                    yield json.dumps(reply).encode() + b"\n"
-                    reply = await anext(found, None)
-                ms = (time.perf_counter() - started) * 1e3
-                yield json.dumps({"ms": round(ms, 1)}).encode() + b"\n"
-            finally:
-                await found.aclose()  # type: ignore[attr-defined]
+        async def lines() -> AsyncGenerator[bytes]:
+            about = {"kind": kind}
+            async for reply in asked.replies():
+                yield as_json(about | reply) + b"\n"
+                about = {}
+            ms = (time.perf_counter() - started) * 1e3
+            yield as_json({"ms": round(ms, 1)}) + b"\n"
 
-        return StreamingResponse(lines(), media_type="application/x-ndjson")
+        return _Answer(lines(), asked.end, "application/x-ndjson")
 
     async def cancel(self, request: Request) -> Response:
         """Stop a question."""
@@ -213,21 +272,30 @@ class Explorer:
     async def one(self, request: Request, ask: str) -> Response:
         """The whole answer to a question: lanes of truth, why not, verdicts. An error is an answer, too."""
         fields = await Fields.of(request)
-        question: dict[str, Any] = {"ask": ask, "text": fields.text("text")}
-        question["parameters"] = fields.parameters()
-        if ask != "check":
+        question: dict[str, Any] = {"ask": ask}
+        side = fields.one_of("side", *self._pools)
+        if ask in {"coverage", "select"}:
+            question["abstraction"] = fields.text("abstraction", "RSV")
+        else:
+            question |= {"text": fields.text("text"), "parameters": fields.parameters()}
+        if ask == "coverage":
+            question["what"] = fields.one_of("what", "classes", "growth", "combos")
+        elif ask == "select":
+            question["clips"] = fields.clips()
+        elif ask != "check":
             trace, seq = fields.text("trace"), fields.whole("seq")
-            side = fields.one_of("side", *self._pools)
             ref = await self.threaded(self.reads[side].frame_id, trace, seq)
             question |= {"frame": ref, "binding": fields.binding()}
-        else:
-            side = fields.one_of("side", *self._pools)
-        found = [reply async for reply in self.replies(question, side=side)]
-        if ask == "check":
-            told = {"verdicts": [one["verdict"] for one in found if "verdict" in one], **found[-1]}
-            told.pop("verdict", None)
-            return JSONResponse(told)
-        return JSONResponse(found[-1])
+        asked = self._ask(question, side=side)
+
+        async def answer() -> AsyncGenerator[bytes]:
+            found = [reply async for reply in asked.replies()]
+            if ask == "check":
+                verdicts = [one.pop("verdict") for one in found if "verdict" in one]
+                found[-1] |= {"verdicts": verdicts}
+            yield as_json(found[-1])
+
+        return _Answer(answer(), asked.end, "application/json")
 
     # What the page reads by trace and frame --------------------------------------------------------
 
@@ -256,21 +324,6 @@ class Explorer:
         writing = self.write_to is not None
         return JSONResponse({**sides["a"], "other": sides.get("b"), "writing": writing})
 
-    async def page(self, request: Request) -> Response:
-        """The page itself; its nonce is that of the policy of this answer."""
-        text = (PAGE / "index.html").read_text(encoding="utf-8")
-        nonce = request.scope["state"]["nonce"]
-        return Response(text.replace(_NONCE, nonce), media_type="text/html")
-
-    async def file(self, request: Request) -> Response:
-        """A module, a style or a licence of the page."""
-        name = request.path_params["name"]
-        path = FILES.get(name)
-        if path is None:
-            return JSONResponse({"reason": "no such file"}, 404)
-        kind = _TYPES[path.suffix]
-        return FileResponse(path, media_type=kind, headers={"cache-control": "no-cache"})
-
     # Tags, measures, files ---------------------------------------------------------------------------
 
     async def tags(self, request: Request) -> Response:
@@ -294,11 +347,13 @@ class Explorer:
         """A longer piece of work, as server-sent events: what is done of it, then its result or an error."""
         fields = await Fields.of(request)
         work = _WORK[name](self, fields)
-        loop = asyncio.get_running_loop()
+        loop, gone = asyncio.get_running_loop(), threading.Event()
         events: asyncio.Queue[tuple[str, Any] | None] = asyncio.Queue()
         tell = partial(loop.call_soon_threadsafe, events.put_nowait)
 
         def progress(done: int, of: int) -> None:
+            if gone.is_set():
+                raise RequestError("nobody waits for it any more")
             tell(("progress", [done, of]))
 
         def run() -> None:
@@ -312,12 +367,13 @@ class Explorer:
             finally:
                 tell(None)
 
-        async def lines() -> AsyncIterator[str]:
-            self._threads.submit(run)
-            while (event := await events.get()) is not None:
-                yield f"event: {event[0]}\ndata: {json.dumps(event[1])}\n\n"
+        self._begin(run)
 
-        return StreamingResponse(lines(), media_type="text/event-stream")
+        async def lines() -> AsyncGenerator[bytes]:
+            while (event := await events.get()) is not None:
+                yield f"event: {event[0]}\ndata: ".encode() + as_json(event[1]) + b"\n\n"
+
+        return _Answer(lines(), gone.set, "text/event-stream")
 
     def target(self, name: str) -> Path:
         """A place below the folder that may be written to.
@@ -335,16 +391,23 @@ class Explorer:
         return self.write_to / name
 
 
+async def page_of(request: Request, script: str = "main.js") -> Response:
+    """A page, by its first script; its nonce is that of the policy of this answer."""
+    text = (PAGE / "index.html").read_text(encoding="utf-8").replace(_SCRIPT, f"js/{script}")
+    nonce = request.scope["state"]["nonce"]
+    return Response(text.replace(_NONCE, nonce), media_type="text/html")
+
+
+async def given_file(request: Request) -> Response:
+    """A module, a style or a licence of the page."""
+    path = FILES.get(request.path_params["name"])
+    if path is None:
+        return JSONResponse({"reason": "no such file"}, 404)
+    kind = _TYPES[path.suffix]
+    return FileResponse(path, media_type=kind, headers={"cache-control": "no-cache"})
+
+
 _WORK: Final[Mapping[str, Callable[[Explorer, Fields], Callable[..., Any]]]] = {
-    "coverage": lambda of, fields: partial(
-        measured,
-        of.store,
-        fields.one_of("what", "classes", "growth", "combos"),
-        fields.text("abstraction", "RSV"),
-    ),
-    "select": lambda of, fields: partial(
-        measured_clips, of.store, fields.clips(), fields.text("abstraction", "RSV")
-    ),
     "lock": lambda of, fields: partial(
         locked_clips, of.store, fields.clips(), of.target(fields.text("name"))
     ),
@@ -393,22 +456,13 @@ def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: 
         Name of the cookie that holds the token.
     """
 
-    def told(endpoint: Endpoint) -> Endpoint:
-        async def answered(request: Request) -> Response:
-            try:
-                return await endpoint(request)
-            except SgstoreError as error:
-                return JSONResponse(error.as_dict(), _status(error))
-
-        return answered
-
     def bound(method: Callable[..., Awaitable[Response]], name: str) -> Endpoint:
         return told(lambda request: method(request, name))
 
     get, post = ["GET"], ["POST"]
     routes = [
-        Route("/", told(explorer.page), methods=get),
-        Route("/static/{name:path}", told(explorer.file), methods=get),
+        Route("/", told(page_of), methods=get),
+        Route("/static/{name:path}", told(given_file), methods=get),
         Route("/api/store", told(explorer.about), methods=get),
         Route("/api/words", bound(explorer.read, "words"), methods=get),
         Route("/api/library", bound(explorer.read, "library"), methods=get),
@@ -416,7 +470,7 @@ def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: 
         Route("/api/find/{key}", told(explorer.cancel), methods=["DELETE"]),
         *(
             Route(f"/api/{n}", bound(explorer.one, n), methods=post)
-            for n in ("parts", "why", "check")
+            for n in ("parts", "why", "check", "coverage", "select")
         ),
         *(
             Route(f"/api/{n}", bound(explorer.read, n), methods=post if n == "thumbs" else get)
@@ -432,6 +486,18 @@ def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: 
         await asyncio.get_running_loop().run_in_executor(None, explorer.close)
 
     return Guard(Starlette(routes=routes, lifespan=lifespan), token, hosts, cookie)
+
+
+def told(endpoint: Endpoint) -> Endpoint:
+    """An endpoint whose errors are answers."""
+
+    async def answered(request: Request) -> Response:
+        try:
+            return await endpoint(request)
+        except SgstoreError as error:
+            return JSONResponse(error.as_dict(), _status(error))
+
+    return answered
 
 
 def _status(error: SgstoreError) -> int:

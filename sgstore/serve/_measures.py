@@ -28,7 +28,7 @@ MOST_ROWS: Final = 2000
 """Rows of a table that the page is sent; it says how many there are."""
 
 
-def measured(store: Store, what: str, abstraction: str, _: Progress) -> dict[str, Any]:
+def measured(store: Store, what: str, abstraction: str) -> dict[str, Any]:
     """A table of coverage of a store: classes by rank, growth, or combinations of two features that lack.
 
     Parameters
@@ -49,7 +49,7 @@ def measured(store: Store, what: str, abstraction: str, _: Progress) -> dict[str
     }
 
 
-def measured_clips(store: Store, clips: Clips, abstraction: str, _: Progress) -> dict[str, Any]:
+def measured_clips(store: Store, clips: Clips, abstraction: str) -> dict[str, Any]:
     """Size of clips, and share of the store's classes that they keep.
 
     Returns

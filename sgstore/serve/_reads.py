@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from sgstore.lang import Catalog
     from sgstore.query import Store
+    from sgstore.roads import RoadMap
     from sgstore.serve._requests import Fields
     from sgstore.store import StoredTrace
 
@@ -164,12 +165,7 @@ class Reads:
 
     def _outlines(self, trace: str) -> bytes:
         found = self._store.file.road_map_text(trace)
-        if found is None:
-            return packed({"origin": [0, 0], "words": []}, {})
-        drawn = drawn_outlines(read_map(found[1], found[0]))
-        names = ("x", "y", "start", "node", "word", "closed")
-        columns = {name: getattr(drawn, name) for name in names}
-        return packed({"origin": drawn.origin, "words": drawn.words}, columns)
+        return drawn_map(None if found is None else read_map(found[1], found[0]))
 
     def warm(self) -> None:
         """Read the maps before they are asked for."""
@@ -203,7 +199,7 @@ class Reads:
                 {"src": src, "relation": relation, "dst": dst, **about}
                 for src, relation, dst, about in graph.edges
             ]
-            return _clean({"nodes": nodes, "edges": edges})
+            return clean({"nodes": nodes, "edges": edges})
 
         return read
 
@@ -254,14 +250,24 @@ class Reads:
         return read
 
 
-def _clean(value: Any) -> Any:
+def drawn_map(road_map: RoadMap | None) -> bytes:
+    """Outlines of a map; without points where there is none."""
+    if road_map is None:
+        return packed({"origin": [0, 0], "words": []}, {})
+    drawn = drawn_outlines(road_map)
+    names = ("x", "y", "start", "node", "word", "closed")
+    columns = {name: getattr(drawn, name) for name in names}
+    return packed({"origin": drawn.origin, "words": drawn.words}, columns)
+
+
+def clean(value: Any) -> Any:
     """A value as JSON holds it: numbers that are none are ``None``."""
     if isinstance(value, dict):
-        return {str(key): _clean(item) for key, item in value.items()}
+        return {str(key): clean(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_clean(item) for item in value]
+        return [clean(item) for item in value]
     if isinstance(value, np.generic):
-        return _clean(value.item())
+        return clean(value.item())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)

@@ -24,7 +24,7 @@ from sgstore.errors import SgstoreError
 from sgstore.files import write_bytes
 from sgstore.serve._notes import NotesFile
 from sgstore.serve._reads import Reads
-from sgstore.serve._wire import packed
+from sgstore.serve._wire import as_json, packed
 from sgstore.serve._worker import answer
 
 if TYPE_CHECKING:
@@ -382,7 +382,7 @@ def _page(kept: dict[str, Any], title: str) -> str:
         name: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
         for name, text in (("script", code), ("style", style))
     }
-    data = json.dumps(kept, separators=(",", ":"), ensure_ascii=False).replace("<", "\\u003c")
+    data = as_json(kept).decode().replace("<", "\\u003c")
     return f"""<!doctype html>
 <html lang="en">
 <head>

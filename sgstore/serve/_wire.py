@@ -1,4 +1,4 @@
-"""Columns as bytes, for a page that makes typed arrays of them without copying.
+"""Columns as bytes, for a page that makes typed arrays of them without copying; and JSON as browsers read it.
 
 ``u32 length of the header, u32 0``, the header as JSON padded to 8 bytes, then each column, little-endian,
 padded to 8 bytes. The header names the columns with their types and lengths under ``columns``.
@@ -7,6 +7,7 @@ padded to 8 bytes. The header names the columns with their types and lengths und
 from __future__ import annotations
 
 import json
+import math
 import struct
 from typing import TYPE_CHECKING, Any
 
@@ -39,3 +40,20 @@ def packed(header: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]) -> by
 
 def _padding(data: bytes) -> bytes:
     return bytes(-len(data) % 8)
+
+
+def as_json(value: object) -> bytes:
+    """A value as browsers read it: a number that JSON has no word for is a text, as ``inf``."""
+    try:
+        text = json.dumps(value, allow_nan=False, separators=(",", ":"), ensure_ascii=False)
+    except ValueError:
+        text = json.dumps(_worded(value), separators=(",", ":"), ensure_ascii=False)
+    return text.encode(errors="replace")
+
+
+def _worded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _worded(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_worded(item) for item in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,6 +1,6 @@
 """Questions of the explorer's page, answered in the process of a sandbox.
 
-A question has ``ask``, one of :data:`QUESTIONS`, ``text``, ``parameters``, ``frame`` and ``binding``.
+A question has ``ask``, one of :data:`QUESTIONS`, and what that needs: ``text``, ``parameters``, ``frame``, ….
 Replies come as they are found; one with ``more`` is followed by others.
 """
 
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sgstore.errors import QueryError
 from sgstore.lang import WhyNotSteps
 from sgstore.sandbox import plain, rows_found, serve
+from sgstore.temporal import margin_cells
 
 if TYPE_CHECKING:
     from sgstore.query import Store
@@ -115,8 +116,23 @@ def _told_check(store: Store, question: dict[str, Any], most: int) -> Iterator[R
         many += len(spans)
         about = {"check": verdict.check, "trace": verdict.trace, "verdict": verdict.verdict}
         about |= {"reason": verdict.reason, "violations": len(verdict.violations), "spans": spans}
+        about["robustness"] = " · ".join(filter(None, margin_cells(verdict)))
         yield {"more": True, "verdict": about}
     yield {"count": many, "truncated": many >= most, "notes": run.notes}
+
+
+def _told_coverage(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
+    """A table of coverage."""
+    from sgstore.serve._measures import measured  # not needed by the others
+
+    yield measured(store, question["what"], question["abstraction"])
+
+
+def _told_selection(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
+    """Size of clips, and what they keep."""
+    from sgstore.serve._measures import measured_clips
+
+    yield measured_clips(store, question["clips"], question["abstraction"])
 
 
 QUESTIONS: Final[Mapping[str, Asked]] = {
@@ -126,6 +142,8 @@ QUESTIONS: Final[Mapping[str, Asked]] = {
     "parts": _told_parts,
     "why": _told_why,
     "check": _told_check,
+    "coverage": _told_coverage,
+    "select": _told_selection,
 }
 """What ``ask`` may be; each is given the store, the question, and the most matches or rows."""
 

@@ -74,9 +74,9 @@ export async function* lines(path, body, signal) {
 }
 
 /** The result of a longer piece of work.
- * @param {string} path @param {Plain} body @param {(done: number, of: number) => void} [progress] */
-export async function work(path, body, progress) {
-  for await (const part of cut(await send(path, body), "\n\n")) {
+ * @param {string} path @param {Plain} body @param {(done: number, of: number) => void} [progress] @param {RequestInit} [how] */
+export async function work(path, body, progress, how) {
+  for await (const part of cut(await send(path, body, how), "\n\n")) {
     const [event, data] = part.split("\ndata: ");
     const value = JSON.parse(data || "null");
     if (event === "event: progress") progress?.(value[0], value[1]);

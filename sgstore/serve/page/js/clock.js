@@ -2,8 +2,8 @@
 // One clock over all that is open: the frame, whether it plays, and what the server says of it.
 import { computed, effect, signal } from "../vendor/core.js";
 import * as api from "./api.js";
-import { nameOf } from "./data.js";
-import { answer, matches, offline, open, openMatch, parametersOf, playing, rate, reasonOf, say, seq, store, text, traces, writeAddress } from "./state.js";
+import { nameOf, stillOf } from "./data.js";
+import { answer, inOther, live, matches, offline, open, openMatch, parametersOf, playing, rate, reasonOf, say, seq, span, store, text, traces, writeAddress } from "./state.js";
 
 /** Lanes of truth of what is open: answers of the server. */
 export const lanes = signal(/** @type {any} */ (null));
@@ -18,16 +18,36 @@ export const series = signal(/** @type {any} */ (null));
 export const frame = computed(() => Math.round(seq.value));
 export const asked = computed(() => answer.value.query || text.value.trim());
 
-/** First and last frame that can be shown: of the trace; in a report of what it holds around the match. */
+/** First and last frame of the timeline: of the trace; of a monitor of what is kept. */
+export const range = computed(/** @returns {[number, number]} */ () => (live.value ? span.value : [0, Math.max((traces.value.get(open.value?.trace || "")?.frames || 1) - 1, 0)]));
+
+/** First and last frame that can be shown: of the timeline; in a report of what it holds around the match. */
 const bounds = computed(/** @returns {[number, number]} */ () => {
+  if (live.value) return span.value;
   const about = traces.value.get(open.value?.trace || ""), match = open.value?.match;
   const end = Math.max((about?.frames || 1) - 1, 0), around = Math.floor((store.value?.around || 0) / (about?.period || 0.1));
   return offline.value && match ? [Math.max(match.first - around, 0), Math.min(match.last + around, end)] : [0, end];
 });
 
-/** Which parts hold now, by lane. @param {number} at */
-export const holdsAt = (at) => (lanes.value?.lanes || []).map((/** @type {any} */ lane) => (lane.unknown.length ? null
-  : lane.spans.some((/** @type {number[]} */ [a, z]) => (a ?? 0) <= at && at <= (z ?? 0))));
+/** Which parts hold now, by lane; of a monitor whose last frames were not looked at yet, in the last that was. @param {number} now @param {any} [of] */
+export const holdsAt = (now, of = lanes.value) => (of?.lanes || []).map((/** @type {any} */ lane) => (lane.unknown.length || (of.known && now < of.known[0]) ? null
+  : lane.spans.some((/** @type {number[]} */ [a, z]) => (a ?? 0) <= Math.min(now, of.known?.[1] ?? now) && Math.min(now, of.known?.[1] ?? now) <= (z ?? 0))));
+
+/** What the server is asked for the lanes of what is open; null: there are none.
+ * @param {NonNullable<typeof open.value>} now @param {string} query @returns {any} */
+function lanesWanted(now, query) {
+  if (live.value) return now.match?.pattern ? { text: now.match.pattern, binding: now.binding } : null;
+  if (!/\bMATCH\b/i.test(query)) return null;
+  return { text: query, parameters: parametersOf(query), trace: now.trace, seq: Math.round(seq.peek()), binding: now.binding };
+}
+
+/** Ask for the lanes again, of a monitor that goes on. */
+export async function refreshLanes() {
+  const now = open.value, body = now && lanesWanted(now, "");
+  if (!body) return;
+  const found = await api.json("api/parts", body).catch(() => null);
+  if (found && open.value === now) lanes.value = found;
+}
 
 let turn = 0, answered = /** @type {any} */ (null);
 // Lanes are asked for when another match is opened, not when their answer said which nodes are bound.
@@ -38,8 +58,8 @@ effect(() => {
   lanes.value = null;
   why.value = null;
   series.value = null;
-  if (!now || !/\bMATCH\b/i.test(query)) return;
-  const body = { text: query, parameters: parametersOf(query), trace: now.trace, seq: Math.round(seq.peek()), binding: now.binding };
+  const body = now && lanesWanted(now, query);
+  if (!body) return;
   api.json("api/parts", body).then((found) => {
     if (mine !== turn) return;
     if (found.error) return;
@@ -47,6 +67,29 @@ effect(() => {
     if (!now.binding && Object.keys(found.binding).length) open.value = answered = { ...now, binding: found.binding };
   }).catch((error) => { if (mine === turn) say(reasonOf(error)); });
 });
+
+/** Lanes of the same match in the second store, while that is shown beside. */
+export const others = signal(/** @type {any} */ (null));
+effect(() => {
+  const now = open.value, query = asked.value;
+  others.value = null;
+  const other = inOther(now?.trace || "");
+  if (!now || !beside.value || !traces.value.has(other) || !/\bMATCH\b/i.test(query)) return;
+  const body = { text: query, parameters: parametersOf(query), trace: now.trace, seq: Math.round(seq.peek()), binding: sameIn(other, now) };
+  api.json("api/parts", { ...body, side: "b" }).then((found) => { if (open.value === now && !found.error) others.value = found; }).catch((error) => say(reasonOf(error)));
+});
+
+/** The nodes of a match in the second store, by the ids that the simulator gave them; null: not all are known there.
+ * @param {string} other @param {NonNullable<typeof open.value>} now */
+function sameIn(other, now) {
+  const here = stillOf(now.trace)?.header.names, there = stillOf(other)?.header.names;
+  const sameMap = traces.value.get(other)?.map_key === traces.value.get(now.trace)?.map_key;
+  if (!here || !there || !now.binding) return null;
+  const ids = new Map(Object.entries(there).map(([node, about]) => [about[1], Number(node)]));
+  const found = Object.entries(now.binding).map(([key, node]) => [key, node < 0 ? (sameMap ? node : undefined) : here[node]?.[1] ? ids.get(here[node][1]) : undefined]);
+  return found.every(([, node]) => node !== undefined) ? Object.fromEntries(found) : null;
+}
+
 // The first camera of a trace, unless one was chosen that it has.
 effect(() => {
   const cameras = traces.value.get(open.value?.trace || "")?.cameras || [];

@@ -2,7 +2,7 @@
 // Columns of states, maps and pictures as the page needs them: asked for once, kept while they are near.
 import { signal } from "../vendor/core.js";
 import * as api from "./api.js";
-import { store, traces } from "./state.js";
+import { live, store, traces } from "./state.js";
 
 /** @typedef {import("./state.js").Match} Match */
 
@@ -80,8 +80,40 @@ export function nameOf(trace, node) {
   return about ? `${about[0]} ${node}` : node < 0 ? `map ${-node}` : `${node}`;
 }
 
+// Frames of a monitor, as they come ---------------------------------------------------------------------------
+
+const FED = 3000; // frames that are kept
+/** @type {Map<number, any>} */
+const fed = new Map();
+
+/** Keep the states of the next frame; the first frame that is kept. @param {string} trace @param {number} seq @param {any} header @param {any} columns */
+export function feed(trace, seq, header, columns) {
+  fed.set(seq, { columns, from: 0, to: columns.node.length, t: header.t, ego: header.ego });
+  for (const old of fed.keys()) { if (fed.size <= FED) return old; fed.delete(old); }
+  return seq;
+}
+
+/** Keep what stands, and names. @param {string} trace @param {any[][]} rows @param {Record<string, string[]>} names */
+export function feedStill(trace, rows, names) {
+  const known = still.get(trace) || { rows: new Map(), header: { names: {} }, columns: null };
+  Object.assign(known.header.names, names);
+  for (const row of rows) known.rows.set(row[0], row);
+  if (rows.length || !known.columns) {
+    const all = [...known.rows.values()];
+    known.columns = Object.fromEntries(["node", "kind", "x", "y", "heading", "length", "width"].map((name, i) => [name, all.map((row) => row[i])]));
+  }
+  still.set(trace, known);
+}
+
+/** Keep the small picture of a frame, for longer than its states. @param {string} trace @param {number} frame */
+export function keepThumb(trace, frame) {
+  const found = fed.get(frame);
+  if (found) thumbs.set(`${trace}#${frame}`, found);
+}
+
 /** States of a frame: arrays, and the rows that are of it. @param {string} trace @param {number} frame */
 export function statesAt(trace, frame) {
+  if (live.value) return fed.get(frame) || null;
   const number = Math.floor(frame / CHUNK), key = `${trace}\n${number}`;
   const about = traces.value.get(trace);
   if (!about) return null;
@@ -124,17 +156,19 @@ export function thumbOf(trace, frame) {
 
 /** @param {[string, number][]} frames what is in sight, the first first */
 export function wantThumbs(frames) {
-  wanted = frames.filter(([trace, frame]) => !thumbs.has(`${trace}#${frame}`));
+  wanted = live.value ? [] : frames.filter(([trace, frame]) => !thumbs.has(`${trace}#${frame}`));
   ask();
 }
 
 async function ask() {
   if (asking || !wanted.length) return;
   asking = true;
-  const now = wanted.slice(0, MANY);
-  wanted = wanted.slice(MANY);
+  const side = traces.value.get(wanted[0]?.[0] || "")?.side;
+  const now = wanted.filter(([trace]) => traces.value.get(trace)?.side === side).slice(0, MANY);
+  wanted = wanted.filter((one) => !now.includes(one));
   try {
-    const { columns } = await api.columns("api/thumbs", { frames: now });
+    const frames = now.map(([trace, frame]) => [traces.value.get(trace)?.name || trace, frame]);
+    const { columns } = await api.columns("api/thumbs", side ? { frames, side } : { frames });
     let row = 0;
     now.forEach(([trace, frame], at) => {
       const from = row;

@@ -29,7 +29,7 @@ const KINDS = {
 const DARK_KINDS = { ...KINDS, building: "#3d434c", vegetation: "#33432f", prop: "#5f5b56", pole: "#5f5b56", barrier: "#5f5b56" };
 /** @type {Record<string, string>} */
 const LIGHTS = { red: "#e5383b", red_yellow: "#ff8c1a", yellow: "#ffb703", green: "#2ec4a0", flashing: "#ffe08a", off: "#5a626f" };
-const SCENERY = new Set(["building", "vegetation", "prop", "pole", "barrier"]);
+export const SCENERY = new Set(["building", "vegetation", "prop", "pole", "barrier"]);
 
 /** Colours of the page now, light or dark. */
 export function inks() {
@@ -249,7 +249,7 @@ function paintEdge(ctx, trace, states, look, ink, edge) {
   if (!from || !to) return;
   const [ax, ay] = placeOf(look, from[0] || 0, from[1] || 0), [bx, by] = placeOf(look, to[0] || 0, to[1] || 0);
   ctx.strokeStyle = edge.holds === false ? ink.fail : edge.holds ? ink.hold : ink.faint;
-  ctx.lineWidth = 2.2;
+  ctx.lineWidth = edge.holds === null ? 1.2 : 2.2;
   ctx.setLineDash(edge.holds === false ? [5, 4] : []);
   ctx.beginPath();
   ctx.moveTo(ax || 0, ay || 0);

@@ -1,7 +1,7 @@
 // @ts-check
 // The editor of queries: colours, completion, errors under carets, a slider for the number under the cursor.
 import {
-  autocompletion, bracketMatching, closeBrackets, closeBracketsKeymap, completionKeymap, defaultKeymap, drawSelection,
+  autocompletion, bracketMatching, closeBrackets, closeBracketsKeymap, closeCompletion, completionKeymap, defaultKeymap, drawSelection,
   EditorState, EditorView, highlightSpecialChars, HighlightStyle, history, historyKeymap, keymap, placeholder, setDiagnostics,
   StreamLanguage, syntaxHighlighting, tags,
 } from "../vendor/codemirror.js";
@@ -141,7 +141,7 @@ export function Editor() {
           EditorView.lineWrapping, placeholder("MATCH (e:Ego)-[:near_coll]->(v:Vehicle) WHERE e.speed > 5     · or SELECT … · or choose a pattern below"),
           EditorView.contentAttributes.of({ "aria-label": "Query" }),
           keymap.of([
-            { key: "Mod-Enter", preventDefault: true, run: () => { find(); return true; } },
+            { key: "Mod-Enter", preventDefault: true, run: (/** @type {any} */ view) => { closeCompletion(view); find(); return true; } },
             { key: "Escape", run: (/** @type {any} */ view) => { view.contentDOM.blur(); return true; } },
             ...closeBracketsKeymap, ...defaultKeymap, ...historyKeymap, ...completionKeymap,
           ]),

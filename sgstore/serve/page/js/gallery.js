@@ -3,10 +3,13 @@
 import { h, htm, useEffect, useLayoutEffect, useRef, useState } from "../vendor/core.js";
 import { arrived, mapOf, stillOf, thumbOf, wantThumbs } from "./data.js";
 import { fitted, lookAt, paintScene } from "./draw.js";
-import { keyOf, matches, notes, offline, open, openMatch, paints, tick, ticked, traces } from "./state.js";
+import { keyOf, notes, offline, open, openMatch, paints, tick, ticked, traces } from "./state.js";
 
 const html = htm.bind(h);
 const GAP = 12, HEAD = 32;
+
+/** What the matches before and behind are grouped by. @param {import("./state.js").Match | undefined} match */
+const groupOf = (match) => match?.group ?? match?.trace ?? "";
 
 /** Where everything stands: groups and rows, by their heights.
  * @param {import("./state.js").Match[]} found @param {number} width */
@@ -15,13 +18,13 @@ function layout(found, width) {
   const rows = [];
   let top = 4, at = 0;
   while (at < found.length) {
-    const trace = /** @type {any} */ (found[at]).trace;
+    const group = groupOf(found[at]);
     let end = at;
-    while (end < found.length && /** @type {any} */ (found[end]).trace === trace) end++;
-    rows.push({ top, height: HEAD, trace, many: end - at, first: at, last: at });
+    while (end < found.length && groupOf(found[end]) === group) end++;
+    rows.push({ top, height: HEAD, group, many: end - at, first: at, last: at });
     top += HEAD;
     for (let i = at; i < end; i += across) {
-      rows.push({ top, height: high + GAP, trace: "", many: 0, first: i, last: Math.min(i + across, end) });
+      rows.push({ top, height: high + GAP, group: "", many: 0, first: i, last: Math.min(i + across, end) });
       top += high + GAP;
     }
     top += 6;
@@ -47,23 +50,25 @@ function Tile({ match, x, y, wide, high }) {
     if (ctx) {
       paintScene(ctx, match.trace, thumb, lookAt(match.trace, thumb, nodes, width, height, 45), ratio,
         { marked: new Set(nodes), lit: new Set(), small: true });
+      canvas.current.dataset.painted = "1";
     }
   }, [match, wide, waits, look]);
   const isOpen = open.value?.match && keyOf(open.value.match) === keyOf(match), on = ticked.value.has(keyOf(match));
   const tags = notes.value.filter((n) => n[0] === match.trace && n[1] >= match.first && n[1] <= match.last);
   const who = Object.entries(match.names).filter(([name]) => name !== "e" && name !== "ego").map(([, v]) => v).join(", ");
   return html`<div class=${`tile ${isOpen ? "chosen" : ""}`} style=${{ left: `${x}px`, top: `${y}px`, width: `${wide}px`, height: `${high}px` }}
-      data-index=${match.index} onClick=${() => openMatch(match)}>
+      data-index=${match.index} onClick=${match.go || (() => openMatch(match))}>
     <canvas ref=${canvas} aria-hidden="true"></canvas>
     <div class="about">
-      ${offline.value ? null : html`<input type="checkbox" checked=${on} aria-label=${`Select ${match.trace} ${match.start.toFixed(1)} s`}
+      ${offline.value || match.go ? null : html`<input type="checkbox" checked=${on} aria-label=${`Select ${match.trace} ${match.start.toFixed(1)} s`}
         onClick=${(/** @type {any} */ event) => { event.stopPropagation(); tick(match); }} />`}
-      <button class="quiet small" aria-label=${`Open ${match.trace}, ${match.start.toFixed(1)}–${match.end.toFixed(1)} s`}>${match.start.toFixed(1)}–${match.end.toFixed(1)} s</button>
+      <button class="quiet small" aria-label=${`Open ${match.trace}, ${match.start.toFixed(1)}–${match.end.toFixed(1)} s`}>${match.start === match.end ? "" : `${match.start.toFixed(1)}–`}${match.end.toFixed(1)} s</button>
       ${tags.map((n) => html`<span class="tag">${n[2]}</span>`)}<span class="who" title=${who}>${who}</span>
     </div></div>`;
 }
 
-export function Gallery() {
+/** @param {{found: import("./state.js").Match[], none?: string, word?: [string, string]}} props */
+export function Gallery({ found, none, word = ["match", "matches"] }) {
   const place = useRef(/** @type {HTMLElement | null} */ (null));
   const [box, setBox] = useState({ width: 900, height: 600, top: 0 });
   useEffect(() => {
@@ -76,7 +81,7 @@ export function Gallery() {
     measure();
     return () => { watch.disconnect(); element.removeEventListener("scroll", measure); };
   }, []);
-  const found = matches.value, { rows, height, wide, high } = layout(found, box.width);
+  const { rows, height, wide, high } = layout(found, box.width);
   // The first row in sight, by halving.
   let low = 0, end = rows.length;
   while (low < end) {
@@ -91,13 +96,14 @@ export function Gallery() {
   const now = open.value?.match;
   useEffect(() => { // what is open comes into sight
     if (!now || !place.current) return;
-    const row = rows.find((one) => !one.trace && found.slice(one.first, one.last).some((m) => keyOf(m) === keyOf(now)));
+    const row = rows.find((one) => !one.group && found.slice(one.first, one.last).some((m) => keyOf(m) === keyOf(now)));
     if (row && (row.top < box.top || row.top + row.height > box.top + box.height)) place.current.scrollTop = row.top - box.height / 3;
   }, [now]);
   return html`<section class="gallery" ref=${place} aria-label="Matches"><div class="inner" style=${{ height: `${height}px` }}>
-    ${seen.map((row) => (row.trace
-      ? html`<div class="group" key=${`g ${row.trace}`} style=${{ top: `${row.top}px` }}>${row.trace} <span>${row.many} ${row.many === 1 ? "match" : "matches"}</span></div>`
-      : found.slice(row.first, row.last).map((match, i) => html`<${Tile} key=${keyOf(match)} match=${match} wide=${wide} high=${high}
+    ${found.length || !none ? null : html`<p class="faint none">${none}</p>`}
+    ${seen.map((row) => (row.group
+      ? html`<div class="group" key=${`g ${row.group} ${row.first}`} style=${{ top: `${row.top}px` }}>${row.group} <span>${row.many} ${row.many === 1 ? word[0] : word[1]}</span></div>`
+      : found.slice(row.first, row.last).map((match, i) => html`<${Tile} key=${`${keyOf(match)} ${match.index}`} match=${match} wide=${wide} high=${high}
           x=${GAP + i * (wide + GAP)} y=${row.top} />`)))}
   </div></section>`;
 }

@@ -20,9 +20,9 @@ export const keys = [
     const all = traces.value.get(open.value?.trace || "")?.cameras || [];
     camera.value = all[(all.indexOf(camera.value) + 1) % (all.length || 1)] || "";
   } }],
-  ["g", "next panel: pattern, nodes, edges", { g: () => {
-    const all = ["pattern", "nodes", "edges"];
-    panel.value = all[(all.indexOf(panel.value) + 1) % 3] || "pattern";
+  ["g", "next panel: pattern, neighbours, nodes, edges", { g: () => {
+    const all = ["pattern", "near", "nodes", "edges"];
+    panel.value = all[(all.indexOf(panel.value) + 1) % 4] || "pattern";
   } }],
   ["Esc", "close", { Escape: () => {
     if (dialog.value) dialog.value = "";

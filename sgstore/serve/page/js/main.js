@@ -7,9 +7,10 @@ import { Editor, focusEditor, NumberSlider, setQuery } from "./editor.js";
 import { Gallery } from "./gallery.js";
 import { Keys, keys } from "./keys.js";
 import { Scene } from "./scene.js";
-import { Compare, Coverage, countLibrary, Selection, Start } from "./sheets.js";
+import { Compare } from "./compare.js";
+import { Coverage, countLibrary, Selection, Start } from "./sheets.js";
 import {
-  answer, cancel, dialog, find, history, keep, library, namesIn, notes, open, openFrame, paints, playing, readAddress, reasonOf, say, seq, store, tag,
+  answer, cancel, dialog, find, history, keep, library, matches, namesIn, notes, open, openFrame, paints, playing, readAddress, reasonOf, say, seq, store, tag,
   text, theme, ticked, toast, values, view, words, writeAddress, writeAddressSoon,
 } from "./state.js";
 import { Status } from "./status.js";
@@ -105,10 +106,9 @@ function Found() {
   const told = answer.value;
   if (told.state === "idle" && !open.value) return html`<${Start} />`;
   if (told.rows) return html`<${Rows} />`;
-  if (open.value) return html`<main class="open"><${Gallery} /><${Scene} /></main>`;
-  if (told.verdicts && !told.matches.length) return html`<${Verdicts} />`;
-  if (told.error || (told.state !== "busy" && !told.matches.length)) return html`<${Nothing} />`;
-  return html`<main><${Gallery} /></main>`;
+  if (open.value) return html`<main class="open"><${Gallery} found=${matches.value} /><${Scene} /></main>`;
+  if (told.error || (told.state !== "busy" && !told.matches.length && !told.verdicts)) return html`<${Nothing} />`;
+  return html`${told.verdicts ? html`<${Verdicts} />` : null}<main><${Gallery} found=${matches.value} word=${told.verdicts ? ["violation", "violations"] : undefined} /></main>`;
 }
 
 /** What to do where nothing was found: mend the text, or look at a frame and ask why it does not match. */

@@ -1,6 +1,6 @@
 // @ts-check
 // What a report has instead of a server: the same answers, kept in the file. It stands in for api.js there.
-import { unpacked } from "./wire.js";
+import { bytesOf, unpacked } from "./wire.js";
 
 /** @typedef {Record<string, any>} Plain */
 
@@ -14,13 +14,6 @@ export class Refused extends Error {}
 /** The key under which an answer is kept. @param {string} path @param {Plain} values */
 export function address(path, values) {
   return JSON.stringify([path, ...Object.values(values)]);
-}
-
-/** @param {string} base64 @returns {Uint8Array<ArrayBuffer>} */
-function bytesOf(base64) {
-  const packed = atob(base64), bytes = new Uint8Array(packed.length);
-  for (let i = 0; i < packed.length; i++) bytes[i] = packed.charCodeAt(i);
-  return bytes;
 }
 
 /** @param {string} path @param {Plain} [body] @returns {Promise<any>} */

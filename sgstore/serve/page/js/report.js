@@ -6,7 +6,7 @@ import { Keys, keys } from "./keys.js";
 import { kept } from "./offline.js";
 import { Scene } from "./scene.js";
 import { Verdicts } from "./verdicts.js";
-import { answer, dialog, find, notes, offline, open, store, text, toast, values } from "./state.js";
+import { answer, dialog, find, matches, notes, offline, open, store, text, toast, values } from "./state.js";
 import { Status } from "./status.js";
 
 const html = htm.bind(h);
@@ -20,9 +20,9 @@ function Head() {
 
 function Report() {
   const told = answer.value;
-  const body = open.value ? html`<main class="open"><${Gallery} /><${Scene} /></main>`
-    : told.verdicts && !told.matches.length ? html`<${Verdicts} />`
-    : told.state === "done" && !told.matches.length ? html`<div class="sheet"><h2>Nothing matches</h2></div>` : html`<main><${Gallery} /></main>`;
+  const body = open.value ? html`<main class="open"><${Gallery} found=${matches.value} /><${Scene} /></main>`
+    : told.verdicts ? html`<${Verdicts} /><main><${Gallery} found=${matches.value} /></main>`
+    : told.state === "done" && !told.matches.length ? html`<div class="sheet"><h2>Nothing matches</h2></div>` : html`<main><${Gallery} found=${matches.value} /></main>`;
   return html`<${Head} /><${Status} />${body}
     ${dialog.value ? html`<div class="dialog" onClick=${() => { dialog.value = ""; }}><div role="dialog" aria-modal="true" aria-label="Keys"><${Keys} /></div></div>` : null}
     ${toast.value ? html`<div class="toast" role="status">${toast.value}</div>` : null}`;

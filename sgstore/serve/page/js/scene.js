@@ -2,11 +2,12 @@
 // A match, or a frame: camera, view from above, the pattern, lanes of truth, all by one clock.
 import { effect, h, htm, signal, useEffect, useLayoutEffect, useRef, useState } from "../vendor/core.js";
 import * as api from "./api.js";
-import { asked, askWhy, beside, camera, copyLink, frame, holdsAt, lanes, nextMatch, panel, series, showSeries, why } from "./clock.js";
+import { asked, askWhy, beside, camera, copyLink, frame, holdsAt, lanes, nextMatch, others, panel, series, showSeries, why } from "./clock.js";
 import { arrived, nameOf, pictureAt, statesAt } from "./data.js";
 import { egoRow, fitted, lookAt, nodeAt, paintScene, rowOf } from "./draw.js";
+import { hop, Neighbours } from "./neighbours.js";
 import { PatternDrawing } from "./pattern.js";
-import { chosen, editing, find, inOther, lit, offline, open, openFrame, paints, playing, rate, reasonOf, say, store, text, traces, writeAddress } from "./state.js";
+import { chosen, editing, find, inOther, lit, live, offline, open, openFrame, paints, playing, rate, reasonOf, say, store, text, traces, writeAddress } from "./state.js";
 import { Timeline } from "./timeline.js";
 
 const html = htm.bind(h);
@@ -45,7 +46,7 @@ function Camera() {
       ? html`<select aria-label="Camera" value=${camera.value} onChange=${(/** @type {any} */ e) => { camera.value = e.target.value; }}>
           ${about?.cameras.map((c) => html`<option>${c}</option>`)}</select>`
       : html`<span class="chip">${camera.value}</span>`}</div>
-    <canvas ref=${canvas} role="img" aria-label="Camera picture"></canvas>
+    <canvas ref=${canvas} role="img" aria-label="Camera picture" data-frame=${picture?.seq}></canvas>
     ${picture?.failed ? html`<div class="none">${reasonOf(picture.failed)}</div>` : null}
   </div>`;
 }
@@ -67,11 +68,12 @@ function Above({ trace }) {
     return () => watch.disconnect();
   }, []);
   arrived.value; paints.value;
-  const { factor, dx, dy, north } = zoom.value, marks = lit.value, picked = chosen.value, known = lanes.value;
+  const { factor, dx, dy, north } = zoom.value, marks = lit.value, picked = chosen.value, known = about?.side ? others.value : lanes.value;
+  const bound = (about?.side ? known?.binding : now?.binding) || {}, near = panel.value === "near" && !about?.side ? hop.value : [];
   useLayoutEffect(() => {
     const ctx = canvas.current?.getContext("2d");
     if (!canvas.current || !ctx || !now || !seen.current) return;
-    const { width, height, ratio } = fitted(canvas.current), nodes = Object.values(now.binding || {});
+    const { width, height, ratio } = fitted(canvas.current), nodes = /** @type {number[]} */ (Object.values(bound));
     const base = lookAt(trace, seen.current, nodes, width, height);
     if (north) base.turn = 0;
     // The scale stays while it plays: it is that of the whole match.
@@ -80,12 +82,12 @@ function Above({ trace }) {
     const cos = Math.cos(base.turn), sin = Math.sin(base.turn);
     const mine = { ...base, scale: reach * factor, x: base.x - (dx * cos + dy * sin), y: base.y - (-dx * sin + dy * cos) };
     look.current = { ...mine, base: reach, key: `${now.trace} ${now.match?.index} ${width} ${height}` };
-    const holds = holdsAt(at), names = new Map(), edges = /** @type {any[]} */ ([]);
-    for (const [key, node] of Object.entries(now.binding || {})) names.set(node, `${key} · ${(node < 0 && now.match?.names[key]) || nameOf(trace, node)}`);
+    const holds = holdsAt(at, known), names = new Map(), edges = /** @type {any[]} */ ([...near]);
+    for (const [key, node] of Object.entries(bound)) names.set(node, `${key} · ${(node < 0 && now.match?.names[key]) || nameOf(trace, node)}`);
     if (picked !== null && !names.has(picked)) names.set(picked, nameOf(trace, picked));
-    (about?.side ? [] : known?.lanes || []).forEach((/** @type {any} */ lane, /** @type {number} */ i) => {
+    (known?.lanes || []).forEach((/** @type {any} */ lane, /** @type {number} */ i) => {
       for (const edge of lane.edges) {
-        const src = now.binding?.[edge.src], dst = now.binding?.[edge.dst];
+        const src = bound[edge.src], dst = bound[edge.dst];
         if (src !== undefined && dst !== undefined) edges.push({ ...edge, src, dst, holds: holds[i] });
       }
     });
@@ -149,7 +151,7 @@ const PAIRS = ["distance", "gap", "ttc", "headway", "bearing", "closing_speed"];
 const OF_NODE = ["speed", "accel", "yaw_rate", "heading", "steer", "brake"];
 
 function Details() {
-  const tabs = [["pattern", "pattern"], ...(offline.value ? [] : [["nodes", "nodes"], ["edges", "edges"]]), ...(chosen.value === null ? [] : [["node", nameOf(open.value?.trace || "", chosen.value)]])];
+  const tabs = [["pattern", "pattern"], ...(offline.value ? [] : [["near", "neighbours"], ["nodes", "nodes"], ["edges", "edges"]]), ...(chosen.value === null ? [] : [["node", nameOf(open.value?.trace || "", chosen.value)]])];
   const now = panel.value === "node" && chosen.value === null ? "pattern" : panel.value;
   return html`<div class="panel pattern">
     <div class="tabs" role="tablist">${tabs.map(([key, name]) => html`<button role="tab" aria-selected=${now === key}
@@ -185,6 +187,7 @@ function GraphTable({ what }) {
     api.json(api.address("api/frame", { trace: now.trace, seq: at })).then(setGraph).catch((error) => say(reasonOf(error)));
   }, [now?.trace, at]);
   if (!graph) return html`<p class="faint" style=${{ padding: "8px 12px" }}>${playing.value ? "pause to read the graph of a frame" : "…"}</p>`;
+  if (what === "near") return html`<${Neighbours} graph=${graph} states=${now ? statesAt(now.trace, frame.value) : null} north=${zoom.value.north} />`;
   const bound = new Set(Object.values(now?.binding || {}));
   if (what === "edges") {
     const names = new Map(graph.nodes.map((/** @type {any} */ n) => [n.id, n.name || n.id]));
@@ -221,7 +224,7 @@ function Transport() {
     ${traces.value.has(inOther(now?.trace || "")) ? html`<button aria-pressed=${beside.value} title="the second store by the same clock" onClick=${() => { beside.value = !beside.value; }}>Beside</button>` : null}
     ${offline.value ? null : html`<button title="why does this frame match, or not (w)" aria-expanded=${told ? "true" : "false"} onClick=${() => { if (told) why.value = null; else askWhy(); }}>Why?</button>
     <button title="copy a link (y)" onClick=${copyLink}>Link</button>`}
-    <button aria-label="Close" title="close (Esc)" onClick=${() => { playing.value = false; open.value = null; writeAddress(); }}>✕</button>
+    ${live.value ? null : html`<button aria-label="Close" title="close (Esc)" onClick=${() => { playing.value = false; open.value = null; writeAddress(); }}>✕</button>`}
     ${told ? html`<span class="gap" role="status">${gap?.failed ? html`<span><b>fails</b> <code>${gap.failed}</code>${gap.found ? html` · found <code>${gap.found}</code>` : null}</span>`
       : told.error ? told.error.reason : "all of it holds in this frame"}
       ${(told.relax || []).map((/** @type {any} */ change) => html`<button class="small" onClick=${() => relax(change)}>${asked.value.slice(change.start, change.end)} → ${change.text}</button>`)}</span>` : null}

@@ -1,10 +1,10 @@
 // @ts-check
-// Views beside the search: the library before anything is asked, coverage, the selection, two stores compared.
+// Views beside the search: the library before anything is asked, coverage, the selection.
 import { h, htm, signal, useEffect, useState } from "../vendor/core.js";
 import * as api from "./api.js";
 import { beside } from "./clock.js";
 import { setQuery } from "./editor.js";
-import { answer, find, keyOf, library, open, openFrame, openMatch, reasonOf, say, store, tally, text, tick, ticked, values, view } from "./state.js";
+import { answer, find, keyOf, library, open, openFrame, openMatch, reasonOf, store, tally, tick, ticked, values, view } from "./state.js";
 
 const html = htm.bind(h);
 
@@ -79,7 +79,7 @@ function go(name) {
 }
 
 /** @param {{table: any, most?: number}} props */
-function Table({ table, most = 200 }) {
+export function Table({ table, most = 200 }) {
   const number = (/** @type {any} */ v) => (Number.isInteger(v) ? v.toLocaleString("en") : v.toPrecision(4));
   return html`${(table.said || []).map((/** @type {string} */ line) => html`<p class="faint">${line}</p>`)}
     <table><thead><tr>${table.columns.map((/** @type {string} */ c, /** @type {number} */ i) => html`<th class=${table.rows.some((/** @type {any[]} */ r) => typeof r[i] === "number") ? "number" : ""}>${c.replace(/_/g, " ")}</th>`)}</tr></thead><tbody>
@@ -108,24 +108,25 @@ function Chart({ table, x, lines }) {
     <text class="axis-text" x="470" y="235" text-anchor="middle">${x}</text></svg>`;
 }
 
-/** Something that takes a while: asks once, and says what came of it. @param {string} path @param {any} body */
-function useWork(path, body) {
+/** Something that takes a while: asks once, and says what came of it; what is not looked at any more ends. @param {string} path @param {any} body */
+export function useWork(path, body) {
   const [told, tell] = useState(/** @type {any} */ ({}));
   useEffect(() => {
-    let mine = true;
+    const mine = new AbortController(), how = { signal: mine.signal };
     tell({ busy: true });
-    api.work(path, body).then((found) => { if (mine) tell({ found }); }).catch((error) => { if (mine) tell({ error: reasonOf(error) }); });
-    return () => { mine = false; };
+    (path === "api/diff" ? api.work(path, body, undefined, how) : api.json(path, body, how).then((found) => { if (found.error) throw new Error(found.error.reason); return found; }))
+      .then((found) => tell({ found })).catch((error) => { if (!mine.signal.aborted) tell({ error: reasonOf(error) }); });
+    return () => mine.abort();
   }, [path, JSON.stringify(body)]);
   return told;
 }
 
 /** @param {{told: any, children?: any}} props */
-const Waiting = ({ told, children }) => (told.error ? html`<p class="error" role="alert">${told.error}</p>` : told.busy || !told.found ? html`<p class="faint" role="status">working …</p>` : children(told.found));
+export const Waiting = ({ told, children }) => (told.error ? html`<p class="error" role="alert">${told.error}</p>` : told.busy || !told.found ? html`<p class="faint" role="status">working …</p>` : children(told.found));
 
 // Coverage ---------------------------------------------------------------------------------------------------------------
 
-const abstraction = signal("RSV");
+export const abstraction = signal("RSV");
 const what = signal("classes");
 
 export function Coverage() {
@@ -169,39 +170,4 @@ export function Selection() {
     <h2>Clips</h2><table><thead><tr><th>trace</th><th class="number">from</th><th class="number">to</th><td></td></tr></thead><tbody>
     ${all.map((m) => html`<tr key=${keyOf(m)}><td>${m.trace}</td><td class="number">${m.start.toFixed(2)} s</td><td class="number">${m.end.toFixed(2)} s</td>
       <td><button class="small" onClick=${() => { view.value = "find"; openMatch(m); }}>open</button> <button class="small" onClick=${() => tick(m)}>remove</button></td></tr>`)}</tbody></table></div>`;
-}
-
-// Two stores -------------------------------------------------------------------------------------------------------------
-
-export function Compare() {
-  const other = store.value.other;
-  if (!other) return html`<div class="sheet"><h2>One store</h2><p class="faint">Start <code>sgstore serve STORE --compare OTHER</code> to see two stores, or two runs, side by side.</p></div>`;
-  return html`<${Comparing} other=${other} />`;
-}
-
-/** @param {{other: any}} props */
-function Comparing({ other }) {
-  const told = useWork("api/diff", { text: abstraction.value });
-  const [found, tell] = useState(/** @type {any} */ (null));
-  useEffect(() => {
-    const query = text.value.trim();
-    if (!query || !/\bMATCH\b/i.test(query)) return;
-    Promise.all(["a", "b"].map(async (side) => {
-      const by = new Map();
-      for await (const line of api.lines("api/find", { text: query, side }, new AbortController().signal)) {
-        if (line.error) throw new Error(line.error.reason);
-        for (const [trace, first, last] of line.matches || []) for (let s = first; s <= last; s++) by.set(trace, (by.get(trace) || new Set()).add(s));
-      }
-      return by;
-    })).then(tell).catch((error) => say(reasonOf(error)));
-  }, [text.value]);
-  const names = found ? [...new Set([...found[0].keys(), ...found[1].keys()])].sort() : [];
-  return html`<div class="sheet" tabindex="0"><h2>${store.value.store} and ${other.store}</h2>
-    ${found ? html`<h2>Matches of the query</h2><table><thead><tr><th>trace</th><th class="number">frames in A</th><th class="number">in B</th><th class="number">only in A</th><th class="number">only in B</th><th>first that differs</th></tr></thead><tbody>
-      ${names.map((name) => {
-        const a = found[0].get(name) || new Set(), b = found[1].get(name) || new Set();
-        const odd = [...a].filter((s) => !b.has(s)), even = [...b].filter((s) => !a.has(s)), first = Math.min(...odd, ...even);
-        return html`<tr><td>${name}</td><td class="number">${a.size}</td><td class="number">${b.size}</td><td class="number">${odd.length}</td><td class="number">${even.length}</td><td>${Number.isFinite(first) ? html`<button class="quiet small" onClick=${() => { beside.value = true; openFrame(name, first); }}>${name}#${first}</button>` : "the same"}</td></tr>`;
-      })}</tbody></table>` : null}
-    <${Waiting} told=${told}>${(/** @type {any} */ d) => html`<h2>Scenes</h2><${Table} table=${d.scenes} /><h2>Frame by frame</h2><${Table} table=${d.frames} />`}</${Waiting}></div>`;
 }

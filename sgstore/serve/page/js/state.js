@@ -5,7 +5,8 @@ import * as api from "./api.js";
 
 /** A match: a run of frames of a trace, and the nodes that are bound.
  * @typedef {{trace: string, first: number, last: number, start: number, end: number,
- *   binding: Record<string, number>, names: Record<string, string>, values: Record<string, any>, index: number}} Match */
+ *   binding: Record<string, number>, names: Record<string, string>, values: Record<string, any>, index: any,
+ *   pattern?: string, group?: string, go?: () => void}} Match */
 /** @typedef {{name: string, frames: number, seconds: number, period: number, map: string, map_key: string,
  *   origin: [number, number], ego: string, cameras: string[], answers: string[], side?: string}} Trace */
 
@@ -31,8 +32,11 @@ export const lit = signal(/** @type {Set<number>} */ (new Set()));
 export const chosen = signal(/** @type {number | null} */ (null));
 export const toast = signal("");
 export const dialog = signal("");
-/** True in a report, which has no server. */
+/** True in a report, which has no server, and of a monitor, whose server knows the last frames only. */
 export const offline = signal(false);
+/** True of a monitor that runs; and the first and last frame of it that are kept. */
+export const live = signal(false);
+export const span = signal(/** @type {[number, number]} */ ([0, 0]));
 export const theme = signal(remembered("theme"));
 /** What the editor does; a report has none. */
 export const editing = {
@@ -172,6 +176,16 @@ export async function find(how = {}) {
     told.error = { reason: reasonOf(error) };
   }
   if (under === mine) { under = null; answer.value = { ...told }; writeAddress(); }
+}
+
+/** Matches among the lines of an answer. @param {AsyncIterable<any>} lines @returns {AsyncGenerator<Match>} */
+export async function* matchesIn(lines) {
+  const told = { names: [], matches: { length: 0 } };
+  for await (const line of lines) {
+    if (line.error) throw new Error(line.error.reason);
+    if (line.names) told.names = line.names;
+    for (const row of line.matches || []) { yield matchOf(row, told); told.matches.length++; }
+  }
 }
 
 /** @param {any[]} row @param {any} told @returns {Match} */

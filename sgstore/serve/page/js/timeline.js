@@ -1,23 +1,24 @@
 // @ts-check
 // The whole trace in time: matches, a lane for each part of the pattern, tags, values; drag to go there.
 import { h, htm, useRef } from "../vendor/core.js";
-import { frame, goTo, holdsAt, lanes, series } from "./clock.js";
+import { frame, goTo, holdsAt, lanes, range, series } from "./clock.js";
 import { keyOf, lit, matches, notes, open, playing, traces } from "./state.js";
 
 const html = htm.bind(h);
 
-/** @param {{spans: number[][], frames: number, kind: (i: number) => string, height?: number}} props */
-function Bars({ spans, frames, kind, height = 21 }) {
+/** @param {{spans: number[][], kind: (i: number) => string, height?: number}} props */
+export function Bars({ spans, kind, height = 21 }) {
+  const [from, to] = range.value, frames = to - from + 1;
   const drag = useRef(false);
   const at = (/** @type {any} */ e) => {
     const box = e.currentTarget.getBoundingClientRect();
-    goTo(Math.round(((e.clientX - box.left) / box.width) * (frames - 1)));
+    goTo(from + Math.round(((e.clientX - box.left) / box.width) * (frames - 1)));
   };
   const least = frames / 500;
-  return html`<svg viewBox=${`0 0 ${frames} ${height}`} preserveAspectRatio="none" aria-hidden="true"
+  return html`<svg viewBox=${`${from} 0 ${frames} ${height}`} preserveAspectRatio="none" aria-hidden="true"
       onPointerDown=${(/** @type {any} */ e) => { drag.current = true; playing.value = false; e.currentTarget.setPointerCapture(e.pointerId); at(e); }}
       onPointerMove=${(/** @type {any} */ e) => { if (drag.current) at(e); }} onPointerUp=${() => { drag.current = false; }}>
-    <rect class="bar-back" x="0" y="4" width=${frames} height=${height - 8} />
+    <rect class="bar-back" x=${from} y="4" width=${frames} height=${height - 8} />
     ${spans.map(([a, z], i) => html`<rect class=${kind(i)} x=${a} y="4" width=${Math.max((z || 0) - (a || 0) + 1, least)} height=${height - 8} />`)}
     <line class="cursor" x1=${frame.value + 0.5} x2=${frame.value + 0.5} y1="0" y2=${height} vector-effect="non-scaling-stroke" /></svg>`;
 }
@@ -44,24 +45,24 @@ function Series({ frames }) {
 export function Timeline() {
   const now = open.value, about = traces.value.get(now?.trace || "");
   if (!now || !about) return null;
-  const frames = about.frames, mine = matches.value.filter((m) => m.trace === now.trace);
+  const [from, to] = range.value, frames = to - from + 1, mine = matches.value.filter((m) => m.trace === now.trace);
   const tags = notes.value.filter((n) => n[0] === now.trace), holds = holdsAt(frame.value);
   const all = lanes.value?.lanes || [], steps = new Set(all.map((/** @type {any} */ l) => l.step)).size > 1;
   const first = [...mine].sort((a, b) => Number(a.index === now.match?.index) - Number(b.index === now.match?.index));
   const ticks = [0, 0.25, 0.5, 0.75, 1];
   return html`<div class="timeline" role="group" aria-label="Timeline">
     <div class="lane"><div class="label">${mine.length} ${mine.length === 1 ? "match" : "matches"} <span class="faint">in this trace</span></div>
-      <${Bars} spans=${first.map((m) => [m.first, m.last])} frames=${frames}
+      <${Bars} spans=${first.map((m) => [m.first, m.last])}
         kind=${(/** @type {number} */ i) => (first[i] && now.match && keyOf(first[i]) === keyOf(now.match) ? "bar-match" : "bar-match other")} /></div>
     ${all.map((/** @type {any} */ lane, /** @type {number} */ i) => {
       const nodes = Object.keys(lane.nodes).map((key) => now.binding?.[key]).filter((n) => n !== undefined);
       return html`<div class="lane" key=${i} data-holds=${String(holds[i])} onMouseEnter=${() => { lit.value = new Set(/** @type {number[]} */ (nodes)); }} onMouseLeave=${() => { lit.value = new Set(); }}>
         <div class="label mono" title=${lane.unknown.length ? `nothing is known of ${lane.unknown.join(", ")}` : lane.text}><span class=${`now ${holds[i] ? "holds" : "fails"}`}>${holds[i] === null ? "?" : holds[i] ? "✓" : "✗"}</span>${steps ? `${lane.step}. ` : ""}${lane.text}</div>
-        <${Bars} spans=${lane.spans} frames=${frames} kind=${() => "bar-hold"} /></div>`;
+        <${Bars} spans=${lane.spans} kind=${() => "bar-hold"} /></div>`;
     })}
-    ${tags.length ? html`<div class="lane"><div class="label">${tags.length} ${tags.length === 1 ? "tag" : "tags"}</div><${Bars} spans=${tags.map((n) => [n[1], n[1] + frames / 200])} frames=${frames} kind=${() => "bar-tag"} /></div>` : null}
+    ${tags.length ? html`<div class="lane"><div class="label">${tags.length} ${tags.length === 1 ? "tag" : "tags"}</div><${Bars} spans=${tags.map((n) => [n[1], n[1] + frames / 200])} kind=${() => "bar-tag"} /></div>` : null}
     ${series.value ? html`<${Series} frames=${frames} />` : null}
     <div class="lane" style=${{ height: "15px" }}><div class="label"></div><div class="row" style=${{ justifyContent: "space-between" }}>
-      ${ticks.map((share) => html`<span class="faint" style=${{ fontSize: "10.5px" }}>${(share * about.seconds).toFixed(1)} s</span>`)}</div></div>
+      ${ticks.map((share) => html`<span class="faint" style=${{ fontSize: "10.5px" }}>${(from * about.period + share * (about.seconds - from * about.period)).toFixed(1)} s</span>`)}</div></div>
   </div>`;
 }

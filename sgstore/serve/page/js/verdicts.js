@@ -7,6 +7,6 @@ const html = htm.bind(h);
 
 export function Verdicts() {
   const told = answer.value.verdicts;
-  return html`<div class="sheet" tabindex="0"><table><thead><tr><th>check</th><th>trace</th><th>verdict</th><th class="number">violations</th><th>reason</th></tr></thead>
-    <tbody>${told.map((/** @type {any} */ v) => html`<tr><td>${v.check}</td><td>${v.trace}</td><td class=${v.verdict === "true" ? "holds" : v.verdict === "false" ? "fails" : ""}>${v.verdict}</td><td class="number">${v.violations}</td><td>${v.reason}</td></tr>`)}</tbody></table></div>`;
+  return html`<div class="sheet verdicts" tabindex="0"><table><thead><tr><th>check</th><th>trace</th><th>verdict</th><th class="number">violations</th><th>robustness</th><th>reason</th></tr></thead>
+    <tbody>${told.map((/** @type {any} */ v) => html`<tr><td>${v.check}</td><td>${v.trace}</td><td class=${v.verdict === "true" ? "holds" : v.verdict === "false" ? "fails" : ""}>${v.verdict}</td><td class="number">${v.violations}</td><td>${v.robustness}</td><td>${v.reason}</td></tr>`)}</tbody></table></div>`;
 }

@@ -8,6 +8,13 @@ const ARRAYS = {
   u1: Uint8Array, u2: Uint16Array, u4: Uint32Array, i4: Int32Array, f4: Float32Array, f8: Float64Array,
 };
 
+/** @param {string} base64 @returns {Uint8Array<ArrayBuffer>} */
+export function bytesOf(base64) {
+  const packed = atob(base64), bytes = new Uint8Array(packed.length);
+  for (let i = 0; i < packed.length; i++) bytes[i] = packed.charCodeAt(i);
+  return bytes;
+}
+
 /** @param {ArrayBuffer} data @returns {Columns} */
 export function unpacked(data) {
   const [length] = new Uint32Array(data, 0, 1);

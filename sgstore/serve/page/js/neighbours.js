@@ -1,0 +1,92 @@
+// @ts-check
+// The nodes of a match and all that an edge joins to them, each where it lies: one hop of the graph of a frame.
+import { h, htm, signal } from "../vendor/core.js";
+import { panel } from "./clock.js";
+import { egoRow, rowOf, SCENERY, spotOf } from "./draw.js";
+import { chosen, lit, open } from "./state.js";
+
+const html = htm.bind(h);
+const MOST = 16, WIDE = 420, HIGH = 210;
+
+/** Edges of the panel, which the view from above shows, too. */
+export const hop = signal(/** @type {any[]} */ ([]));
+
+/** One hop around some nodes: who is there, the nearest first, and how they are joined.
+ * @param {any} graph @param {Set<number>} bound @param {(node: number) => number[] | null} placeOf */
+function hopOf(graph, bound, placeOf) {
+  /** @type {Map<string, {src: number, dst: number, labels: Set<string>, both: boolean}>} */
+  const pairs = new Map();
+  for (const { src, dst, relation } of graph.edges) {
+    if (src === dst || (!bound.has(src) && !bound.has(dst))) continue;
+    const key = src < dst ? `${src} ${dst}` : `${dst} ${src}`, one = pairs.get(key) || { src, dst, labels: new Set(), both: false };
+    one.labels.add(relation);
+    one.both ||= one.src !== src;
+    pairs.set(key, one);
+  }
+  const middle = [...bound].map(placeOf).find(Boolean) || [0, 0];
+  const far = (/** @type {number} */ node) => { const at = placeOf(node); return at ? Math.hypot((at[0] || 0) - (middle[0] || 0), (at[1] || 0) - (middle[1] || 0)) : Infinity; };
+  const kinds = new Map(graph.nodes.map((/** @type {any} */ n) => [n.id, n.kind]));
+  const all = [...new Set([...pairs.values()].flatMap(({ src, dst }) => [src, dst]))].filter((node) => !bound.has(node) && Number.isFinite(far(node)));
+  const met = all.filter((node) => !SCENERY.has(kinds.get(node)));
+  // Whoever moves before parts of the map, the nearest first.
+  const near = met.sort((a, b) => Number(a < 0) - Number(b < 0) || far(a) - far(b)).slice(0, MOST - bound.size);
+  const shown = new Set([...bound, ...near]);
+  return { shown: [...shown].filter((node) => placeOf(node)), edges: [...pairs.values()].filter(({ src, dst }) => shown.has(src) && shown.has(dst)), left: all.length - near.length };
+}
+
+/** Where nodes stand in the panel: in their direction, those far away less far. @param {number[]} nodes @param {(node: number) => number[] | null} placeOf
+ * @param {Set<number>} bound @param {number} turn */
+function layout(nodes, placeOf, bound, turn) {
+  const of = nodes.filter((n) => bound.has(n)).map((n) => placeOf(n) || [0, 0]), many = Math.max(of.length, 1);
+  const cx = of.reduce((s, [x]) => s + (x || 0), 0) / many, cy = of.reduce((s, [, y]) => s + (y || 0), 0) / many;
+  const polar = nodes.map((node) => {
+    const [x, y] = placeOf(node) || [0, 0], dx = (x || 0) - cx, dy = (y || 0) - cy;
+    return { node, far: Math.sqrt(Math.hypot(dx, dy)), angle: Math.atan2(dy, dx) + turn };
+  });
+  const most = Math.max(...polar.map((p) => p.far), 1);
+  const spots = polar.map(({ node, far, angle }) => ({ node, x: WIDE / 2 + (far / most) * (WIDE / 2 - 44) * Math.cos(angle), y: HIGH / 2 - (far / most) * (HIGH / 2 - 24) * Math.sin(angle) }));
+  for (let round = 0; round < 40; round++) { // who would stand on another steps aside
+    for (const a of spots) for (const b of spots) {
+      const dx = b.x - a.x, dy = b.y - a.y;
+      if (a === b || Math.abs(dx) > 62 || Math.abs(dy) > 24) continue;
+      const push = (dy < 0 || (dy === 0 && a.node < b.node) ? -1 : 1) * (24 - Math.abs(dy)) / 2;
+      a.y = Math.min(Math.max(a.y - push, 16), HIGH - 16);
+      b.y = Math.min(Math.max(b.y + push, 16), HIGH - 16);
+    }
+  }
+  return new Map(spots.map(({ node, x, y }) => [node, [x, y]]));
+}
+
+/** @param {{graph: any, states: any, north: boolean}} props */
+export function Neighbours({ graph, states, north }) {
+  const now = open.value, ego = states ? egoRow(states) : -1;
+  if (!now || !states) return null;
+  const keys = new Map(Object.entries(now.binding || {}).map(([key, node]) => [node, key]));
+  const bound = new Set(keys.size ? keys.keys() : ego >= 0 ? [states.columns.node[ego]] : []);
+  if (chosen.value !== null) bound.add(chosen.value);
+  const about = new Map(graph.nodes.map((/** @type {any} */ n) => [n.id, n]));
+  const near = [...bound].map((n) => rowOf(states, n)).filter((row) => row >= 0).map((row) => [states.columns.x[row], states.columns.y[row]])[0];
+  const placeOf = (/** @type {number} */ node) => (about.has(node) ? spotOf(now.trace, states, node, near) : null);
+  const { shown, edges, left } = hopOf(graph, bound, placeOf);
+  const heading = ego >= 0 ? states.columns.heading[ego] : NaN;
+  const at = layout(shown, placeOf, bound, north || !Number.isFinite(heading) ? 0 : Math.PI / 2 - heading);
+  const drawn = edges.filter(({ src, dst }) => at.has(src) && at.has(dst));
+  const told = drawn.map(({ src, dst, both, labels }) => ({ src, dst, both, label: [...labels].join(", "), holds: null }));
+  queueMicrotask(() => { if (JSON.stringify(hop.peek()) !== JSON.stringify(told)) hop.value = told; });
+  const name = (/** @type {number} */ node) => keys.get(node) || about.get(node)?.kind.replace(/_/g, " ") || String(node);
+  return html`<div class="scroll near"><svg viewBox=${`0 0 ${WIDE} ${HIGH}`} role="img" aria-label="Neighbours">
+      ${drawn.map(({ src, dst, labels, both }) => {
+        const [ax, ay] = at.get(src) || [0, 0], [bx, by] = at.get(dst) || [0, 0], inside = bound.has(src) && bound.has(dst), on = lit.value.has(src) && lit.value.has(dst);
+        const words = [...labels], text = words.length > 2 && !on ? `${words[0]} +${words.length - 1}` : words.join(", ");
+        return html`<g class=${on || inside ? "holds" : "faint"} stroke="currentColor" onMouseEnter=${() => { lit.value = new Set([src, dst]); }} onMouseLeave=${() => { lit.value = new Set(); }}>
+          <title>${`${name(src)} ${words.join(", ")} ${name(dst)}${both ? ", and back" : ""}`}</title><path d=${`M${ax} ${ay}L${bx} ${by}`} stroke-width=${on ? 3 : inside ? 2 : 1} /><path d=${`M${ax} ${ay}L${bx} ${by}`} stroke="transparent" stroke-width="9" />
+          ${on || inside || drawn.length < 9 ? html`<text class="halo" x=${((ax || 0) + (bx || 0)) / 2} y=${((ay || 0) + (by || 0)) / 2 - 3} font-size="9.5" text-anchor="middle" fill="currentColor">${text}</text>` : null}</g>`;
+      })}
+      ${shown.map((node) => {
+        const [x, y] = at.get(node) || [0, 0], one = name(node).slice(0, 12), wide = Math.max(one.length * 6 + 14, 34);
+        return html`<g key=${node} style=${{ cursor: node >= 0 ? "pointer" : "default" }} onMouseEnter=${() => { lit.value = new Set([node]); }} onMouseLeave=${() => { lit.value = new Set(); }}
+          onClick=${() => { if (node >= 0) { chosen.value = node; panel.value = "near"; } }}><title>${about.get(node)?.name || node}</title>
+          <rect x=${(x || 0) - wide / 2} y=${(y || 0) - 11} width=${wide} height="22" rx=${node < 0 ? 4 : 11} fill=${bound.has(node) ? "var(--soft)" : "var(--raised)"} stroke=${bound.has(node) ? "var(--mark)" : lit.value.has(node) ? "var(--accent)" : "var(--line)"} stroke-width=${bound.has(node) ? 2 : 1.2} />
+          <text x=${x} y=${(y || 0) + 3.5} font-size="10" font-weight=${bound.has(node) ? 600 : 400} text-anchor="middle" fill="var(--ink)">${one}</text></g>`;
+      })}</svg>${left > 0 ? html`<p class="faint">and ${left} more: scenery, or farther away</p>` : null}</div>`;
+}
