@@ -60,7 +60,7 @@ TESTS = {
     "selection": "selection selection_* prioritize",
     "sumo_net": "sumo",
     "sgg": "sgg sgg_* crowds",
-    "serve": "serve report explorer sandbox_pool",
+    "serve": "serve live report explorer sandbox_pool",
     "step": "online",
     "store": "store store_* doors events",
     "temporal": "temporal monitor over_time happens robustness windows tolerance",

@@ -334,6 +334,30 @@ def test_what_two_queries_differ_in_is_a_gallery(page: Any, town_store: Path) ->
     expect(time_shown(page)).to_contain_text(f"town#{seq} ")
 
 
+def test_a_monitor_is_seen_while_it_runs(visit: Callable[..., Any]) -> None:
+    command = [sys.executable, "-m", "sgstore", "monitor", str(RECORDING), "--serve"]
+    command += ["-e", f"CHECK calm: ALWAYS ego.speed < 3; {NEAR} WHERE e.speed > 1"]
+    child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    assert child.stderr is not None
+    try:
+        page = visit(child.stderr.readline().split()[-1])
+        page.locator(".tile canvas[data-painted]").first.wait_for()
+        was = time_shown(page).inner_text()
+        expect(time_shown(page)).not_to_have_text(was)
+        assert page.locator("[data-statement]").count() == 2
+        page.locator(".tile", has_text="pattern").first.click()
+        page.locator(".timeline .lane[data-holds=true]").first.wait_for()
+        page.get_by_role("button", name="Back to live").click()
+        was = time_shown(page).inner_text()
+        expect(time_shown(page)).not_to_have_text(was)
+        seen(page, "live")
+        if AXE.exists():
+            assert faults(page) == []
+    finally:
+        child.terminate()
+        child.communicate(timeout=20)
+
+
 def test_coverage_is_shown_and_a_gap_is_a_query(page: Any) -> None:
     page.get_by_role("button", name="Coverage").click()
     page.locator(".chart").wait_for()

@@ -8,7 +8,10 @@ from __future__ import annotations
 import math
 import re
 import shutil
+import threading
+from contextlib import suppress
 from dataclasses import asdict
+from functools import partial
 from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -40,14 +43,15 @@ from sgstore.cli._options import (
 )
 from sgstore.cli._output import json_text, say
 from sgstore.cli._places import collection_at, say_missing, url_of
+from sgstore.cli._process import was_ended
 from sgstore.files import without_controls, write_bytes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from sgstore.collection import PartedChecks
     from sgstore.matches import Interval
-    from sgstore.temporal import CheckRun, MonitorEvent, Verdict
+    from sgstore.temporal import CheckRun, FrameSource, Monitor, MonitorEvent, Verdict
 
 PANEL: Final = "Rules over time"
 
@@ -271,6 +275,8 @@ def monitor(
         bool, Option("--require", help="End with exit code 4 if a check is violated.")
     ] = False,
     as_json: AsJson = False,
+    serve: Annotated[bool, Option("--serve", help="Show a page of it while it goes on.")] = False,
+    port: Annotated[int, Option("--port", min=0, max=65535, help="Of the page; 0: any.")] = 0,
     *,
     statements: Statements,
     reading: ReadingOptions,
@@ -278,7 +284,8 @@ def monitor(
     """Watch a recording as if it were live, or a running CARLA.
 
     One line for each violation and each match, as soon as it is known; then the verdicts. The answers are
-    those of check and find over a store.
+    those of check and find over a store. With --serve a page shows
+    the scene, a recording in its own time; it stays until Ctrl-C.
     """
     from sgstore.config import Config
     from sgstore.lang import joined
@@ -287,19 +294,23 @@ def monitor(
     asked, values = statements.asked(files)
     settings = reading.settings() or Config()
     tell = _as_json if as_json else _for_people
+    longest = seconds_of(duration, "--duration") if duration else None
     with opened(trace, settings, road_map=reading.road_map, ego=ego) as source:
-        watched = Monitor(
+        watch = partial(
+            Monitor,
             joined([*chain.from_iterable(asked.values())]),
             source.road_map,
             settings,
-            on_event=tell,
             parameters=values,
             trace=source.name,
             called=_called(asked),
             sgsm_compat=statements.sgsm_compat,
         )
-        longest = seconds_of(duration, "--duration") if duration else None
-        verdicts = watched.run(source.frames, duration_s=longest)
+        if serve:
+            watched, verdicts = _watched_on_a_page(watch, source, tell, longest, port)
+        else:
+            watched = watch(on_event=tell)
+            verdicts = watched.run(source.frames, duration_s=longest)
     losses = [*source.losses, *(loss.reason for loss in watched.generator.losses)]
     for warning in [*source.warnings, *losses]:
         say(warning)
@@ -308,6 +319,35 @@ def monitor(
     if require and any(verdict.violated for verdict in verdicts):
         return NO_MATCH
     return LOSS if losses else 0
+
+
+def _watched_on_a_page(
+    watch: Callable[..., Monitor],
+    source: FrameSource,
+    tell: Callable[[MonitorEvent], None],
+    longest: float | None,
+    port: int,
+) -> tuple[Monitor, tuple[Verdict, ...]]:
+    """A monitor that has watched, beside a page that shows it; and the verdicts, when both have ended."""
+    from sgstore.serve import LiveRun, paced, serve_live
+
+    page = LiveRun(source.name, source.road_map)
+
+    def told(event: MonitorEvent) -> None:
+        tell(event)
+        page.event(event)
+
+    watched = watch(on_event=told, on_step=page.step)
+    page.follow(watched)
+    with serve_live(page, port=port, on_start=say):
+        frames = source.frames if source.live else paced(source.frames)
+        verdicts = watched.run(frames, duration_s=longest)
+        page.end(verdicts)
+        if not was_ended():
+            say("the page stays until Ctrl-C")
+            with suppress(KeyboardInterrupt):
+                threading.Event().wait()
+    return watched, verdicts
 
 
 def _called(asked: Mapping[str, list[str]]) -> list[str]:

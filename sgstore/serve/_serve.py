@@ -6,14 +6,26 @@ import secrets
 import socket
 import threading
 import webbrowser
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from sgstore.errors import ConfigError, MissingExtraError, SgstoreError
 
+try:
+    import uvicorn
+
+    from sgstore.serve._app import Explorer, application
+    from sgstore.serve._live import live_application
+except ImportError as error:
+    raise MissingExtraError("the explorer", "ui") from error
+
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Generator
     from pathlib import Path
+
+    from sgstore.serve._guard import Guard
+    from sgstore.serve._live import LiveRun
 
 HOST: Final = "127.0.0.1"
 
@@ -52,44 +64,75 @@ def serve(
         There is no such store.
     ConfigError
         The address cannot be listened on.
-    MissingExtraError
-        The packages of the extra ``ui`` are not installed.
     """
-    try:
-        import uvicorn
-
-        from sgstore.serve._app import Explorer, application
-    except ImportError as error:
-        raise MissingExtraError("the explorer", "ui") from error
     with ExitStack() as unless_begun:
         explorer = Explorer(store, other=other, write_to=write_to)
         unless_begun.callback(explorer.close)
-        listening = unless_begun.enter_context(_listening(host, port))
+        make = partial(application, explorer)
+        with _page_of(make, host, port) as (server, listening, address):
+            threading.Thread(target=_warm, args=(explorer,), daemon=True).start()
+            on_start(address)
+            if browse:
+                webbrowser.open(address)
+            unless_begun.pop_all()
+            with suppress(KeyboardInterrupt):
+                server.run(sockets=[listening])
+
+
+@contextmanager
+def serve_live(
+    run: LiveRun, *, port: int = 0, browse: bool = False, on_start: Callable[[str], None] = print
+) -> Generator[None]:
+    """Serve the page of a monitor beside it, on this machine alone; at the end of the block it is gone.
+
+    Parameters
+    ----------
+    run : LiveRun
+    port, browse, on_start
+        As :func:`serve` takes them.
+
+    Raises
+    ------
+    ConfigError
+        The address cannot be listened on.
+    """
+    with _page_of(partial(live_application, run), HOST, port) as (server, listening, address):
+        thread = threading.Thread(target=server.run, args=([listening],), daemon=True)
+        thread.start()
+        on_start(address)
+        if browse:
+            webbrowser.open(address)
+        try:
+            yield
+        finally:
+            server.should_exit = True
+            thread.join(5)
+
+
+@contextmanager
+def _page_of(
+    make: Callable[[str, tuple[str, ...], str], Guard], host: str, port: int
+) -> Generator[tuple[uvicorn.Server, socket.socket, str]]:
+    """A server of an application, the socket that it is to listen on, and the address with its token."""
+    with _listening(host, port) as listening:
         number = listening.getsockname()[1]
         token = secrets.token_urlsafe(24)
         names = dict.fromkeys((f"[{host}]" if ":" in host else host, HOST, "localhost"))
         hosts = tuple(f"{name}:{number}" for name in names)
         config = uvicorn.Config(
-            application(explorer, token, hosts, f"sgstore-{number}"),
+            make(token, hosts, f"sgstore-{number}"),
             log_level="warning",
             access_log=False,
             server_header=False,
             lifespan="on",  # at its end the explorer is closed
             timeout_graceful_shutdown=1,  # a question under way does not keep the server
         )
-        threading.Thread(target=_warm, args=(explorer,), daemon=True).start()
-        address = f"http://{hosts[0]}/?token={token}"
-        on_start(address)
-        if browse:
-            webbrowser.open(address)
-        unless_begun.pop_all()
-    with suppress(KeyboardInterrupt):
-        uvicorn.Server(config).run(sockets=[listening])
+        yield uvicorn.Server(config), listening, f"http://{hosts[0]}/?token={token}"
 
 
-def _warm(explorer: object) -> None:
+def _warm(explorer: Explorer) -> None:
     """Read maps before somebody asks for them."""
-    for reads in explorer.reads.values():  # type: ignore[attr-defined]
+    for reads in explorer.reads.values():
         with suppress(SgstoreError):
             reads.warm()
 

@@ -1,0 +1,389 @@
+"""A monitor as a page: every frame as it comes, what checks and patterns become, and lanes of truth of a match.
+
+The monitor tells a :class:`LiveRun` of each frame. It keeps the last ones, as they are sent, and of the last
+few seconds the graphs, so that the parts of a match can be looked at before and after it was found. Whoever
+reads too slowly misses frames, and nobody waits for him.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import math
+import threading
+import time
+from collections import OrderedDict, deque
+from dataclasses import asdict
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from starlette.applications import Starlette
+from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.routing import Route
+
+from sgstore.errors import QueryNameError, SgstoreError
+from sgstore.lang import Binding, FrameView, ScopeSearch, parts_of
+from sgstore.serve._app import given_file, page_of, told
+from sgstore.serve._guard import Guard
+from sgstore.serve._reads import clean, drawn_map
+from sgstore.serve._requests import Fields
+from sgstore.serve._wire import as_json, packed
+from sgstore.vocabulary import KIND_CODE, KINDS, LIGHT_STATE_CODE, LIGHT_STATES
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
+
+    from starlette.requests import Request
+
+    from sgstore.graph import SceneGraph
+    from sgstore.lang.ir import Query
+    from sgstore.roads import RoadMap
+    from sgstore.step import Frame
+    from sgstore.temporal import FrameTime, Monitor, MonitorEvent, Verdict
+
+MOST_FRAMES: Final = 3000
+"""Frames that are kept for whoever opens the page later, and at most so many bytes of them."""
+MOST_BYTES: Final = 32 << 20
+
+MOST_EDGES: Final = 100_000
+"""Edges of the last graphs that are kept for lanes of truth; some 30 MB."""
+
+MOST_NAMES: Final = 20_000
+"""Entities whose names are kept."""
+
+WATCHED: Final = 8
+"""Matches whose parts are followed on."""
+
+LOOK_S: Final = 0.02
+"""How often is looked for a new frame; s."""
+
+_STATES: Final = {
+    **dict.fromkeys(("x", "y", "heading", "speed", "length", "width"), np.float32),
+    "node": np.int32,
+    **dict.fromkeys(("kind", "ego", "light"), np.uint8),
+}
+_NO_LIGHT: Final = len(LIGHT_STATES)
+
+
+class NotKeptError(SgstoreError):
+    """A part asks for what was known of a frame only while it was the last one: its class, roles of lanes."""
+
+
+class WatchedMatch:
+    """Parts of a pattern for the nodes of a match, frame by frame.
+
+    Parameters
+    ----------
+    query : Query
+        As the monitor has bound it.
+    nodes : mapping of str to int
+
+    Raises
+    ------
+    QueryNameError
+        The pattern has no such variable.
+    """
+
+    def __init__(self, query: Query, nodes: Mapping[str, int]) -> None:
+        self._nodes = dict(nodes)
+        self._parts = tuple(parts_of(query, nodes))
+        self._spans: list[list[list[int]]] = [[] for _ in self._parts]
+        self._search = [
+            None
+            if part.query.steps  # it is about other frames, too
+            else ScopeSearch(part.query.scope, injective=part.query.injective)
+            for part in self._parts
+        ]
+        self._begun = self._seen = -1
+
+    def look(self, views: Iterable[FrameView]) -> None:
+        """Look at the frames that were not looked at yet."""
+        for view in views:
+            seq = view.frame["seq"]
+            if seq <= self._seen:
+                continue
+            self._begun = seq if self._begun < 0 else self._begun
+            self._seen = seq
+            for number, (search, spans) in enumerate(zip(self._search, self._spans, strict=True)):
+                try:
+                    holds = search is not None and any(True for _ in search.run(Binding(view)))
+                except NotKeptError:
+                    self._search[number], holds = None, False
+                if holds and spans and spans[-1][1] == seq - 1:
+                    spans[-1][1] = seq
+                elif holds:
+                    spans.append([seq, seq])
+
+    def lanes(self, first: int) -> dict[str, Any]:
+        """Lanes of truth from a frame on, as :meth:`sgstore.Store.parts` gives them of a whole trace."""
+        return {
+            "binding": self._nodes,
+            "known": [max(first, self._begun), self._seen],
+            "lanes": [
+                {
+                    "text": part.text,
+                    "step": part.step,
+                    "nodes": part.nodes,
+                    "edges": [asdict(edge) for edge in part.edges],
+                    "conditions": part.conditions,
+                    "spans": [] if search is None else [one for one in spans if one[1] >= first],
+                    "unknown": ["what is asked of other frames"] if search is None else [],
+                }
+                for part, search, spans in zip(self._parts, self._search, self._spans, strict=True)
+            ],
+        }
+
+
+class LiveRun:
+    """What a page that follows a monitor is sent.
+
+    Parameters
+    ----------
+    name : str
+        Of the recording, or of the world.
+    road_map : RoadMap, optional
+    """
+
+    def __init__(self, name: str, road_map: RoadMap | None) -> None:
+        self.name = name
+        self._map = drawn_map(road_map)
+        self._has_map = road_map is not None
+        self._lock = threading.Lock()
+        self._monitor: Monitor | None = None
+        self._sent: deque[bytes] = deque()
+        self._gone = self._bytes = 0
+        self._views: deque[FrameView] = deque()
+        self._edges = 0
+        self._names: OrderedDict[int, list[str]] = OrderedDict()
+        self._still: dict[int, list[Any]] = {}
+        self._events: list[dict[str, Any]] = []
+        self._origin: tuple[float, float] | None = None
+        self._watched: OrderedDict[tuple[Any, ...], WatchedMatch] = OrderedDict()
+
+    # What the monitor tells ------------------------------------------------------------------------
+
+    def follow(self, monitor: Monitor) -> None:
+        """Take the monitor that tells; before its first frame."""
+        self._monitor = monitor
+
+    def event(self, event: MonitorEvent) -> None:
+        """Take an event: it goes with its frame."""
+        with self._lock:
+            self._events.append(
+                {
+                    "kind": event.kind,
+                    "name": event.name,
+                    "first": event.start.seq,
+                    "last": event.end.seq,
+                    "start": event.start.t,
+                    "end": event.end.t,
+                    "nodes": dict(event.nodes),
+                    "names": dict(event.names),
+                    "values": clean(event.values),
+                }
+            )
+
+    def step(self, here: FrameTime, graphs: Sequence[SceneGraph]) -> None:
+        """Take a frame with its graphs; of several egos the first one's is shown."""
+        graph, monitor = graphs[0], self._monitor
+        with self._lock:
+            if self._origin is None:
+                self._origin = _origin_of(graph)
+            header = {
+                "seq": here.seq,
+                "t": here.t,
+                "origin": self._origin,
+                "ego": -1 if graph.ego is None else graph.ego,
+                "names": self._new_names(graph),
+                "still": self._new_still(graph),
+                "status": monitor.status if monitor is not None else {},
+                "events": self._events,
+            }
+            self._events = []
+            data = packed(header, _columns(graph, self._origin))
+            self._put("frame", base64.b64encode(data))
+            frame = {"id": here.seq, "seq": here.seq, "time_ns": here.time_ns, "t": here.t}
+            about = {"id": 0, "name": monitor.trace if monitor is not None else self.name}
+            self._views.append(FrameView(graph, frame, about, _not_kept, _not_kept))
+            self._edges += len(graph.edges)
+            while self._edges > MOST_EDGES and len(self._views) > 1:
+                self._edges -= len(self._views.popleft().graph.edges)
+            for watched in self._watched.values():
+                watched.look([self._views[-1]])
+
+    def end(self, verdicts: Sequence[Verdict]) -> None:
+        """Take the verdicts: there are no more frames."""
+        with self._lock:
+            listed = [[one.check, one.verdict, len(one.violations), one.reason] for one in verdicts]
+            told = {"verdicts": listed, "events": self._events}
+            self._put("end", as_json(told))
+
+    def _put(self, event: str, data: bytes) -> None:
+        message = b"event: " + event.encode() + b"\ndata: " + data + b"\n\n"
+        self._sent.append(message)
+        self._bytes += len(message)
+        while len(self._sent) > MOST_FRAMES or (self._bytes > MOST_BYTES and len(self._sent) > 1):
+            self._bytes -= len(self._sent.popleft())
+            self._gone += 1
+
+    def _new_names(self, graph: SceneGraph) -> dict[int, list[str]]:
+        found = {
+            node: [about["kind"], about.get("ident", ""), ""]
+            for node, about in graph.nodes.items()
+            if node >= 0 and node not in self._names
+        }
+        self._names |= found
+        while len(self._names) > MOST_NAMES:
+            self._names.popitem(last=False)
+        return found
+
+    def _new_still(self, graph: SceneGraph) -> list[list[Any]]:
+        """What stands and was not there before: node, kind, x, y, heading, length, width."""
+        x, y = self._origin or (0.0, 0.0)
+        new = [n for n, a in graph.nodes.items() if n >= 0 and a["is_static"]]
+        for node in (new := [node for node in new if node not in self._still]):
+            about = graph.nodes[node]
+            place = about.get("x", math.nan) - x, about.get("y", math.nan) - y
+            turned = math.radians(about.get("heading", 0.0))
+            size = about.get("length"), about.get("width")
+            told = [node, KIND_CODE[about["kind"]], *place, turned, *size]
+            self._still[node] = clean(told)
+        return [self._still[node] for node in new]
+
+    # What the page asks --------------------------------------------------------------------------------
+
+    def about(self) -> dict[str, Any]:
+        """What the page is told first, as of a store with one trace."""
+        trace = {"name": self.name, "frames": 0, "seconds": 0.0, "period": 0.0, "map": ""}
+        trace |= {"map_key": "live" * self._has_map, "origin": self._origin or (0.0, 0.0)}
+        trace |= {"ego": "", "cameras": [], "answers": []}
+        monitor = self._monitor
+        names = monitor.names if monitor is not None else ()
+        checks = [*monitor.status] if monitor is not None else []
+        codes = {"kind": list(KINDS), "light": [*LIGHT_STATES, "unknown"]}
+        return {"store": self.name, "traces": [trace], "codes": codes, "other": None} | {
+            "writing": False,
+            "checks": checks,
+            "patterns": [name for name in names if name not in checks],
+        }
+
+    def outlines(self) -> bytes:
+        """Outlines of the road map; without points where there is none."""
+        return self._map
+
+    def parts(self, name: str, nodes: Mapping[str, int]) -> dict[str, Any]:
+        """Lanes of truth of a match, over the frames whose graphs are kept; they are followed on.
+
+        Raises
+        ------
+        QueryNameError
+            There is no such pattern, or it has no such variable.
+        """
+        with self._lock:
+            queries = self._monitor.patterns if self._monitor is not None else {}
+            if name not in queries:
+                raise QueryNameError(f"no pattern {name!r} is watched")
+            key = (name, *sorted(nodes.items()))
+            if key not in self._watched:
+                self._watched[key] = WatchedMatch(queries[name], nodes)
+                self._watched[key].look(self._views)
+            self._watched.move_to_end(key)
+            while len(self._watched) > WATCHED:
+                self._watched.popitem(last=False)
+            return {"trace": self.name, **self._watched[key].lanes(self._gone)}
+
+    def _hello(self) -> tuple[int, bytes]:
+        """The number of the first message that is kept, and what a page must know before it."""
+        with self._lock:
+            told = {"about": self.about(), "names": self._names, "still": [*self._still.values()]}
+            return self._gone, b"event: hello\ndata: " + as_json(told) + b"\n\n"
+
+    def _since(self, number: int) -> tuple[int, list[bytes]]:
+        """Messages from a number on, as far as they are kept, and the number of the next."""
+        with self._lock:
+            found = list(islice(self._sent, max(number - self._gone, 0), None))
+            return self._gone + len(self._sent), found
+
+    async def messages(self) -> AsyncIterator[bytes]:
+        """Server-sent events: all that is kept, then each frame as it comes."""
+        number, hello = self._hello()
+        yield hello
+        while True:
+            number, found = self._since(number)
+            if found:
+                yield b"".join(found)
+            await asyncio.sleep(LOOK_S)
+
+
+def paced(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """Frames of a recording as they would come from a running world: each in its time."""
+    begun = first = None
+    for frame in frames:
+        if begun is None or first is None:
+            begun, first = time.monotonic(), frame.time_ns
+        wait = begun + (frame.time_ns - first) / 1e9 - time.monotonic()
+        if wait > 0:
+            time.sleep(wait)
+        yield frame
+
+
+def live_application(run: LiveRun, token: str, hosts: tuple[str, ...], cookie: str) -> Guard:
+    """The ASGI application of a monitor, behind a token; as :func:`sgstore.serve.application`."""
+
+    async def page(request: Request) -> Response:
+        return await page_of(request, "live.js")
+
+    async def about(_: Request) -> Response:
+        return JSONResponse(run.about())
+
+    async def outlines(_: Request) -> Response:
+        return Response(run.outlines(), media_type="application/octet-stream")
+
+    async def parts(request: Request) -> Response:
+        fields = await Fields.of(request)
+        nodes = fields.binding() or {}
+        return JSONResponse(await asyncio.to_thread(run.parts, fields.text("text"), nodes))
+
+    async def live(_: Request) -> Response:
+        return StreamingResponse(run.messages(), media_type="text/event-stream")
+
+    get = ["GET"]
+    routes = [
+        Route("/", told(page), methods=get),
+        Route("/static/{name:path}", told(given_file), methods=get),
+        Route("/api/store", told(about), methods=get),
+        Route("/api/map", told(outlines), methods=get),
+        Route("/api/parts", told(parts), methods=["POST"]),
+        Route("/api/live", told(live), methods=get),
+    ]
+    return Guard(Starlette(routes=routes), token, hosts, cookie)
+
+
+def _columns(graph: SceneGraph, origin: tuple[float, float]) -> dict[str, Any]:
+    """States of what moves, as the page draws them."""
+    moving = [(n, a) for n, a in graph.nodes.items() if n >= 0 and not a["is_static"]]
+    columns: dict[str, list[Any]] = {
+        name: [about.get(name, math.nan) for _, about in moving] for name in _STATES
+    }
+    for name, place in zip("xy", origin, strict=True):
+        columns[name] = [value - place for value in columns[name]]
+    columns["heading"] = [math.radians(degrees) for degrees in columns["heading"]]
+    columns["node"] = [node for node, _ in moving]
+    columns["ego"] = [int(node == graph.ego) for node, _ in moving]
+    columns["kind"] = [KIND_CODE[about["kind"]] for _, about in moving]
+    columns["light"] = [
+        LIGHT_STATE_CODE.get(about.get("light_state", ""), _NO_LIGHT) for _, about in moving
+    ]
+    return {name: np.array(columns[name], type_) for name, type_ in _STATES.items()}
+
+
+def _origin_of(graph: SceneGraph) -> tuple[float, float]:
+    """A place near which the others are, so that they fit into 32 bits."""
+    places = [a for n, a in graph.nodes.items() if n >= 0]
+    first = graph.nodes[graph.ego] if graph.ego is not None else next(iter(places), {})
+    return float(round(first.get("x", 0.0))), float(round(first.get("y", 0.0)))
+
+
+def _not_kept(*_: object) -> Any:
+    raise NotKeptError("it is known of the last frame only")

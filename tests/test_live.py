@@ -1,0 +1,187 @@
+"""A monitor as a page: what it is sent is what a store has of the recording, frame by frame."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import json
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+pytest.importorskip("starlette", reason="the extra [ui] is not installed")
+
+pytest.importorskip("httpx")
+
+import httpx
+import numpy as np
+from columns_read import unpacked
+
+from sgstore.config import Config
+from sgstore.demo import RECORDING
+from sgstore.errors import QueryNameError
+from sgstore.serve import LiveRun, live_application, paced
+from sgstore.step import Frame
+from sgstore.temporal import Monitor, MonitorEvent, opened
+
+if TYPE_CHECKING:
+    from sgstore.query import Store
+
+FRAMES = 60
+NEAR = "MATCH (e:Ego)-[:near]->(v:Vehicle) WHERE v.speed > 1 AND e.speed < 20"
+CHECK = "CHECK calm: FORALL (v:Vehicle) ALWAYS v.speed < 4"
+
+
+async def told(run: LiveRun) -> list[tuple[str, Any]]:
+    """Events that a page is sent, up to the end of the run."""
+    found: list[tuple[str, Any]] = []
+    async for part in run.messages():
+        for message in part.decode().split("\n\n")[:-1]:
+            event, data = message.split("\n")
+            name, data = event.removeprefix("event: "), data.removeprefix("data: ")
+            is_frame = name == "frame"
+            found.append((name, unpacked(base64.b64decode(data)) if is_frame else json.loads(data)))
+        if found[-1][0] == "end":
+            return found
+    raise AssertionError("it ended without its end")
+
+
+@pytest.fixture(scope="module")
+def watched() -> tuple[LiveRun, list[MonitorEvent], list[tuple[str, Any]]]:
+    events: list[MonitorEvent] = []
+    with opened(str(RECORDING), Config()) as source:
+        run = LiveRun("town", source.road_map)
+
+        def tell(event: MonitorEvent) -> None:
+            events.append(event)
+            run.event(event)
+
+        monitor = Monitor(
+            f"{CHECK};{NEAR}", source.road_map, Config(), on_event=tell, on_step=run.step
+        )
+        run.follow(monitor)
+        run.end(monitor.run(islice(source.frames, FRAMES)))
+    return run, events, asyncio.run(told(run))
+
+
+def test_frames_are_those_of_a_store(watched: Any, open_town: Store) -> None:
+    (_, hello), *frames, _ = watched[2]
+    sql = (
+        "SELECT n.node_id, n.kind, n.x, n.y, n.speed FROM nodes n JOIN frames f USING (frame_id)"
+        " WHERE NOT n.is_static AND n.node_id >= 0 AND f.seq = $seq ORDER BY n.node_id"
+    )
+    origin, kinds = None, hello["about"]["codes"]["kind"]
+    assert [header["seq"] for _, (header, _) in frames] == list(range(FRAMES))
+    for _, (header, columns) in frames[::20]:
+        rows = open_town.sql(sql.replace("$seq", str(header["seq"]))).values
+        assert columns["node"].tolist() == [row[0] for row in rows]
+        assert [kinds[code] for code in columns["kind"]] == [row[1] for row in rows]
+        places = np.array([row[2:4] for row in rows]) - np.stack([columns["x"], columns["y"]], 1)
+        origin = places[0] if origin is None else origin
+        assert np.allclose(places, origin, atol=2e-3)
+        speeds = np.array([row[4] for row in rows], float)
+        assert np.allclose(columns["speed"], speeds, atol=1e-3, equal_nan=True)
+        assert columns["node"][columns["ego"] == 1].tolist() == [header["ego"]]
+
+
+def test_events_come_with_their_frames(watched: Any) -> None:
+    _, events, ((_, hello), *frames, (_, end)) = watched
+    sent = [event for _, (header, _) in frames for event in header["events"]] + end["events"]
+
+    assert hello["about"]["checks"] == ["calm"]
+    assert hello["about"]["patterns"] == ["pattern"]
+    assert len(events) > 3
+    assert [(e.kind, e.name, e.start.seq, dict(e.nodes)) for e in events] == [
+        (e["kind"], e["name"], e["first"], e["nodes"]) for e in sent
+    ]
+    assert end["verdicts"][0][:2] == ["calm", "false"]
+    assert frames[-1][1][0]["status"] == {"calm": "false"}
+
+
+def test_lanes_of_truth_are_those_of_a_store(watched: Any, open_town: Store) -> None:
+    run, events, _ = watched
+    found = [event for event in events if event.kind == "found"]
+    assert len(found) == 3
+    for event in found:
+        lanes = run.parts("pattern", event.nodes)
+        assert lanes["known"] == [0, FRAMES - 1]
+        parts = open_town.parts(NEAR, f"town#{event.start.seq}", event.nodes).lanes
+        assert [lane["text"] for lane in lanes["lanes"]] == [one.part.text for one in parts]
+        for lane, one in zip(lanes["lanes"], parts, strict=True):
+            seqs = {seq for a, z in lane["spans"] for seq in range(a, z + 1)}
+            kept = range(FRAMES)
+            assert seqs == {seq for a, z in one.spans for seq in range(a, z + 1) if seq in kept}
+
+
+def test_a_part_over_time_is_not_known(open_town: Store) -> None:
+    text = "MATCH (v:Vehicle) WHERE v.speed > 1 AND run_length(v.speed > 1) >= 0.1s"
+    run = LiveRun("x", None)
+    events: list[MonitorEvent] = []
+    monitor = Monitor(text, on_event=events.append, on_step=run.step)
+    run.follow(monitor)
+    for i in range(5):
+        monitor.step(moving(i, 3.0))
+    lanes = run.parts("pattern", events[0].nodes)["lanes"]
+
+    assert [bool(lane["unknown"]) for lane in lanes] == [False, True]
+    assert lanes[0]["spans"] == [[0, 4]]
+    with pytest.raises(QueryNameError, match="no pattern 'other'"):
+        run.parts("other", {})
+
+
+def moving(i: int, speed: float) -> Frame:
+    frame = Frame(i * 100_000_000, "e")
+    frame.add("e", "car", 0.0, 0.0, heading=0.0, length=4.0, width=2.0, vx=0.0, vy=0.0)
+    frame.add("v", "car", 9.0 + i, 0.0, heading=0.0, length=4.0, width=2.0, vx=speed, vy=0.0)
+    return frame
+
+
+def test_what_is_kept_does_not_grow(monkeypatch: pytest.MonkeyPatch) -> None:
+    import sgstore.serve._live as live
+
+    monkeypatch.setattr(live, "MOST_FRAMES", 10)
+    monkeypatch.setattr(live, "MOST_EDGES", 12)
+    run = LiveRun("x", None)
+    monitor = Monitor("MATCH (v:Vehicle) WHERE v.speed > 1", on_event=run.event, on_step=run.step)
+    run.follow(monitor)
+    for i in range(40):
+        monitor.step(moving(i % 3, 3.0) if i % 3 else moving(0, 3.0))
+    run.end(monitor.finish())
+    sent = asyncio.run(told(run))
+
+    assert [name for name, _ in sent] == ["hello", *["frame"] * 9, "end"]
+    assert sent[1][1][0]["seq"] == 31
+    ((first, last),) = run.parts("pattern", {"v": 1})["lanes"][0]["spans"]
+    assert 30 < first < last == 39  # the graphs before are let go
+
+
+def test_a_recording_comes_in_its_time() -> None:
+    import time
+
+    begun = time.monotonic()
+    assert len(list(paced(moving(i, 1.0) for i in range(4)))) == 4
+    assert 0.29 < time.monotonic() - begun < 3
+
+
+def test_the_page_is_behind_its_token_and_knows_the_map(watched: Any) -> None:
+    run = watched[0]
+    app = live_application(run, "secret", ("127.0.0.1:1",), "sgstore-1")
+
+    async def all_of() -> list[httpx.Response]:
+        transport = httpx.ASGITransport(app=app)
+        headers = {"cookie": "sgstore-1=secret"}
+        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1:1") as client:
+            return [
+                await client.get("/api/store"),
+                await client.get("/", headers=headers),
+                await client.get("/static/js/live.js", headers=headers),
+                await client.get("/api/map", headers=headers),
+                await client.post("/api/parts", headers=headers, json={"text": "no"}),
+                await client.get("/api/states", headers=headers),
+            ]
+
+    found = asyncio.run(all_of())
+    assert [one.status_code for one in found] == [403, 200, 200, 200, 422, 404]
+    assert 'src="static/js/live.js"' in found[1].text
+    assert len(unpacked(found[3].content)[1]["start"]) > 20
