@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: help demo check test tests test-edges test-ui test-wheel test-versions lint format bench fuzz kill mutants soak pyg viewers maps oracle patterns sample clean duckdb-versions fuzz-queries frozen house api vendor cluster
+.PHONY: help demo check test tests test-edges test-ui test-wheel test-versions lint format bench fuzz kill mutants soak soak-explorer pyg viewers maps oracle patterns sample clean duckdb-versions fuzz-queries frozen house api vendor cluster
 
 help:
 	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
@@ -24,6 +24,7 @@ help:
 	@echo "make kill    kill verbs that write 200 times while they work, and look whether all is whole and equal (20 minutes)"
 	@echo "make mutants  put faults in on purpose and look whether the tests of their room find them (about an hour)"
 	@echo "make soak    one writer and eight readers on one store for ten minutes"
+	@echo "make soak-explorer  the same, the readers being pages of one explorer"
 	@echo "make pyg     PyTorch Geometric reads what is exported for it, and a small network learns from it (downloads torch)"
 	@echo "make viewers  Rerun's reader looks at what is exported for it (downloads Rerun)"
 	@echo "make maps    the package lanelet2 and SUMO beside what we make of their maps and recordings (downloads both)"
@@ -86,7 +87,7 @@ EDGES := commonroad coverage coverage_docs criticality_recorded derive derive_us
   draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap export_scenarios export_rerun export_viewers exports exports_docs timeline \
   assistant notebook carla_live collection collection_landing collection_ray collection_remote collection_spark importing junit lang_sgl pytest_plugin record sample \
   docs_house docs_queries lang_docs packaging views_page library cookbook textmate tck \
-  lanelet2 autoware sumo fuzz mutants serve report parts sandbox_pool
+  lanelet2 autoware sumo fuzz mutants serve live report parts sandbox_pool
 tests-of = $(foreach name,$(1),tests/test_$(name).py)
 
 # A file of tests at a time in each process: what its tests share is made once. The longest come first
@@ -135,6 +136,9 @@ mutants: $(VENV)/.dev
 
 soak: $(VENV)/.dev
 	$(BIN)/python tests/soaking.py 600
+
+soak-explorer: $(VENV)/.dev
+	$(BIN)/python tests/soaking.py 600 --explorer
 
 # In an environment of its own, because torch is large.
 pyg: $(VENV)/.base

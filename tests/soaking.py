@@ -2,7 +2,8 @@
 
 ::
 
-    python tests/soaking.py 600        # how many seconds
+    python tests/soaking.py 600              # how many seconds
+    python tests/soaking.py 600 --explorer   # the readers are eight pages of one explorer
 
 The writer reads recordings in, replaces them and takes them out; the readers ask what must hold of whole
 traces.
@@ -73,6 +74,39 @@ while time.monotonic() < end:
 print(reads, slowest)
 """
 
+PAGE = """
+import json, sys, time
+import httpx
+address, seconds = sys.argv[1:]
+end, reads, slowest = time.monotonic() + float(seconds), 0, 0.0
+FIND = {"text": "MATCH (e:Ego)-[:near|visible|very_near]->(v)"}
+with httpx.Client(base_url=address.split("/?")[0], timeout=60) as page:
+    page.get(address, follow_redirects=True).raise_for_status()
+    print("begun", flush=True)
+    def read(path, **how):
+        told = page.request("POST" if "json" in how else "GET", path, **how)
+        # A trace may be taken out between two questions; nothing else may be wrong.
+        gone = told.status_code == 404 and "no " in told.text
+        assert gone or told.status_code == 200, (path, told.status_code, told.text)
+        return told
+    while time.monotonic() < end:
+        start = time.monotonic()
+        traces = read("/api/store").json()["traces"]
+        lines = [json.loads(line) for line in read("/api/find", json=FIND).text.splitlines()]
+        assert not any("error" in line for line in lines), lines
+        rows = [row for line in lines for row in line.get("matches", ())]
+        read("/api/thumbs", json={"frames": [[row[0], row[1]] for row in rows[:100]]})
+        for trace in traces[:1]:
+            name = trace["name"]
+            read("/api/states", params={"trace": name, "first": 0, "last": trace["frames"] - 1})
+            read("/api/frame", params={"trace": name, "seq": 0})
+            read("/api/map", params={"trace": name})
+            read("/api/parts", json={**FIND, "trace": name, "seq": 0})
+        slowest = max(slowest, time.monotonic() - start)
+        reads += 1
+print(reads, slowest)
+"""
+
 
 @dataclass(frozen=True)
 class Soaked:
@@ -84,8 +118,8 @@ class Soaked:
     slowest_read: float
 
 
-def soak(folder: Path, seconds: float, readers: int = READERS) -> Soaked:
-    """Let a writer and readers use one store.
+def soak(folder: Path, seconds: float, readers: int = READERS, *, explorer: bool = False) -> Soaked:
+    """Let a writer and readers use one store; the readers may be pages of an explorer.
 
     Raises
     ------
@@ -96,7 +130,14 @@ def soak(folder: Path, seconds: float, readers: int = READERS) -> Soaked:
     store = folder / "s.db"
     ingest(store, paths[:1])
     arguments = [str(store), str(seconds)]
-    runs = [_begun(READER, *arguments) for _ in range(readers)]
+    server, code = None, READER
+    if explorer:
+        command = [sys.executable, "-m", "sgstore", "serve", str(store)]
+        server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert server.stdout is not None
+        arguments[0], code = server.stdout.readline().strip(), PAGE
+    runs = [_begun(code, *arguments) for _ in range(readers)]
+    arguments[0] = str(store)
     runs.append(_begun(WRITER, *arguments, *map(str, paths)))
     told: list[tuple[int, float]] = []
     for run in runs:
@@ -104,6 +145,10 @@ def soak(folder: Path, seconds: float, readers: int = READERS) -> Soaked:
         assert run.returncode == 0, errors
         count, slowest = output.split()[-2:]
         told.append((int(count), float(slowest)))
+    if server is not None:
+        assert server.poll() is None
+        server.terminate()
+        server.communicate(timeout=20)
     *read, (written, slowest_write) = told
     assert all(count for count, _ in read)
     return Soaked(
@@ -124,10 +169,11 @@ def _begun(code: str, *arguments: str) -> subprocess.Popen[str]:
 
 
 def main() -> None:
-    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 600
+    numbers = [word for word in sys.argv[1:] if not word.startswith("--")]
+    seconds, explorer = float(numbers[0]) if numbers else 600.0, "--explorer" in sys.argv
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
-        soaked = soak(Path(folder), seconds)
+        soaked = soak(Path(folder), seconds, explorer=explorer)
         spent = time.perf_counter() - start
     print(
         f"{spent:.0f} s, {READERS} readers: {soaked.read} reads (slowest {soaked.slowest_read:.2f} s), "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import islice
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,13 @@ from sgstore.query import Store
 if TYPE_CHECKING:
     from pathlib import Path
 
-ONE_STEP = [p for p in patterns().values() if p.kind in {"concept", "scenario"}]
+LIBRARY = [p for p in patterns().values() if p.kind in {"concept", "scenario"}]
+STEP = re.compile(
+    r"\b(?:THEN(?:\s+IMMEDIATELY|\s+WITHIN\s+[\w.$]+)?(?:\s+NOT)?|UNTIL)\s+(?=MATCH\b)"
+)
+HOLD = re.compile(r"\s+FOR\s+>=\s+[\w.]+\s*$")
+ONE_STEP = [p for p in LIBRARY if not STEP.search(p.text)]
+SEQUENCES = [p for p in LIBRARY if STEP.search(p.text)]
 
 
 @pytest.fixture(scope="module")
@@ -127,6 +134,8 @@ def test_patterns_of_the_library_in_other_towns(data: Path, tmp_path: Path, trac
     with store.file.snapshot():
         for pattern in ONE_STEP:
             compare_lanes(store, pattern, None)
+        for pattern in SEQUENCES:
+            compare_steps(store, pattern, 5)
 
 
 def compare_lanes(store: Store, pattern: NamedPattern, most: int | None) -> None:
@@ -138,10 +147,34 @@ def compare_lanes(store: Store, pattern: NamedPattern, most: int | None) -> None
         found.setdefault((span.trace, nodes), set()).update(seqs)
     for (trace, nodes), seqs in islice(found.items(), most):
         lanes = store.parts(pattern.text, f"{trace}#{min(seqs)}", dict(nodes))
-        if lanes.steps == (0,):
-            assert in_spans(lanes.together()) == seqs, (pattern.name, nodes)
-        else:
-            assert all(lanes.together(step) for step in lanes.steps if step == 1), pattern.name
+        (step,) = lanes.steps
+        together = in_spans(lanes.together(step))
+        # A hold asks how long all of it is true, which no part says.
+        assert seqs <= together if HOLD.search(pattern.text) else seqs == together, pattern.name
+
+
+@pytest.mark.parametrize("pattern", some(SEQUENCES, 2), ids=lambda one: one.name)
+def test_sequences_of_the_library(store: Store, pattern: NamedPattern) -> None:
+    compare_steps(store, pattern, None if LONG else 1)
+
+
+def compare_steps(store: Store, pattern: NamedPattern, most: int | None) -> None:
+    """Compare the lanes of each step with frames in which it has the same nodes as a query of its own."""
+    steps = [HOLD.sub("", one) for one in STEP.split(pattern.text)]
+    bindings: dict[tuple[str, tuple[tuple[str, int], ...]], int] = {}
+    for span in store.find(pattern.text).intervals(bound=True):
+        nodes = tuple((k, v) for k, v in span.values.items() if isinstance(v, int))
+        bindings.setdefault((span.trace, nodes), span.start_seq)
+    for (trace, nodes), seq in islice(bindings.items(), most):
+        lanes = store.parts(pattern.text, f"{trace}#{seq}", dict(nodes))
+        assert lanes.steps == tuple(range(1, len(steps) + 1)), pattern.name
+        for number, step in enumerate(steps, start=1):
+            here = {name: node for name, node in nodes if re.search(rf"\b{name}\b", step)}
+            assert in_spans(lanes.together(number)) == frames_with(store, step, trace, here), (
+                pattern.name,
+                number,
+                nodes,
+            )
 
 
 def test_a_union_has_the_lanes_of_the_part_that_matches(store: Store) -> None:
