@@ -1,0 +1,340 @@
+"""The explorer in a browser: how soon it paints, how it plays and scrolls, and what its requests cost.
+
+::
+
+    python -m bench explorer [--quick]
+
+Needs Playwright and Chromium (``SGSTORE_CHROMIUM`` names its program). There are a small store of the bundled
+sample, one of a crowded town where the shared recordings are, and a large one of replicas (:mod:`bench.real`;
+``SGSTORE_BENCH_REAL=FILE`` takes one that is there). Processor times are of the server and its sandboxes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import httpx
+
+from bench.measure import Measure
+from bench.real import QUICK, TRACES, made
+from sgstore.demo import RECORDING
+from sgstore.ingest import ingest
+from sgstore.query import Store
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Iterator
+
+NEAR = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle) WHERE e.speed > 3"
+MANY = "MATCH (v:Vehicle) WHERE frame.seq % 2 = 0"
+"""Each frame is a match of its own: more than 10,000 in the sample."""
+LARGE = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle)"
+RUNAWAY = "SELECT max((a.range * b.range) % 7) FROM range(1000000) a, range(1000000) b"
+TICK = os.sysconf("SC_CLK_TCK")
+
+STEPS = """seconds => new Promise(done => {
+  const starts = [], costs = [], late = [], canvas = document.querySelector('.camera canvas');
+  const begun = performance.now();
+  const step = now => {
+    const channel = new MessageChannel(), from = performance.now();
+    channel.port1.onmessage = () => costs.push(performance.now() - from);  // after the frame was painted
+    channel.port2.postMessage(0);
+    starts.push(now);
+    const shown = /#(\\d+)/.exec(document.querySelector('.transport .time')?.textContent || '');
+    if (canvas && shown) late.push(Number(shown[1]) - Number(canvas.dataset.frame));
+    if (now - begun < seconds * 1000) requestAnimationFrame(step);
+    else {
+      costs.sort((a, b) => a - b);
+      done({fps: (starts.length - 1) / (starts.at(-1) - starts[0]) * 1000,
+            p95: costs[Math.floor(costs.length * .95)], late: late.filter(n => n > 0).length});
+    }
+  };
+  requestAnimationFrame(step);
+})"""
+PAINTED = """many => {
+  const tiles = [...document.querySelectorAll('.tile canvas')].filter(c => c.dataset.painted);
+  return tiles.length >= many && performance.now();
+}"""
+SCROLL = """seconds => new Promise(done => {
+  const place = document.querySelector('.gallery'), begun = performance.now();
+  let many = 0, last = begun;
+  const step = now => {
+    place.scrollTop += 400;
+    many++; last = now;
+    if (now - begun < seconds * 1000) requestAnimationFrame(step);
+    else done((many - 1) / (last - begun) * 1000);
+  };
+  requestAnimationFrame(step);
+})"""
+JUMP = """() => new Promise(done => {
+  const place = document.querySelector('.gallery'), begun = performance.now();
+  place.scrollTop = place.scrollHeight / 2;
+  const look = () => {
+    const box = place.getBoundingClientRect(), inside = b => b.bottom > box.top && b.top < box.bottom;
+    const seen = [...document.querySelectorAll('.tile')].filter(t => inside(t.getBoundingClientRect()));
+    const painted = seen.length && seen.every(t => t.querySelector('canvas').dataset.painted);
+    if (performance.now() - begun > 60 && painted) done(performance.now() - begun);
+    else requestAnimationFrame(look);
+  };
+  requestAnimationFrame(look);
+})"""
+
+
+class Server:
+    """``sgstore serve`` of a store, as a process."""
+
+    def __init__(self, store: Path) -> None:
+        command = [sys.executable, "-m", "sgstore", "serve", str(store)]
+        self._child = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert self._child.stdout is not None
+        self.address = self._child.stdout.readline().strip()
+
+    def close(self) -> None:
+        self._child.terminate()
+        self._child.communicate(timeout=20)
+
+    def worked(self) -> float:
+        """Processor time of the server and its sandboxes so far; s."""
+        return sum(_worked(pid) for pid in [self._child.pid, *_children(self._child.pid)])
+
+    def client(self) -> httpx.Client:
+        """A client with the cookie of the page."""
+        client = httpx.Client(base_url=self.address.split("/?")[0], timeout=120)
+        client.get(self.address, follow_redirects=True).raise_for_status()
+        return client
+
+
+@contextmanager
+def served(store: Path) -> Generator[Server]:
+    """A server that is there for a block."""
+    server = Server(store)
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+def _worked(pid: int) -> float:
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / TICK
+
+
+def _children(pid: int) -> list[int]:
+    found: list[int] = []
+    for task in Path(f"/proc/{pid}/task").glob("*/children"):
+        found += map(int, task.read_text().split())
+    return found
+
+
+# In a browser -----------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def chromium() -> Generator[Any]:
+    """A browser without a window; ``None`` where there is none."""
+    names = ("chromium", "chromium-browser", "google-chrome")
+    program = os.environ.get("SGSTORE_CHROMIUM") or next(
+        filter(None, map(shutil.which, names)), None
+    )
+    if program is None or find_spec("playwright") is None:
+        yield None
+        return
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        options = ["--no-sandbox", "--disable-dev-shm-usage"]
+        browser = playwright.chromium.launch(executable_path=program, args=options)
+        yield browser
+        browser.close()
+
+
+def visited(browser: Any, server: Server, width: int = 1440, height: int = 900) -> Any:
+    """The page of a server."""
+    page = browser.new_context(viewport={"width": width, "height": height}).new_page()
+    page.set_default_timeout(120_000)
+    page.goto(server.address)
+    page.locator(".editor .cm-content").wait_for()
+    return page
+
+
+def asked(page: Any, query: str, tiles: int) -> tuple[float, float]:
+    """Milliseconds from Find to the answer, and to so many tiles that are painted."""
+    page.locator(".cm-content").fill(query)
+    begun = page.evaluate("performance.now()")
+    page.keyboard.press("Control+Enter")
+    painted = page.wait_for_function(PAINTED, arg=tiles, polling="raf").json_value()
+    page.locator(".status .busy").wait_for(state="detached")
+    answered = page.evaluate(
+        "performance.getEntriesByType('resource').findLast(e => e.name.endsWith('api/find')).responseEnd"
+    )
+    return answered - begun, painted - begun
+
+
+def playing(page: Any, seconds: float) -> dict[str, float]:
+    """Frames a second, and what a step costs, while a match plays from the beginning of its trace."""
+    page.locator(".tile").first.click()
+    page.locator(".timeline .lane[data-holds]").first.wait_for()
+    page.wait_for_timeout(1000)
+    page.keyboard.press(" ")
+    page.wait_for_timeout(300)
+    return page.evaluate(STEPS, seconds)
+
+
+def of_sample(browser: Any, server: Server, seconds: float) -> Iterator[Measure]:
+    """The sample: paint, tiles, playing, scrolling."""
+    page = visited(browser, server)
+    paint = "performance.getEntriesByName('first-contentful-paint')[0].startTime"
+    yield Measure("first contentful paint, fresh server", page.evaluate(paint), "ms", "aim 1,000")
+    answered, painted = asked(page, MANY, 16)
+    note = f"aim 1,000; answer after {answered:.0f}"
+    yield Measure("16 tiles after Find, fresh server", painted, "ms", note)
+    page = visited(browser, server)
+    yield Measure("first contentful paint", page.evaluate(paint), "ms", "aim 1,000")
+    answered, painted = asked(page, NEAR, 4)
+    told = playing(page, seconds)
+    yield Measure("plays, with camera, view, drawing, lanes", told["fps"], "frames/s", "aim 30")
+    yield Measure("  a step, 95th percentile", told["p95"], "ms", "aim 17")
+    yield Measure("  steps with a late picture", told["late"], "", "aim 0")
+    page.keyboard.press(" ")
+    page.keyboard.press("Escape")
+    asked(page, MANY, 16)
+    many = page.evaluate("document.querySelector('.status b').textContent")
+    yield Measure(
+        f"scrolls {many} tiles by 400 points a frame",
+        page.evaluate(SCROLL, seconds),
+        "frames/s",
+        "aim 50",
+    )
+    yield Measure("jump to the middle", page.evaluate(JUMP), "ms", "aim 500")
+    page.context.close()
+
+
+def of_crowd(browser: Any, store: Path, seconds: float) -> Iterator[Measure]:
+    """A crowded town in a small window."""
+    sql = (
+        "SELECT max(n) FROM (SELECT count(*) AS n FROM nodes WHERE node_id >= 0 GROUP BY frame_id)"
+    )
+    ((most,),) = Store(store).sql(sql).values
+    with served(store) as server:
+        page = visited(browser, server, 900, 700)
+        asked(page, LARGE, 1)
+        told = playing(page, seconds)
+        yield Measure(f"plays {most} entities, 900 by 700", told["fps"], "frames/s", "aim 30")
+        yield Measure("  a step, 95th percentile", told["p95"], "ms")
+        page.context.close()
+
+
+# Requests ---------------------------------------------------------------------------------------------------
+
+
+def requests_of(server: Server, store: Path, times: int) -> Iterator[Measure]:
+    """Processor time of a request by its kind."""
+    (trace,) = Store(store).traces()
+    client = server.client()
+    camera = client.get("/api/store").json()["traces"][0]["cameras"][:1]
+    first = next(Store(store).find(NEAR).intervals(bound=True))
+    nodes = {name: node for name, node in first.values.items() if isinstance(node, int)}
+    every = max(trace.frames // 100, 1)
+    about = {"trace": trace.name, "seq": first.start_seq}
+    frames = [[trace.name, seq] for seq in range(0, trace.frames, every)][:100]
+    lanes = {"text": NEAR, **about, "binding": nodes}
+    kinds: list[tuple[str, int, Callable[[], httpx.Response]]] = [
+        ("find", 40, lambda: client.post("/api/find", json={"text": NEAR})),
+        ("100 thumbnails", 25, lambda: client.post("/api/thumbs", json={"frames": frames})),
+        (
+            f"states of {trace.frames} frames",
+            35,
+            lambda: client.get(
+                "/api/states", params={"trace": trace.name, "first": 0, "last": trace.frames - 1}
+            ),
+        ),
+        ("graph", 35, lambda: client.get("/api/frame", params=about)),
+        ("lanes of truth", 170, lambda: client.post("/api/parts", json=lanes)),
+    ]
+    if camera:
+        picture = {**about, "channel": camera[0]}
+        kinds.append(("picture", 15, lambda: client.get("/api/picture", params=picture)))
+    for name, aim, ask in kinds:
+        for _ in range(3):
+            ask().raise_for_status()
+        before = server.worked()
+        for _ in range(times):
+            ask().raise_for_status()
+        spent = (server.worked() - before) / times * 1e3
+        yield Measure(f"processor time: {name}", spent, "ms", f"aim {aim}")
+
+
+def of_large(browser: Any, store: Path) -> Iterator[Measure]:
+    """A large store: first matches, cancelling, and a quick question behind one that does not end."""
+    ((frames,),) = Store(store).sql("SELECT count(*) FROM frames").values
+    with served(store) as server:
+        if browser is not None:
+            page = visited(browser, server)
+            page.wait_for_timeout(3000)
+            _, painted = asked(page, LARGE, 4)
+            yield Measure(f"{frames:,} frames: first matches on screen", painted, "ms", "aim 1,500")
+            page.context.close()
+        client = server.client()
+        ended: list[float] = []
+
+        def run_away() -> None:
+            with client.stream("POST", "/api/find", json={"text": RUNAWAY, "id": "away"}) as found:
+                found.read()
+            ended.append(time.perf_counter())
+
+        thread = threading.Thread(target=run_away)
+        thread.start()
+        time.sleep(2)
+        begun = time.perf_counter()
+        client.post("/api/find", json={"text": "SELECT 1 AS x"}).raise_for_status()
+        yield Measure(
+            "  quick question behind a runaway",
+            (time.perf_counter() - begun) * 1e3,
+            "ms",
+            "aim 500",
+        )
+        begun = time.perf_counter()
+        client.delete("/api/find/away")
+        thread.join(60)
+        yield Measure("  cancel", (ended[0] - begun) * 1e3, "ms", "aim 500")
+        head = time.perf_counter()
+        with client.stream("POST", "/api/find", json={"text": LARGE}) as found:
+            for line in found.iter_lines():
+                if json.loads(line).get("matches"):
+                    break
+        yield Measure("  first matches on the wire", (time.perf_counter() - head) * 1e3, "ms")
+
+
+def run(quick: bool = False) -> Iterator[Measure]:
+    """Serve, look, count."""
+    seconds, times = (2.0, 5) if quick else (6.0, 20)
+    crowd = Path(os.environ.get("SGSTORE_DATA", "/nowhere")) / "traces/sumo/Town10HD_sumo_osi.mcap"
+    with tempfile.TemporaryDirectory() as name, chromium() as browser:
+        folder = Path(name)
+        ingest(folder / "town.sgstore", [RECORDING])
+        with served(folder / "town.sgstore") as server:
+            if browser is None:
+                yield Measure("no browser: Playwright or Chromium is missing", 0, "")
+            else:
+                yield from of_sample(browser, server, seconds)
+            yield from requests_of(server, folder / "town.sgstore", times)
+        if browser is not None and crowd.exists():
+            ingest(folder / "crowd.sgstore", [crowd])
+            yield from of_crowd(browser, folder / "crowd.sgstore", seconds)
+        large = Path(os.environ.get("SGSTORE_BENCH_REAL") or folder / "real.sgstore")
+        if not large.exists():
+            yield from made(large, QUICK if quick else TRACES)
+        yield from of_large(browser, large)
