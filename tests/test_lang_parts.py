@@ -93,6 +93,14 @@ def test_what_is_absent_is_null_in_every_form(store: Store, tmp_path: Path) -> N
     assert store.find(f"{text} RETURN DISTINCT v").rows() == [(3,), (None,)]
 
 
+def test_matches_are_listed_once_whatever_is_not_passed_on(world: World) -> None:
+    for text in (
+        "USING NODES any MATCH p = (a)-[:near*1..2]->(b) WITH b, a",
+        "MATCH (v:Entity) WITH v.kind AS k, v.id AS i, COUNT(*) AS n WITH k",
+    ):
+        assert disagreement_of_matches(text, world)[0] == ""
+
+
 def test_with_counts_and_chooses_in_each_frame(store: Store) -> None:
     counted = "MATCH (e:Ego), (v:Car) WITH e, COUNT(v) AS many WHERE many > 2"
     nearest = "MATCH (e:Ego), (v:Car) WITH e, v ORDER BY dist(e, v) DESC LIMIT 1"

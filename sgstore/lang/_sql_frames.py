@@ -395,8 +395,8 @@ def frames(
     bound = nodes | {key for leaf in needed for key in nodes_of(leaf)}
     edged = {leaf.edge for leaf in needed if isinstance(leaf, EdgeAttribute)}
     bound |= {end for e in scope.edges if e.key in edged for end in (e.src, e.dst)}
-    every = {*scope.nodes, *scope.outer}
-    bound |= {key for pair in apart(scope, every, parts.late) for key in pair}
+    pairs = apart(scope, {*scope.nodes, *scope.outer}, parts.late)
+    bound |= {key for pair in pairs for key in pair}
     ties = edges | {leaf.edge for leaf in needed if isinstance(leaf, EdgeRelation) or _is_own(leaf)}
     join, given = _first_phase(sql, scope, parts, given, bound, ties, needed)
     _second_phase(sql, join, scope, parts, given, needed)
@@ -408,7 +408,8 @@ def frames(
     hidden = (bound | parts.late | ties) - nodes - edges - told
     hidden -= {key for key in hidden - ties if scope.kinds(key).one_a_frame}
     known = sql.found_in(scope)
-    bare = known and known.told and not (nodes or edges or wanted)
+    once = sql.query.stages and (sql.query.result.whole or not nodes)
+    bare = known and once and not {*known.told} <= {*wanted}
     if hidden or bare or (known and not (known.nodes <= nodes and known.edges <= edges)):
         return "SELECT DISTINCT" + text.removeprefix("SELECT")
     return text
@@ -809,9 +810,7 @@ def _is(leaf: Leaf, name: str) -> TypeGuard[NodeAttribute]:
     return isinstance(leaf, NodeAttribute) and leaf.attribute is NODE_ATTRIBUTES[name]
 
 
-_BARE: Final = frozenset(
-    {DisplayUnit.binding, DisplayUnit.owner, DisplayUnit.role, DisplayUnit.own}
-)
+_BARE: Final = {DisplayUnit.binding, DisplayUnit.owner, DisplayUnit.role, DisplayUnit.own}
 """What is told of a node without its tables."""
 
 
