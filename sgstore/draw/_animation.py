@@ -278,7 +278,7 @@ class LastingPalette:
     def indexed(self, picture: Pixels) -> Image.Image:
         """An RGB picture, (height, width, 3), with a palette."""
         whole = packed(picture)
-        places = self._places[whole]
+        places = self._places.take(whole)
         unknown = places < 0
         if not self._colours.size or (unknown.any() and not self._grows(whole[unknown])):
             if not self._begins(whole):
@@ -286,7 +286,7 @@ class LastingPalette:
                 return photo.quantize(PLACES, dither=Image.Dither.NONE)
             unknown[:] = True
         if unknown.any():
-            places[unknown] = self._places[whole[unknown]]
+            places[unknown] = self._places.take(whole[unknown])
         return with_palette(places.astype(np.uint8), self._colours)
 
     def _begins(self, whole: NDArray[np.int32]) -> bool:

@@ -121,9 +121,11 @@ def grown(
         Greatest distance of a colour from its nearest one.
     """
     squares = (colours * colours).sum(axis=1)
-    away = squares[:, None] - 2 * (colours @ palette.T) + (palette * palette).sum(axis=1)
+    # Of each colour's distances what is the same for all of them is added to the least one alone.
+    away = colours @ (-2 * palette.T)
+    away += (palette * palette).sum(axis=1)
     nearest = away.argmin(axis=1)
-    least = away[np.arange(len(colours)), nearest]
+    least = squares + away[np.arange(len(colours)), nearest]
     more: list[int] = []
     while len(palette) + len(more) < most and least.max() > enough**2:
         row = int(least.argmax())
@@ -179,13 +181,20 @@ _ONE_AT_A_TIME: Final = threading.RLock()
 @contextmanager
 def own_style() -> Generator[None]:
     """Draw in the style of this house, whatever the user's configuration says; restores it afterwards."""
-    style: dict[Any, Any] = {k: v for k, v in mpl.rcParamsDefault.items() if k.startswith(_STYLE)}
-    style |= {"svg.fonttype": "none", "svg.hashsalt": "sgstore"}
-    # At this size letters look better unhinted, and are faster.
-    style["text.hinting"] = "none"
     # The package keeps its settings for the whole process: two pictures at once would mix them.
-    with _ONE_AT_A_TIME, mpl.rc_context(style):
+    with _ONE_AT_A_TIME, mpl.rc_context():
+        dict.update(mpl.rcParams, _style())  # they were looked at before
         yield
+
+
+@cache
+def _style() -> dict[Any, Any]:
+    """The settings of the drawing package for pictures of this house, as it keeps them."""
+    style: dict[Any, Any] = {k: v for k, v in mpl.rcParamsDefault.items() if k.startswith(_STYLE)}
+    # At this size letters look better unhinted, and are faster.
+    style |= {"svg.fonttype": "none", "svg.hashsalt": "sgstore", "text.hinting": "none"}
+    with mpl.rc_context(style):
+        return {name: mpl.rcParams[name] for name in style}
 
 
 @dataclass(frozen=True, slots=True)

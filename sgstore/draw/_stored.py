@@ -9,6 +9,7 @@ import io
 import re
 import tempfile
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
@@ -288,7 +289,8 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
                 graphs = [*store.file.graphs(np.array([ref.frame_id for ref in some]))]
                 found = [matches.bindings(ref) if matches is not None else [] for ref in some]
                 pictures = [
-                    _picture(store, ref, camera) if seen and not diagram else None for ref in some
+                    _picture(store, ref, camera, usual) if seen and not diagram else None
+                    for ref in some
                 ]
             marked = [bindings[0] if bindings else {} for bindings in found]
             yield from zip(graphs, marked, pictures, strict=True)
@@ -297,7 +299,8 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
         chosen = _chosen(store, frames, fps)
         trace = chosen[0].trace
         road_map = map_of(store, trace)
-        if camera is None and not camera_of(store, trace):
+        usual = camera_of(store, trace)
+        if camera is None and not usual:
             camera = NO_CAMERA
     spread = sorted({len(chosen) * i // SAMPLES for i in range(SAMPLES)} | {len(chosen) - 1})
     samples = [*shots([chosen[number] for number in spread], seen=False)]
@@ -319,8 +322,12 @@ def _chosen(store: Store, frames: FrameRange, fps: float) -> list[FrameRef]:
         raise ExportError(f"the clip from {' to '.join(frames)} ends before it begins")
     chosen: list[FrameRef] = []
     due: float | None = None
-    for seq in range(first.seq, last.seq + 1):
-        frame = store.file.frame(f"{first.trace}#{seq}")
+    sql = (
+        "SELECT frame_id, seq, time_ns, log_time_ns, t FROM frames"
+        " WHERE frame_id BETWEEN ? AND ? ORDER BY frame_id"
+    )
+    for about in store.file.rows(sql, [first.frame_id, last.frame_id]).dicts():
+        frame = replace(first, **about)
         # A little grace: the clock of a trace is not that exact. One that runs back starts anew.
         if due is None or not due - 2e9 / fps <= frame.time_ns < due:
             chosen.append(frame)
@@ -338,12 +345,18 @@ def _map_in(file: StoreFile, trace: str) -> RoadMap | None:
     return read_map(found[1], found[0]) if found else None
 
 
-def _picture(store: Store, frame: FrameRef, camera: str | None) -> bytes | None:
-    """Picture of the camera nearest to the frame, as JPEG or PNG; ``None`` if there is none."""
+def _picture(
+    store: Store, frame: FrameRef, camera: str | None, usual: str | None = None
+) -> bytes | None:
+    """Picture of the camera nearest to the frame, as JPEG or PNG; ``None`` if there is none.
+
+    ``usual``: the camera if none is asked for, where it is known already.
+    """
     if camera == NO_CAMERA:
         return None
     try:
-        message = store.payload(frame, camera or camera_of(store, frame.trace))
+        topic = camera or (camera_of(store, frame.trace) if usual is None else usual)
+        message = store.payload(frame, topic)
     except StoreError:
         if camera:
             raise
