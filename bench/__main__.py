@@ -21,6 +21,7 @@ TITLES = {
     "temporal": "Time: formulas over columns, and frame by frame",
     "coverage": "Coverage of a million frames",
     "selection": "Small parts of a million frames that keep every class",
+    "criticality": "Measures of criticality, a million pairs each",
     "explorer": "The explorer: in a browser, and by request",
     "prioritize": "Orders of simulator runs by risk, beside their outcomes",
 }

@@ -36,9 +36,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator
 
 NEAR = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle) WHERE e.speed > 3"
-SOME = "MATCH (v:Person) WHERE frame.seq % 2 = 0"
-MANY = "MATCH (v:Vehicle), (p:Person) WHERE frame.seq % 2 = 0"
-"""Each frame is a match of its own: 2,231 and 15,139 of the sample."""
+MANY = "MATCH (v:Vehicle) WHERE frame.seq % 2 = 0"
+"""Each frame is a match of its own: more than 10,000 in the sample."""
 LARGE = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle)"
 RUNAWAY = "SELECT max((a.range * b.range) % 7) FROM range(1000000) a, range(1000000) b"
 TICK = os.sysconf("SC_CLK_TCK")
@@ -199,7 +198,7 @@ def of_sample(browser: Any, server: Server, seconds: float) -> Iterator[Measure]
     page = visited(browser, server)
     paint = "performance.getEntriesByName('first-contentful-paint')[0].startTime"
     yield Measure("first contentful paint, fresh server", page.evaluate(paint), "ms", "aim 1,000")
-    answered, painted = asked(page, SOME, 16)
+    answered, painted = asked(page, MANY, 16)
     note = f"aim 1,000; answer after {answered:.0f}"
     yield Measure("16 tiles after Find, fresh server", painted, "ms", note)
     page = visited(browser, server)
