@@ -83,7 +83,7 @@ test: $(VENV)/.dev
 # Files of tests beside the way from a recording to an answer: what is derived, measured and chosen from what is stored,
 # pictures, exports, graphs and simulators of others, plug-ins of other programs, collections, assistants, the explorer,
 # pages of the docs and the patterns that come along, and parts of the long programs below. A file that is not listed is of the core.
-EDGES := commonroad coverage coverage_docs criticality_recorded derive derive_using like locks selection selection_docs selection_overlapping prioritize \
+EDGES := commonroad coverage coverage_docs crime criticality_recorded derive derive_using like locks selection selection_docs selection_overlapping prioritize \
   draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap export_scenarios export_rerun export_viewers exports exports_docs timeline \
   assistant notebook carla_live collection collection_landing collection_ray collection_remote collection_spark importing junit lang_sgl pytest_plugin record sample \
   docs_house docs_queries lang_docs packaging views_page library cookbook textmate tck \
@@ -162,7 +162,7 @@ maps: $(VENV)/.base
 # Files of tests that try more where SGSTORE_LONG is set (tests/thorough.py).
 LONG := collection collection_landing collection_ray commonroad collection_spark temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \
   lang_after lang_attributes lang_counting lang_match lang_oracle lang_parts lang_subgraphs doors frozen importing ingest_data ingest_hardship \
-  export_scenarios monitor store_verify notebook assistant online parts serve sgg_traces store_transactions tolerance lane_places criticality_recorded
+  export_scenarios monitor store_verify notebook assistant online parts serve sgg_traces store_transactions tolerance lane_places criticality_recorded crime
 oracle: $(VENV)/.dev
 	$(BIN)/python tests/oracle_temporal.py 100000
 	$(BIN)/python tests/oracle_monitor.py 100000

@@ -28,7 +28,7 @@ TESTS = {
     "columns": "roads relations ingest",
     "config": "config config_*",
     "contrib": "lang_sgl",
-    "criticality": "criticality criticality_*",
+    "criticality": "criticality criticality_* crime",
     "demo": "api sample",
     "diff": "natural_order",
     "display": "notebook",

@@ -444,7 +444,7 @@ _LATER: Final = frozenset(
         "RESET",
         "SEMICOLON",
     }
-    | {"_ARROW", "HAVING", "OPTIONAL", "PATH_NAME", "SKIP", "UNION", "WITH"}
+    | {"_ARROW", "HAVING", "OPTIONAL", "SKIP", "UNION", "WITH"}
 )
 """What is not proposed, lest the list be long: what concerns time, and other words for what is proposed."""
 
