@@ -150,6 +150,12 @@ PARTS: Final = (
         "step: `MATCH cut_in(within = 2s)`.",
     ),
     (
+        "manoeuvres",
+        "Manoeuvres",
+        "What somebody does. `sgstore coverage sequences` counts who did what after what "
+        "([how](coverage.md#sequences-of-manoeuvres)).",
+    ),
+    (
         "nuplan",
         "Scenarios of nuPlan",
         "The scenarios of the nuPlan challenge, by their tags.",
@@ -177,7 +183,12 @@ PARTS: Final = (
         "Safe distances of RSS, UN Regulation 157 (automated lane keeping), the interstate and intersection "
         "rules of CommonRoad, and disturbances of ISO 34502, of the ego and every other vehicle. A parameter "
         "is changed by `k=v`, and `ROBUSTNESS` behind the text of a rule says by how much it is kept. The "
-        "drawings show scenes that violate them.",
+        "drawings show scenes that violate them.\n\n"
+        "**What is not there**: of R_I2 the case of a broad lane marking between the two (maps keep where "
+        "lanes may be changed, not how lines are painted); of R_IN2 the turn on red; R_IN3 to R_IN5, and an "
+        "R_IN6, whose text we could not find; of UN R157 what depends on the state of the system (transition "
+        "demand, minimal risk manoeuvre); of ISO 34502 16 of 24 disturbances, whose formulas we could not "
+        "find, and of its cut-out (2) only a sketch; IEEE 2846, which names quantities and no limits.",
     ),
 )
 

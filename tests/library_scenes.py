@@ -37,7 +37,9 @@ PLAIN: Final = crossroads()
 LIGHTS: Final = crossroads("light")
 STOPS: Final = crossroads("stop")
 WIDE: Final = crossroads(lanes=2)
-ROADS: Final = (WAYS, TWO_WAY, ENTRY, EXIT, TOWN, PLAIN, LIGHTS, STOPS, WIDE)
+LIMITED: Final = street("driving", "driving", limit=13.9)
+BROAD: Final = street("driving", "driving", "driving")
+ROADS: Final = (WAYS, TWO_WAY, ENTRY, EXIT, TOWN, PLAIN, LIGHTS, STOPS, WIDE, LIMITED, BROAD)
 
 RIGHT, LEFT = -1.75, -5.25
 MOUTH_OF: Final = {"s": (5.0, -12.5), "n": (-5.0, 12.5), "w": (-12.5, -5.0), "e": (12.5, 5.0)}
@@ -697,7 +699,104 @@ UNDERTAKING = Scene(
     seconds=5,
     drawn=(0.0, 4.0),
 )
+REVEALED = Scene(
+    WAYS,
+    ego(along(RIGHT), 10),
+    actor("v", aside(85, RIGHT, LEFT, 12), 10, start=20),
+    actor("o", (110, RIGHT)),
+    seconds=11,
+    drawn=(6.4, 8.0, 10.4),
+)
+WALKED_INTO = Scene(
+    TOWN,
+    ego(along(RIGHT), 7),
+    actor("p", over(40, -8, 6), 1.2, "person"),
+    seconds=7,
+    drawn=(0.0, 5.6),
+)
+MERGED_BEFORE = Scene(
+    WAYS,
+    ego(aside(60, RIGHT, LEFT, 20), 10, start=40),
+    actor("v", along(LEFT), 18),
+    seconds=5,
+    drawn=(0.0, 3.0),
+)
+SLOW = Scene(WAYS, ego(along(RIGHT), 12), seconds=3)
+JAM = Scene(
+    BROAD,
+    ego(along(RIGHT), 2),
+    *(actor(f"v{i}", along(RIGHT), 2, start=15 + 10 * i) for i in range(3)),
+    seconds=4,
+)
+JOINING = Scene(
+    ENTRY,
+    ego(aside(30, RIGHT, LEFT), 15),
+    actor("v", aside(50, -8.75, LEFT), 15, start=20),
+    seconds=5,
+    drawn=(0.0, 4.0),
+)
+FASTER_BEHIND = Scene(
+    WAYS,
+    ego(along(RIGHT), 10, start=60),
+    actor("v", along(RIGHT), [(0, 10), (1, 10), (4, 19)], start=10),
+    seconds=4,
+    drawn=(0.0, 4.0),
+)
+BOTH_CHANGE = Scene(
+    WAYS,
+    ego(aside(30, RIGHT, LEFT, 40), 15),
+    actor("v", aside(42, LEFT, RIGHT, 40), 15, start=12),
+    seconds=6,
+    drawn=(0.0, 3.4, 6.0),
+)
+BOTH_LEAVE = Scene(
+    WAYS,
+    ego(aside(20, RIGHT, LEFT, 60), 6),
+    actor("v", aside(20, RIGHT, LEFT, 60), [(0, 6), (3, 6), (6, 1)], start=22),
+    seconds=7,
+    drawn=(0.0, 7.0),
+)
+PULLED_OUT = Scene(
+    WAYS,
+    ego(aside(70, RIGHT, LEFT), 10, start=60),
+    actor("v", along(LEFT), [(0, 10), (4, 22)], start=15),
+    seconds=5,
+    drawn=(0.0, 4.0),
+)
+SWERVED = Scene(
+    WAYS,
+    ego(aside(10, RIGHT, LEFT, 120), 6),
+    actor("v", along(RIGHT), [(0, 6), (6, 6), (8.5, 1)], start=22),
+    seconds=9,
+    drawn=(0.0, 8.0),
+)
 SCENES |= {
+    "r157_cut_out": (REVEALED, REVEALED.with_actor("ego", speed=braking(10, 8, 3))),
+    "r157_pedestrian": (WALKED_INTO, WALKED_INTO.with_actor("ego", speed=braking(7, 2, 2.5))),
+    "r157_emergency_braking": (HARD, NEAR),
+    "r157_lane_change": (
+        MERGED_BEFORE,
+        MERGED_BEFORE.with_actor("ego", route=aside(120, RIGHT, LEFT, 20), start=100.0),
+    ),
+    "r_g3_speed_limit": (
+        Scene(LIMITED, ego(along(RIGHT), 15), seconds=3),
+        Scene(LIMITED, ego(along(RIGHT), 13), seconds=3),
+    ),
+    "r_g4_traffic_flow": (
+        SLOW,
+        Scene(WAYS, *SLOW.actors, actor("v", along(RIGHT), 10, start=30), seconds=3),
+    ),
+    "r_i4_emergency_lane": (JAM, JAM.with_actor("ego", route=along(-1.1))),
+    "r_i5_merging": (JOINING, JOINING.with_actor("ego", route=along(RIGHT))),
+    "iso_cut_out": (
+        CUT_OUT,
+        CUT_OUT.with_actor("v", route=along(RIGHT), speed=braking(15, 2, 6)),
+    ),
+    "iso_rear_accelerates": (FASTER_BEHIND, FASTER_BEHIND.with_actor("v", speed=10.0)),
+    "iso_change_cut_in": (BOTH_CHANGE, BOTH_CHANGE.with_actor("v", route=along(LEFT))),
+    "iso_change_cut_out": (BOTH_LEAVE, BOTH_LEAVE.with_actor("v", speed=15.0)),
+    "iso_change_rear_accelerates": (PULLED_OUT, PULLED_OUT.with_actor("ego", route=along(RIGHT))),
+    "iso_change_lead_brakes": (SWERVED, SWERVED.with_actor("ego", route=along(RIGHT))),
     "rss_distance": (FOLLOWING, FOLLOWING.with_actor("v", start=40.0)),
     "r157_following": (SLOWLY, SLOWLY.with_actor("v", start=25.0)),
     "r157_cut_in": (CUT_OFF, CUT_OFF.with_actor("ego", speed=[(0, 15), (2, 15), (4, 5), (7, 5)])),
@@ -729,6 +828,22 @@ SCENES |= {
         BRAKING_LEAD,
         BRAKING_LEAD.with_actor("v", speed=10.0),
     ),
+}
+
+
+# Manoeuvres -------------------------------------------------------------------------------------------------
+
+TO_THE_LEFT = Scene(WAYS, ego(aside(40, LEFT, RIGHT), 12), drawn=(0.0, 7.0))
+TO_THE_RIGHT = Scene(WAYS, ego(aside(40, RIGHT, LEFT), 12), drawn=(0.0, 7.0))
+SCENES |= {
+    "stops": (STOPPING, STRAIGHT),
+    "starts": (AT_STOP, THROUGH_STOP),
+    "brakes_hard": (HARD, GENTLE),
+    "changes_lane_left": (TO_THE_LEFT, TO_THE_RIGHT),
+    "changes_lane_right": (TO_THE_RIGHT, TO_THE_LEFT),
+    "turns_left": (TURN_LEFT, TURN_RIGHT),
+    "turns_right": (TURN_RIGHT, TURN_LEFT),
+    "walks_onto_road": (WALKER, WALKER.with_actor("p", route=((10, -7.0), (60, -7.0)))),
 }
 
 

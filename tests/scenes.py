@@ -183,15 +183,22 @@ def over(x: float, y: float, to: float) -> tuple[Point, ...]:
 
 
 @cache
-def street(*right: str, left: tuple[str, ...] = (), zebra: float | None = None) -> RoadMap:
+def street(
+    *right: str,
+    left: tuple[str, ...] = (),
+    zebra: float | None = None,
+    limit: float | None = None,
+) -> RoadMap:
     """A straight road from x = -100 to 400; types of its lanes from the middle outwards.
 
     Lanes to the right lead along x, those to the left against it. One may change between lanes of a side.
+    ``limit``: of speed; m/s.
     """
+    limits = () if limit is None else (element("speed", sOffset=0, max=limit, unit="m/s"),)
     lanes = [lane(0, mark("broken"))]
     for side, sign in ((right, -1), (left, 1)):
         for number, kind in enumerate(side, start=1):
-            records = (width(WIDTHS.get(kind, LANE)), mark("broken", laneChange="both"))
+            records = (width(WIDTHS.get(kind, LANE)), mark("broken", laneChange="both"), *limits)
             lanes.append(lane(sign * number, *records, kind=kind))
     objects = crosswalk("zebra", zebra + 100, 0.0, 20.0) if zebra is not None else ""
     road = a_road("1", line(500.0, x=-100.0), sections=section(*lanes), objects=objects)

@@ -57,6 +57,19 @@ def town(open_town: Store) -> Store:
     return open_town
 
 
+def test_a_count_of_a_block_that_speaks_of_others_has_its_margin(town: Store) -> None:
+    count = "COUNT {(u:Vehicle) WHERE u <> e AND same_lane(e, u) AND lon(e, u) > 0}"
+    many = [n for (n,) in town.find(f"MATCH (e:Ego) RETURN {count} AS n")]
+    text = f"CHECK c: ALWAYS {count} < 3 ROBUSTNESS".replace("e,", "ego,").replace("<> e", "<> ego")
+
+    (verdict,) = town.check(text)
+
+    assert verdict.robustness is not None
+    assert verdict.robustness.value == 3 - max(many) < 3
+    before = f"MATCH (e:Ego) RETURN prev({count}) AS n"
+    assert [n for (n,) in town.find(before)] == [None, *many[:-1]]
+
+
 def test_a_check_says_by_how_much_by_whom_and_when(town: Store) -> None:
     text = "CHECK near: FORALL (v:Vehicle ABSENT AS TRUE) ALWAYS dist(ego, v) > 5 ROBUSTNESS"
 

@@ -97,8 +97,11 @@ def relation(
     keys = set(query.scope.nodes if bound is None else bound)
     nodes = sorted(keys & set(query.scope.nodes))
     edges = sorted(keys & {edge.key for edge in query.scope.edges})
-    query = rewritten(query, catalog)
-    values = list(values)
+    # What is asked of matches is rewritten with them: its blocks are opened as those of conditions are.
+    asked = tuple(ReturnColumn(f":{n}", value) for n, value in enumerate(values))
+    result = Result(columns=asked, whole=False, distinct=False)
+    query = rewritten(replace(query, result=result), catalog)
+    values = [column.value for column in query.result.columns]
     sql = SqlBuilder(query, catalog, window)
     wanted = [leaf for value in values for leaf in leaves(value)]
     text = frames(sql, query.scope, None, frozenset(nodes), frozenset(edges), wanted)

@@ -40,7 +40,16 @@ if TYPE_CHECKING:
 KINDS_OF_PATTERNS: Final = ("predicate", "concept", "scenario", "property")
 """Conditions with names; patterns that practitioners ask for; scenarios of a benchmark; rules of traffic."""
 
-LIBRARY: Final = ("std", "concepts", "nuplan", "leaderboard", "sgsm", "sceneflow", "rules")
+LIBRARY: Final = (
+    "std",
+    "concepts",
+    "manoeuvres",
+    "nuplan",
+    "leaderboard",
+    "sgsm",
+    "sceneflow",
+    "rules",
+)
 """Names of the files, in the order in which they are listed."""
 
 _HEAD: Final = re.compile(rf"-- ({'|'.join(KINDS_OF_PATTERNS)}) (\w+): (\S.*)")
