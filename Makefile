@@ -87,7 +87,7 @@ EDGES := commonroad coverage coverage_docs crime criticality_recorded derive der
   draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap export_scenarios export_rerun export_viewers exports exports_docs timeline \
   assistant notebook carla_live collection collection_landing collection_ray collection_remote collection_spark importing junit lang_sgl pytest_plugin record sample \
   docs_house docs_queries lang_docs packaging views_page library cookbook textmate tck \
-  lanelet2 autoware sumo fuzz mutants serve live report parts sandbox_pool
+  lanelet2 autoware sumo fuzz mutants serve live report parts sandbox_pool sequences shrink
 tests-of = $(foreach name,$(1),tests/test_$(name).py)
 
 # A file of tests at a time in each process: what its tests share is made once. The longest come first

@@ -24,7 +24,7 @@ from sgstore.store import IN_NOTEBOOK, FrameRef, StoreFile, UserTables
 from sgstore.vocabulary import normalize_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
     import networkx as nx
     import numpy as np
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from sgstore.matches import Interval, Matches
     from sgstore.segments import TraceOutcome
     from sgstore.store import Rows, SimilarFrames, StoredTrace
-    from sgstore.temporal import CheckRun
+    from sgstore.temporal import CheckRun, ShortestClip
     from sgstore.truth_lanes import TruthLanes
     from sgstore.world import Clip
 
@@ -328,6 +328,44 @@ class Store:
         return CheckRun(
             self.file, self.file.catalog, text, parameters, sgsm_compat=sgsm_compat, status=status
         )
+
+    def shrink(
+        self, text: str, /, clip: str | None = None, **parameters: object
+    ) -> Iterator[ShortestClip]:
+        """Yield the shortest clips that still match, or violate a check: one for each trace (and check).
+
+        Each clip that is tried is a trace of its own: what looks back or ahead sees nothing outside of it, and
+        who is in none of its frames is not in it. A violation must be one that nothing can mend that may come.
+
+        Parameters
+        ----------
+        text : str
+            A query, as :meth:`find` takes it, or ``CHECK`` statements.
+        clip : str, optional
+            What is cut: ``TRACE@12s..18s`` or ``TRACE#120..180``; by default every whole trace.
+        **parameters
+            Values of ``$name``.
+
+        Raises
+        ------
+        QueryError
+            The text is neither, or names what the store does not know.
+        StoreError
+            There is no such clip.
+        """
+        from sgstore.draw import range_of
+        from sgstore.temporal import shortest_clips
+
+        span = None
+        if clip is not None:
+            ends = range_of(clip)
+            if ends is None:
+                raise StoreError(f"{clip}: no clip; expected TRACE@12s..18s or TRACE#120..180")
+            first, last = (self.file.frame(end) for end in ends)
+            if first.frame_id > last.frame_id:
+                raise StoreError(f"{clip}: it ends before it begins")
+            span = first, last
+        return shortest_clips(self.file, self.file.catalog, text, parameters, span)
 
     def sql(
         self, text: str, *, timeout_s: float | None = None, max_rows: int | None = None

@@ -36,7 +36,7 @@ VERBS: Final = {
     "checks": ("check", "monitor", "timeline"),
     "coverage": ("coverage", "select", "diff", "lock"),
     "prioritize": ("prioritize",),
-    "exports": ("show", "export"),
+    "exports": ("show", "export", "shrink"),
     "serve": ("serve", "report"),
     "assistant": ("mcp",),
     "collections": ("collection",),

@@ -1,4 +1,4 @@
-"""Verbs that draw and write: show, export."""
+"""Verbs that draw and write: show, export, shrink."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typer import Argument, Option
 from sgstore.cli._options import (
     LOSS,
     AsJson,
+    PrintedRows,
     QueryLimits,
     Question,
     StorePath,
@@ -20,6 +21,7 @@ from sgstore.cli._options import (
     lines_of,
     parameters_of,
     say_left_out,
+    say_unknown,
     seconds_of,
 )
 from sgstore.cli._output import Format, count_bar, say, write_rows
@@ -176,11 +178,15 @@ def export(
 
 def _write(written: Sequence[WrittenClip | WrittenFile], form: Format) -> None:
     """Say what was lost, and print what was written, a row each."""
+    _say_lost(written)
+    rows = [one.as_row() for one in written]
+    write_rows(tuple(rows[0]), [tuple(row.values()) for row in rows], form)
+
+
+def _say_lost(written: Sequence[WrittenClip | WrittenFile]) -> None:
     for one in written:
         for loss in one.losses:
             say(f"{one.file.name}: lost: {loss.reason}")
-    rows = [one.as_row() for one in written]
-    write_rows(tuple(rows[0]), [tuple(row.values()) for row in rows], form)
 
 
 def _clips(
@@ -204,6 +210,80 @@ def _clips(
     matches = store.find(text, **parameters)
     say_left_out(matches)
     return list(matches.clips(*margins))
+
+
+# The verb that cuts clips to what matters ---------------------------------------------------------
+
+
+@app.command(rich_help_panel=PANEL)
+def shrink(
+    store: StorePath,
+    question: Question,
+    clip: Annotated[
+        str | None,
+        Option(
+            "--clip",
+            metavar="CLIP",
+            help="A clip to cut: TRACE@12s..18s or TRACE#120..180; by default every whole trace.",
+        ),
+    ] = None,
+    to: Annotated[
+        Path | None,
+        Option(
+            "--to",
+            metavar="DIR",
+            help="Folder to write the clips into, with the original messages; nothing is overwritten.",
+        ),
+    ] = None,
+    *,
+    out: PrintedRows,
+    bounds: QueryLimits,
+) -> int:
+    """Cut traces, or a clip, to the fewest frames that still match, or violate a check.
+
+    One row for each trace, and for each check. What is cut out is asked as if it were the
+    whole recording.
+    """
+    from sgstore.diff import has_checks
+
+    opened = bounds.opened(store)
+    text, values = question.asked()
+    found = list(opened.shrink(text, clip, **values))
+    checks = has_checks(text)
+    if checks:
+        unknown = opened.check(text, **values).unknown()
+        say_unknown((one.check, one.trace, one.reason) for one in unknown)
+    else:
+        say_left_out(opened.find(text, **values))
+    written: dict[Clip, WrittenClip | WrittenFile] = {}
+    if to is not None and found:
+        written = _cut_out(opened, list(dict.fromkeys(one.clip for one in found)), text, to)
+    head = [*(["file"] if written else []), *(["check"] if checks else [])]
+    rows = [
+        (
+            *([str(written[one.clip].file)] if written else []),
+            *([one.check] if checks else []),
+            *(one.trace, f"{one.trace}#{one.start_seq}", f"{one.trace}#{one.end_seq}"),
+            *(round(one.start, 3), round(one.end, 3), one.frames, one.of),
+        )
+        for one in found
+    ]
+    out.write((*head, "trace", "from", "to", "start", "end", "frames", "of"), rows)
+    lost = any(one.losses for one in written.values())
+    return LOSS if lost else 0
+
+
+def _cut_out(
+    store: Store, clips: list[Clip], text: str, to: Path
+) -> dict[Clip, WrittenClip | WrittenFile]:
+    """Write clips as their recordings have them; says what was lost."""
+    from sgstore.exporters import Export, write_export
+
+    with count_bar(to.name or "shrink", "clips") as progress:
+        order = Export(store, tuple(clips), provenance={"query": text}, progress=progress)
+        written = write_export(order, to)
+    _say_lost(written)
+    return dict(zip(clips, written, strict=True))
 
 
 # Verbs that draw --------------------------------------------------------------------------------

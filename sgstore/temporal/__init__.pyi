@@ -18,6 +18,8 @@ from ._monitor import opened as opened
 from ._robustness import Robustness as Robustness
 from ._sequence_monitor import FrameTime as FrameTime
 from ._sequence_monitor import MonitorEvent as MonitorEvent
+from ._shrink import ShortestClip as ShortestClip
+from ._shrink import shortest_clips as shortest_clips
 from ._signals import evaluate as evaluate
 
 __all__ = [
@@ -28,6 +30,7 @@ __all__ = [
     "Monitor",
     "MonitorEvent",
     "Robustness",
+    "ShortestClip",
     "TemporalMatches",
     "Verdict",
     "Witness",
@@ -37,6 +40,7 @@ __all__ = [
     "margin_cells",
     "returned_by",
     "opened",
+    "shortest_clips",
     "unknown_notes",
     "verdict_columns",
     "verdict_rows",

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, replace
+from functools import cached_property
 from heapq import merge
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
@@ -22,7 +23,7 @@ from sgstore.lang import (
 )
 from sgstore.matches import Interval, notes_in
 from sgstore.store import IN_NOTEBOOK
-from sgstore.temporal._formula import Formula, formula_text, tolerant
+from sgstore.temporal._formula import Formula, Proposition, formula_text, tolerant
 from sgstore.temporal._match_values import AT_FRAME, ReturnedValues, Stretches
 from sgstore.temporal._matches import lacking
 from sgstore.temporal._offline import PlanValues, TraceReader, refuse_many, traces
@@ -49,7 +50,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.lang import Catalog, CheckInCatalog
+    from sgstore.lang import Catalog, CheckInCatalog, Window
     from sgstore.lang.ir import BoundCheck, BoundQuantifier, OverMatch
     from sgstore.store import StoreFile
     from sgstore.world import Bools, Floats, Ints
@@ -494,12 +495,20 @@ class CheckRun:
     def __iter__(self) -> Iterator[Verdict]:
         with self._file.snapshot():
             for one in compile_checks(self._text, self._catalog(), self._parameters):
-                check = _Check(self._file, one, compat=self._compat, status=self._status)
+                check = StoreCheck(self._file, one, compat=self._compat, status=self._status)
                 yield from check.verdicts()
+
+    def unknown(self) -> Iterator[Verdict]:
+        """The verdicts of the traces that cannot answer; no other trace is asked."""
+        with self._file.snapshot():
+            for one in compile_checks(self._text, self._catalog(), self._parameters):
+                yield from StoreCheck(self._file, one, compat=False, status=False).unknown()
 
     def explain(self) -> str:
         """Explain the checks: formulas over atoms, and each atom."""
-        parts = [_Check(self._file, one, compat=False, status=False).text() for one in self._checks]
+        parts = [
+            StoreCheck(self._file, one, compat=False, status=False).text() for one in self._checks
+        ]
         return "\n\n".join(parts)
 
 
@@ -507,8 +516,17 @@ _BindingVerdict = tuple[tuple[Violation, ...], "Statuses | None"]
 """Violations of one binding, or of a check without quantifiers; and its status at each frame, if asked for."""
 
 
-class _Check:
-    """One check, while a store is asked."""
+class StoreCheck:
+    """One check, while a store is asked.
+
+    Parameters
+    ----------
+    file : StoreFile
+        It stays as it is while this is used.
+    one : CheckInCatalog
+    compat, status : bool
+        As ``sgsm_compat`` and ``status`` of :class:`CheckRun`.
+    """
 
     def __init__(self, file: StoreFile, one: CheckInCatalog, *, compat: bool, status: bool) -> None:
         check = one.check
@@ -525,6 +543,15 @@ class _Check:
         self._quantity = self._plan.quantity(check.formula) if check.robustness else None
         self._people: dict[int, dict[str, dict[int, str]]] = {}
 
+    @cached_property
+    def _lacks(self) -> dict[int, str]:
+        """The traces that do not know what the check needs, with the reason."""
+        return lacking(self._file, self._catalog, of_check(self._check))
+
+    @cached_property
+    def _knowing(self) -> Catalog:
+        return replace(self._catalog, unknowing=frozenset(self._lacks))
+
     def text(self) -> str:
         """The check as it is asked."""
         head = [f"---- {self._check.name}"]
@@ -536,15 +563,47 @@ class _Check:
 
     def verdicts(self) -> Iterator[Verdict]:
         """The verdict of each trace, by name of the trace."""
+        known = (self._verdict(trace) for trace in self.readers() if len(trace))
+        yield from merge(known, self.unknown(), key=lambda verdict: natural(verdict.trace))
+
+    def readers(self, within: Window | None = None) -> Iterator[TraceReader]:
+        """The traces that can answer, of a window of whole traces, with all that the check needs of them."""
         gaps = "bridge" if self._check.gaps == "bridge" else "break"
         self._read_people()
-        lacks = lacking(self._file, self._catalog, of_check(self._check))
-        catalog = replace(self._catalog, unknowing=frozenset(lacks))
         asks = self._plan.asks | self._values.asks
-        told = traces(self._file, catalog, self._whole, asks, gaps=gaps)
-        known = (self._verdict(trace) for trace in told if len(trace))
-        unknown = self._unknown(catalog, lacks)
-        yield from merge(known, unknown, key=lambda verdict: natural(verdict.trace))
+        yield from traces(self._file, self._knowing, self._whole, asks, gaps=gaps, within=within)
+
+    def unknown(self) -> Iterator[Verdict]:
+        """The verdicts of the traces that cannot answer."""
+        yield from self._unknown(self._knowing, self._lacks)
+
+    def watched(self) -> dict[str, str]:
+        """Names of the propositions that say where the entities of each variable are; asked from now on."""
+        found = (
+            (node, self._plan.present(node)) for q in self._check.quantifiers for node in q.nodes
+        )
+        return {node: one.name for node, one in found if isinstance(one, Proposition)}
+
+    def violated(self, trace: TraceReader, present: Mapping[str, str]) -> bool:
+        """Tell whether some frames of a trace violate the check, as if they were all.
+
+        Parameters
+        ----------
+        trace : TraceReader
+            Those frames.
+        present : mapping of str to str
+            What :meth:`watched` gave before the trace was read: who is in none of the frames is not in it.
+        """
+        everybody = self._people.get(trace.trace_id, {})
+        here = dict(everybody)
+        for node, name in present.items():
+            ids = trace.relations[name].keys[:, 0].tolist()
+            here[node] = {i: everybody[node][i] for i in ids if i in everybody.get(node, {})}
+        self._people[trace.trace_id] = here
+        try:
+            return self._verdict(trace).violated
+        finally:
+            self._people[trace.trace_id] = everybody
 
     def _unknown(self, catalog: Catalog, lacks: Mapping[int, str]) -> Iterator[Verdict]:
         """The verdicts of the traces that cannot answer."""

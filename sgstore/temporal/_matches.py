@@ -85,6 +85,12 @@ class TemporalMatches(Matches):
             else:
                 yield compiled
 
+    @contextmanager
+    def asked(self) -> Generator[Compiled]:
+        """The query as a store is asked; the store stays as it is until this is left."""
+        with self._compiled() as compiled:
+            yield compiled
+
     def _part(self, compiled: Compiled, query: Query) -> Compiled:
         ready = super()._part(compiled, query)
         return replace(ready, finder=self._finder(ready)) if query.steps else ready

@@ -90,6 +90,15 @@ class TimedRelation:
         starts = np.append(first, len(frames))
         return cls(keys[first], starts, frames, tuple(value[order] for value in values))
 
+    def between(self, first: int, last: int) -> TimedRelation:
+        """The same in the frames from one to another, both included, as if there were no others."""
+        rows = np.flatnonzero((self.frames >= first) & (self.frames <= last))
+        owners = np.searchsorted(self.starts, rows, "right") - 1
+        new = np.flatnonzero(np.diff(owners, prepend=-1))
+        keys, starts = self.keys[owners[new]], np.append(new, len(rows))
+        values = tuple(value[rows] for value in self.values)
+        return TimedRelation(keys, starts, self.frames[rows] - first, values)
+
     def find(self, wanted: Keys) -> Ints:
         """(B,) the place of each of some bindings (B, n) among the keys; -1: it is not there."""
         if not len(self.keys) or not len(wanted):
@@ -205,6 +214,19 @@ class TraceReader:
 
     def __len__(self) -> int:
         return len(self.frame_ids)
+
+    def between(self, first: int, last: int) -> TraceReader:
+        """The frames from one to another, both included, as if the trace had no others."""
+        rows = slice(first, last + 1)
+        return replace(
+            self,
+            frame_ids=self.frame_ids[rows],
+            numbers=self.numbers[rows],
+            times=self.times[rows],
+            log_times=self.log_times[rows],
+            clock=replace(self.clock, times=self.clock.times[rows], runs=self.clock.runs[rows]),
+            relations={name: one.between(first, last) for name, one in self.relations.items()},
+        )
 
     @property
     def together(self) -> int:

@@ -385,14 +385,7 @@ class Finder:
             What is worked out for each match.
         window : Window or None
         """
-        if window is not None:
-            high = ((window.high - 1) >> BUCKET_BITS) + 1
-            low = window.low >> BUCKET_BITS << BUCKET_BITS
-            window = Window(low, high << BUCKET_BITS, window.traces)
-        ordered = sorted(self._steps, key=lambda ask: len(ask.after))
-        asks = self._asks_of(places, ordered)
-        about = self._file, self._catalog, self._query, asks
-        found = traces(*about, gaps=self._query.gaps, within=window)
+        found = self.readers(window, places)
         parts: list[_Part] = []
         for trace in found:
             for part in self._find(trace, places) if len(trace) else ():
@@ -411,6 +404,29 @@ class Finder:
         many = len(places) + self._spans * 2
         values = [[item for part in parts for item in part[3][n]] for n in range(many)]
         return ExternalRelation(first, last, nodes, edges, values)
+
+    def readers(
+        self, window: Window | None, places: tuple[Bound, ...] = ()
+    ) -> Iterator[TraceReader]:
+        """The traces of a window, or those that it is a part of, with what the query needs of them.
+
+        Parameters
+        ----------
+        window : Window or None
+        places : tuple of Bound
+            What is worked out for each match.
+        """
+        if window is not None:
+            high = ((window.high - 1) >> BUCKET_BITS) + 1
+            low = window.low >> BUCKET_BITS << BUCKET_BITS
+            window = Window(low, high << BUCKET_BITS, window.traces)
+        ordered = sorted(self._steps, key=lambda ask: len(ask.after))
+        about = self._file, self._catalog, self._query, self._asks_of(places, ordered)
+        return traces(*about, gaps=self._query.gaps, within=window)
+
+    def matches(self, trace: TraceReader) -> bool:
+        """Tell whether there is a match in some frames of a trace, as if they were all."""
+        return any(len(part[0]) for part in self._find(trace, ()))
 
     def _asks_of(self, places: tuple[Bound, ...], steps: Sequence[Ask]) -> dict[str, Ask]:
         """All that is asked of single frames; of what is only returned, no more than steps leave."""

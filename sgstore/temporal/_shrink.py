@@ -1,0 +1,259 @@
+"""Shortest clips: the fewest consecutive frames that still have a match, or a violation.
+
+Each clip that is tried is a trace of its own: what looks back or ahead sees nothing outside of it, and who is
+in none of its frames is not in it. Values of single frames stay as they are: times since the beginning,
+``parked``, and what is said of the trace.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.lang import (
+    CLOCK,
+    CheckInCatalog,
+    Window,
+    compile_checks,
+    extents,
+    parse,
+    union_parts,
+)
+from sgstore.lang.ir import Tense, walk
+from sgstore.lang.syntax import CheckClause
+from sgstore.temporal._checks import StoreCheck
+from sgstore.temporal._matches import TemporalMatches
+from sgstore.temporal._sequences import Finder
+from sgstore.world import Clip
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from sgstore.lang import Catalog
+    from sgstore.lang.ir import Bound, BoundCheck, Query
+    from sgstore.store import FrameRef, StoreFile
+    from sgstore.temporal._offline import TraceReader
+
+Span = tuple["FrameRef", "FrameRef"]
+"""The first and the last frame of a clip."""
+
+
+@dataclass(frozen=True, slots=True)
+class ShortestClip:
+    """Shortest clip of a trace that still has a match, or violates a check.
+
+    Attributes
+    ----------
+    check : str
+        Name of the check; empty: it has a match of the query.
+    trace : str
+    start_seq, end_seq : int
+        First and last frame.
+    start, end : float
+        Their times since the trace began; s.
+    frames : int
+        How many there are.
+    of : int
+        How many there were: of the clip that was given, or of the whole trace.
+    clip : Clip
+        What an export cuts out: log times.
+    """
+
+    check: str
+    trace: str
+    start_seq: int
+    end_seq: int
+    start: float
+    end: float
+    frames: int
+    of: int
+    clip: Clip
+
+
+def fewest(frames: int, has: Callable[[int, int], bool], *, grows: bool) -> tuple[int, int] | None:
+    """The shortest range of frames that has something, the earliest of these; ``None``: no range has it.
+
+    Parameters
+    ----------
+    frames : int
+    has : function
+        Tell whether the range from a first to a last frame has it.
+    grows : bool
+        Whether a range that has it still has it when frames follow: then not every range needs to be tried.
+    """
+    if not grows:
+        lengths = range(1, frames + 1)
+        ranges = ((i, i + n - 1) for n in lengths for i in range(frames - n + 1))
+        return next((one for one in ranges if has(*one)), None)
+    best, most = None, frames
+    for first in range(frames):
+        low, high = first, min(first + most, frames) - 1
+        if high < low or not has(first, high):
+            continue
+        while low < high:
+            middle = (low + high) // 2
+            low, high = (low, middle) if has(first, middle) else (middle + 1, high)
+        best, most = (first, high), high - first
+    return best
+
+
+def shortest_clips(
+    file: StoreFile,
+    catalog: Callable[[], Catalog],
+    text: str,
+    parameters: Mapping[str, object],
+    span: Span | None = None,
+) -> Iterator[ShortestClip]:
+    """The shortest clips that have a match of a query, or violate checks: one for each trace (and check).
+
+    A violation is one that nothing can mend that may still come: what only the end of a trace refutes, the end
+    of a clip would refute as well.
+
+    Parameters
+    ----------
+    file : StoreFile
+    catalog : function
+        Gives what the store holds.
+    text : str
+        A query, or ``CHECK`` statements.
+    parameters : mapping of str to value
+    span : pair of FrameRef, optional
+        A clip, which is to be cut; by default every whole trace is.
+
+    Raises
+    ------
+    QueryError
+        The text is neither, or has no meaning.
+    """
+    with file.snapshot():
+        held = catalog()
+        window = None if span is None else _of_trace(held, span[0].trace_id)
+        if any(isinstance(one, CheckClause) for one in parse(text)):
+            for one in compile_checks(text, held, parameters):
+                yield from _violating(file, one, window, span)
+            return
+        asked = union_parts(text, parameters)
+        make = partial(TemporalMatches, file, catalog)
+        parts = [make(text, parameters)] if asked is None else asked.each(make, text)
+        found: dict[str, ShortestClip] = {}
+        for part in parts:
+            for clip in _matching(file, part, window, span):
+                if clip.trace not in found or clip.frames < found[clip.trace].frames:
+                    found[clip.trace] = clip
+        yield from found.values()
+
+
+def _of_trace(catalog: Catalog, trace_id: int) -> Window:
+    """The window of a whole trace."""
+    ids = [one.trace_id for one in catalog.traces]
+    return Window.of([extents(catalog)[ids.index(trace_id)]])
+
+
+def _violating(
+    file: StoreFile, one: CheckInCatalog, window: Window | None, span: Span | None
+) -> Iterator[ShortestClip]:
+    forgiving = replace(one.check, end="weak", returns=(), robustness=False)
+    check = StoreCheck(file, CheckInCatalog(forgiving, one.catalog), compat=False, status=False)
+    present = check.watched()
+    for trace in check.readers(window):
+        whole = _cut(trace, span)
+
+        def violated(first: int, last: int, whole: TraceReader = whole) -> bool:
+            part = whole.between(first, last)
+            return check.violated(part, present)
+
+        yield from _told(
+            one.check.name, whole, fewest(len(whole), violated, grows=_lasts(forgiving))
+        )
+
+
+def _matching(
+    file: StoreFile, matches: TemporalMatches, window: Window | None, span: Span | None
+) -> Iterator[ShortestClip]:
+    with matches.asked() as compiled:
+        if not compiled.query.steps:
+            yield from _of_one_frame(file, matches, span)
+            return
+        finder = Finder(file, compiled.query, compiled.catalog)
+        for trace in finder.readers(window):
+            whole = _cut(trace, span)
+
+            def matched(first: int, last: int, whole: TraceReader = whole) -> bool:
+                return finder.matches(whole.between(first, last))
+
+            found = fewest(len(whole), matched, grows=_stays(compiled.query))
+            yield from _told("", whole, found)
+
+
+def _of_one_frame(
+    file: StoreFile, matches: TemporalMatches, span: Span | None
+) -> Iterator[ShortestClip]:
+    """The first frame of each trace, or in a clip, that matches."""
+    low, high = (-1, (1 << 63) - 1) if span is None else (one.frame_id for one in span)
+    found: dict[int, FrameRef] = {}
+    for one in matches.frames():
+        if low <= one.frame_id <= high:
+            found.setdefault(one.trace_id, one)
+    for trace_id, one in found.items():
+        if span is None:
+            frames = file.trace(trace_id).frames
+        else:
+            frames = len(file.arrays(CLOCK, (low, high + 1))["seq"])
+        clip = Clip(one.trace, one.log_time_ns, one.log_time_ns)
+        yield ShortestClip("", one.trace, one.seq, one.seq, one.t, one.t, 1, frames, clip)
+
+
+_AHEAD: Final = frozenset({"ALWAYS", "EVENTUALLY", "NEXT", "WEAKNEXT", "UNTIL", "RELEASE"})
+"""Operators of time that look ahead: at the end of a clip they see less."""
+
+
+def _looks_ahead(condition: Bound | None) -> bool:
+    parts = walk(condition) if condition is not None else ()
+    return any(isinstance(part, Tense) and part.word in _AHEAD for part in parts)
+
+
+def _lasts(check: BoundCheck) -> bool:
+    """Tell whether frames that violate a check still do when others follow: nobody who comes can mend it."""
+    quantifiers = check.quantifiers
+    return check.gaps != "unknown" and not any(
+        q.word != "FORALL" or _looks_ahead(q.where) for q in quantifiers
+    )
+
+
+def _stays(query: Query) -> bool:
+    """Tell whether frames with a match of a query still have one when others follow."""
+    return not any(
+        step.absent
+        or (step.hold is not None and step.hold.comparison not in {">", ">="})
+        or any(map(_looks_ahead, step.when))
+        for step in query.steps
+    )
+
+
+def _cut(trace: TraceReader, span: Span | None) -> TraceReader:
+    """A trace, or the frames of a clip in it."""
+    if span is None:
+        return trace
+    first, last = np.searchsorted(trace.frame_ids, [one.frame_id for one in span]).tolist()
+    return trace.between(first, last)
+
+
+def _told(check: str, whole: TraceReader, found: tuple[int, int] | None) -> Iterator[ShortestClip]:
+    if found is None:
+        return
+    first, last = found
+    seqs, log = (column[[first, last]].tolist() for column in (whole.numbers, whole.log_times))
+    yield ShortestClip(
+        check=check,
+        trace=whole.name,
+        start_seq=seqs[0],
+        end_seq=seqs[1],
+        start=whole.seconds(first),
+        end=whole.seconds(last),
+        frames=last - first + 1,
+        of=len(whole),
+        clip=Clip(whole.name, log[0], log[1]),
+    )
