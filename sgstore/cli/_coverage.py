@@ -84,6 +84,25 @@ Missing = Annotated[
     bool, Option("--missing", help="List what is missing, each with a query for it.")
 ]
 Covered = Annotated[bool, Option("--covered", help="List what is covered, with its frames.")]
+Manoeuvres = Annotated[
+    list[str] | None,
+    Option(
+        "--manoeuvre",
+        "-m",
+        metavar="NAME",
+        help="A manoeuvre of sequences: a pattern of the library, or NAME=QUERY; may be repeated.",
+        show_default="the manoeuvres of the library",
+    ),
+]
+Within = Annotated[
+    str | None,
+    Option(
+        "--within",
+        metavar="TIME",
+        help="Longest time from the first manoeuvre of a sequence to the last.",
+        show_default="10s",
+    ),
+]
 
 
 @dataclass(frozen=True)
@@ -271,6 +290,44 @@ def combos_(
         title = f"Pairs of features in {abstraction} of {_short(a)}"
         draw_matrix(names, frames, wanted, picture, title=title)
         say(f"drawn: {picture}")
+
+
+@coverage.command("sequences")
+def sequences_(
+    a: A,
+    k: Annotated[int, Option("--k", min=1, help="Number of manoeuvres in a sequence.")] = 2,
+    by: Annotated[
+        str | None,
+        Option("--by", metavar="B", help="Reference: sequences that occur in B; by default all."),
+    ] = None,
+    manoeuvres: Manoeuvres = None,
+    within: Within = None,
+    missing: Annotated[bool, Option("--missing", help="List what is missing.")] = False,
+    covered: Annotated[
+        bool, Option("--covered", help="List what is covered, with where it happens first.")
+    ] = False,
+    limit: Limit = None,
+    *,
+    ask: AskOptions,
+) -> None:
+    """Count the sequences of k manoeuvres, such as (car stops, ego stops): who did what after what."""
+    from sgstore.coverage import manoeuvres_named, selection_of, sequences
+
+    named = manoeuvres_named(manoeuvres or ())
+    spill = ask.spill()
+    ours, *others = (selection_of(text, max_spill=spill) for text in (a, by) if text is not None)
+    say_left_out(ours)
+    found = sequences(ours, k, others[0] if others else None, named, _within(within))
+    listed = found.missing if missing else found.covered if covered else found.shares
+    for text in found.shares.said if listed is not found.shares else ():
+        say(text)
+    ask.report(listed, limit)
+
+
+def _within(text: str | None) -> float:
+    from sgstore.coverage import WITHIN_S
+
+    return WITHIN_S if text is None else seconds_of(text, "--within")
 
 
 @coverage.command("spec")
@@ -465,6 +522,11 @@ class ChoiceOptions:
         int, Option("--combos", metavar="K", min=0, help="Keep combinations of K features.")
     ] = 0
     ego: Annotated[bool, Option("--ego", help="--combos: only features of the ego.")] = False
+    sequences: Annotated[
+        int, Option("--sequences", metavar="K", min=0, help="Keep sequences of K manoeuvres.")
+    ] = 0
+    manoeuvres: Manoeuvres = None
+    within: Within = None
     objective: Annotated[
         Objective, Option("--objective", help="Quantity that --minimal minimizes.")
     ] = "units"
@@ -493,6 +555,9 @@ class ChoiceOptions:
             objective=self.least or self.objective,
             seed=self.seed,
             stride_s=seconds_of(self.stride, "--stride") if self.stride else None,
+            sequences=self.sequences,
+            manoeuvres=tuple(self.manoeuvres or ()),
+            within_s=_within(self.within),
         )
 
     def _strategy(self) -> Strategy:

@@ -33,6 +33,14 @@ from ._frames import of_unknown as of_unknown
 from ._frames import periods_of as periods_of
 from ._frames import run_begins as run_begins
 from ._frames import selection_of as selection_of
+from ._sequences import WITHIN_S as WITHIN_S
+from ._sequences import Happenings as Happenings
+from ._sequences import SequenceCoverage as SequenceCoverage
+from ._sequences import check_sequences as check_sequences
+from ._sequences import happenings as happenings
+from ._sequences import manoeuvres_named as manoeuvres_named
+from ._sequences import sequences as sequences
+from ._sequences import sequences_in as sequences_in
 from ._slots import read_specifications as read_specifications
 from ._slots import slot_coverage as slot_coverage
 from ._slots import specification as specification
@@ -43,10 +51,14 @@ __all__ = [
     "Combinations",
     "Combos",
     "CountedUnit",
+    "Happenings",
     "Missing",
     "ReportTable",
     "S3C_THRESHOLD",
+    "SequenceCoverage",
     "UNKNOWN",
+    "WITHIN_S",
+    "check_sequences",
     "classed",
     "classes",
     "combined",
@@ -58,6 +70,8 @@ __all__ = [
     "features",
     "frames_of",
     "growth",
+    "happenings",
+    "manoeuvres_named",
     "names_of",
     "novel",
     "novel_clips",
@@ -69,6 +83,8 @@ __all__ = [
     "read_specifications",
     "run_begins",
     "selection_of",
+    "sequences",
+    "sequences_in",
     "shared",
     "slot_coverage",
     "specification",

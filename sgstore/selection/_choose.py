@@ -13,11 +13,19 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.coverage import UNKNOWN, ReportTable, classed, expected_classes, names_of
+from sgstore.coverage import UNKNOWN, WITHIN_S, ReportTable, classed, expected_classes, names_of
 from sgstore.errors import ConfigError
 from sgstore.locks import lock_of
 from sgstore.selection._cover import affordable, cheapest, has_solver, minimal, within
-from sgstore.selection._units import Budget, Measure, SelectionUnit, holdings, kept, units_of
+from sgstore.selection._units import (
+    Budget,
+    Measure,
+    SelectionUnit,
+    holdings,
+    kept,
+    sequence_holdings,
+    units_of,
+)
 from sgstore.store import seq_of, trace_of
 
 if TYPE_CHECKING:
@@ -126,6 +134,12 @@ class SelectionSpec:
         0: classes are to be kept; k: combinations of k features.
     of_ego : bool
         Whether only features of the ego count, and of lanes by how they lie to it.
+    sequences : int
+        k: sequences of k manoeuvres are to be kept, and no classes; 0: none.
+    manoeuvres : tuple of str
+        As :func:`sgstore.coverage.manoeuvres_named` takes them; by default those of the library.
+    within_s : float
+        Longest time from the first manoeuvre of a sequence to the last; s.
     each : int
         In how many units each class is to be; of each stratum how many are taken, 0: as the budget allows.
     by : str
@@ -154,6 +168,9 @@ class SelectionSpec:
     objective: Measure = "units"
     seed: int = 0
     stride_s: float | None = None
+    sequences: int = 0
+    manoeuvres: tuple[str, ...] = ()
+    within_s: float = WITHIN_S
 
     def __post_init__(self) -> None:
         """Refuse what has no meaning.
@@ -173,6 +190,14 @@ class SelectionSpec:
                 "clips that overlap share frames, so a class that is in two of them may have come once:"
                 " to have each class several times, leave out --stride"
             )
+        if self.sequences and self.combos:
+            raise ConfigError("give one of --combos and --sequences: what is to be kept")
+        if self.sequences and self.unit is SelectionUnit.frame:
+            raise ConfigError("a sequence is in no single frame: say --unit clip or --unit trace")
+        if (self.manoeuvres or self.within_s != WITHIN_S) and not self.sequences:
+            raise ConfigError(
+                "manoeuvres, and a time within which they happen, belong to --sequences"
+            )
         if not 0 <= self.alpha <= 10:
             raise ConfigError(
                 f"--alpha {self.alpha:g}; expected 0 (the same for all) to 1 (as they are)"
@@ -181,13 +206,18 @@ class SelectionSpec:
     def as_dict(self, query: str) -> dict[str, Any]:
         """All of it as plain values, as a lock says it."""
         cover = self.strategy in {Strategy.minimal, Strategy.per_class, Strategy.rarest}
-        return {
+        told = {
+            "sequences": self.sequences,
+            "manoeuvres": list(self.manoeuvres) or None,
+            "within_s": self.within_s,
+        }
+        return (told if self.sequences and cover else {}) | {
             "query": query or None,
             "way": self.strategy.value,
             "unit": self.unit.value,
             "clip_s": self.clip_s if self.unit is SelectionUnit.clip else None,
             "stride_s": self.stride_s if self.unit is SelectionUnit.clip else None,
-            "abstraction": self.abstraction if cover else None,
+            "abstraction": self.abstraction if cover and not self.sequences else None,
             "combos": self.combos if cover else None,
             "of_ego": self.of_ego if cover and self.combos else None,
             "each": self.each if self.strategy in {Strategy.per_class, Strategy.stratify} else None,
@@ -265,10 +295,17 @@ def _selected(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
         case Strategy.stratify:
             return _stratified(spec, units, rank)
         case _:
-            held = holdings(units, spec.abstraction, spec.combos, of_ego=spec.of_ego)
+            held = _held(spec, units)
             if spec.strategy is Strategy.rarest:
                 return _rarest(spec, units, rank, held)
             return _covering(spec, units, rank, held)
+
+
+def _held(spec: SelectionSpec, units: Units) -> Holdings:
+    """What the units of a selection hold: classes, combinations of features, or sequences of manoeuvres."""
+    if spec.sequences:
+        return sequence_holdings(units, spec.sequences, spec.manoeuvres, spec.within_s)
+    return holdings(units, spec.abstraction, spec.combos, of_ego=spec.of_ego)
 
 
 def _every(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:

@@ -9,13 +9,24 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from sgstore.coverage import UNKNOWN, classed, combined, features, periods_of, run_begins
+from sgstore.coverage import (
+    UNKNOWN,
+    check_sequences,
+    classed,
+    combined,
+    features,
+    happenings,
+    manoeuvres_named,
+    periods_of,
+    run_begins,
+    sequences_in,
+)
 from sgstore.errors import ConfigError
 from sgstore.selection._sets import SetFamily, distinct, spread
 from sgstore.store import lengths_of_messages, trace_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
     from sgstore.coverage import ChosenFrames, Classed, Combinations
     from sgstore.locks import CasePart
@@ -311,8 +322,8 @@ class Holdings:
 
     Attributes
     ----------
-    classed : Classed
-        The frames with their classes.
+    classed : Classed or None
+        The frames with their classes; ``None``: the elements are sequences.
     pairs : (2, M) int64
         Units, and the elements that each holds; each pair once, in order.
     weight : (E,) int64
@@ -325,7 +336,7 @@ class Holdings:
         Elements of the classes that occur; ``None``: they are the elements.
     """
 
-    classed: Classed
+    classed: Classed | None
     pairs: Ints
     weight: Ints
     frames: Ints
@@ -343,7 +354,18 @@ class Holdings:
         return replace(found, weight=self.weight)
 
     def over(self, units: Units) -> Holdings:
-        """The same of other units of the same frames."""
+        """The same of other units of the same frames.
+
+        Raises
+        ------
+        ConfigError
+            The elements are sequences, which may be in a clip and in no part of it.
+        """
+        if self.classed is None:
+            raise ConfigError(
+                "clips that overlap are chosen for sequences by their number alone: leave out --stride, or"
+                " --objective and a budget of time, frames or bytes"
+            )
         pairs = _classes_of(units, self.classed)
         return replace(self, pairs=pairs if self.has is None else _of_units(pairs, self.has))
 
@@ -376,6 +398,43 @@ def holdings(units: Units, abstraction: str, combos: int = 0, *, of_ego: bool = 
     inside, weight, frames = _distinct_combinations(found)
     kind = f"combinations of {combos} features{' of the ego' if of_ego else ''} in {abstraction}"
     return Holdings(of, _of_units(pairs, inside), weight, frames, kind, inside)
+
+
+def sequence_holdings(units: Units, k: int, names: Sequence[str], within_s: float) -> Holdings:
+    """Elements of units: the sequences of k manoeuvres that happen in their frames.
+
+    Parameters
+    ----------
+    units : Units
+    k : int
+    names : sequence of str
+        Manoeuvres, as :func:`sgstore.coverage.manoeuvres_named` takes them.
+    within_s : float
+        Longest time from the first to the last; s.
+
+    Raises
+    ------
+    ConfigError
+        There are more sequences than can be gone through.
+    QueryError
+        A manoeuvre is no pattern.
+    """
+    happened = happenings(units.chosen, manoeuvres_named(names))
+    check_sequences(len(happened.names), k)
+    row = np.searchsorted(units.frame_id, happened.frame_id)
+    number: dict[int, int] = {}
+    parts = [np.zeros((2, 0), np.int64)]
+    ends = zip(units.begin.tolist(), units.end.tolist(), strict=True)
+    for unit, (begin, end) in enumerate(ends):
+        low, high = np.searchsorted(row, [begin, end]).tolist()
+        of, time = happened.code[low:high], happened.time_ns[low:high]
+        found = sequences_in(of, time, len(happened.names), k, round(within_s * 1e9))
+        held = sorted(number.setdefault(one, len(number)) for one in found)
+        parts.append(np.stack([np.full(len(held), unit), np.array(held, np.int64)]))
+    pairs = np.concatenate(parts, axis=1)
+    often = np.bincount(pairs[1], minlength=len(number)).astype(np.int64)
+    kind = f"sequences of {k} manoeuvres within {within_s:g} s"
+    return Holdings(None, pairs, np.ones_like(often), often, kind)
 
 
 def _classes_of(units: Units, of: Classed) -> Ints:
