@@ -1,12 +1,4 @@
-"""A store as people use it: recordings go in, frames are found, seen as graphs and pictures, cut into clips.
-
-::
-
-    with sgstore.open("drives.sgstore", create=True) as store:
-        store.ingest("monday.mcap")
-        for row in store.find("MATCH (e:Ego)-[:near_coll]->(p:Person)"):
-            print(row.trace, row.t, row.p_name)
-"""
+"""A store as people use it: recordings go in, frames are found, seen as graphs and pictures, cut into clips."""
 
 from __future__ import annotations
 
@@ -332,40 +324,10 @@ class Store:
     def shrink(
         self, text: str, /, clip: str | None = None, **parameters: object
     ) -> Iterator[ShortestClip]:
-        """Yield the shortest clips that still match, or violate a check: one for each trace (and check).
-
-        Each clip that is tried is a trace of its own: what looks back or ahead sees nothing outside of it, and
-        who is in none of its frames is not in it. A violation must be one that nothing can mend that may come.
-
-        Parameters
-        ----------
-        text : str
-            A query, as :meth:`find` takes it, or ``CHECK`` statements.
-        clip : str, optional
-            What is cut: ``TRACE@12s..18s`` or ``TRACE#120..180``; by default every whole trace.
-        **parameters
-            Values of ``$name``.
-
-        Raises
-        ------
-        QueryError
-            The text is neither, or names what the store does not know.
-        StoreError
-            There is no such clip.
-        """
-        from sgstore.draw import range_of
+        """Yield the shortest clips that still match; see :func:`sgstore.temporal.shortest_clips`."""
         from sgstore.temporal import shortest_clips
 
-        span = None
-        if clip is not None:
-            ends = range_of(clip)
-            if ends is None:
-                raise StoreError(f"{clip}: no clip; expected TRACE@12s..18s or TRACE#120..180")
-            first, last = (self.file.frame(end) for end in ends)
-            if first.frame_id > last.frame_id:
-                raise StoreError(f"{clip}: it ends before it begins")
-            span = first, last
-        return shortest_clips(self.file, self.file.catalog, text, parameters, span)
+        return shortest_clips(self.file, self.file.catalog, text, parameters, clip)
 
     def sql(
         self, text: str, *, timeout_s: float | None = None, max_rows: int | None = None

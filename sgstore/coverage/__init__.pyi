@@ -34,7 +34,7 @@ from ._frames import periods_of as periods_of
 from ._frames import run_begins as run_begins
 from ._frames import selection_of as selection_of
 from ._sequences import WITHIN_S as WITHIN_S
-from ._sequences import Happenings as Happenings
+from ._sequences import ManoeuvreEvents as ManoeuvreEvents
 from ._sequences import SequenceCoverage as SequenceCoverage
 from ._sequences import check_sequences as check_sequences
 from ._sequences import happenings as happenings
@@ -51,7 +51,7 @@ __all__ = [
     "Combinations",
     "Combos",
     "CountedUnit",
-    "Happenings",
+    "ManoeuvreEvents",
     "Missing",
     "ReportTable",
     "S3C_THRESHOLD",

@@ -63,7 +63,7 @@ def manoeuvres_named(names: Sequence[str] = ()) -> dict[str, str]:
 
 
 @dataclass(frozen=True)
-class Happenings:
+class ManoeuvreEvents:
     """What happened in some frames, in order of traces and times.
 
     Attributes
@@ -86,7 +86,7 @@ class Happenings:
     time_ns: Ints
     said: list[str]
 
-    def over(self, names: tuple[str, ...]) -> Happenings:
+    def over(self, names: tuple[str, ...]) -> ManoeuvreEvents:
         """The same with codes that are places in other names, which have all of these."""
         place = {name: i for i, name in enumerate(names)}
         moved = np.array([place[name] for name in self.names] or [0], np.int64)
@@ -100,7 +100,7 @@ class Happenings:
         return list(zip(traces.tolist(), map(slice, first.tolist(), ends.tolist()), strict=True))
 
 
-def happenings(chosen: ChosenFrames, manoeuvres: Mapping[str, str]) -> Happenings:
+def happenings(chosen: ChosenFrames, manoeuvres: Mapping[str, str]) -> ManoeuvreEvents:
     """What happened in some frames.
 
     Parameters
@@ -129,7 +129,7 @@ def happenings(chosen: ChosenFrames, manoeuvres: Mapping[str, str]) -> Happening
     names = tuple(sorted({name for *_, name in told}))
     number = {name: i for i, name in enumerate(names)}
     columns = np.array([(f, t, number[n]) for f, t, n in told], np.int64).reshape(-1, 3)
-    return Happenings(chosen, names, columns[:, 2], columns[:, 0], columns[:, 1], said)
+    return ManoeuvreEvents(chosen, names, columns[:, 2], columns[:, 0], columns[:, 1], said)
 
 
 def _steps(text: str) -> int:
@@ -305,7 +305,7 @@ def check_sequences(names: int, k: int) -> None:
         )
 
 
-def _in_traces(of: Happenings, k: int, within_ns: int) -> dict[int, tuple[int, int]]:
+def _in_traces(of: ManoeuvreEvents, k: int, within_ns: int) -> dict[int, tuple[int, int]]:
     """Sequences, in how many traces each is, and the frame of the first happening of the first."""
     found: dict[int, tuple[int, int]] = {}
     for _, rows in of.traces:

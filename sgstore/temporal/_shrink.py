@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.draw import range_of
+from sgstore.errors import StoreError
 from sgstore.lang import (
     CLOCK,
     CheckInCatalog,
@@ -105,9 +107,12 @@ def shortest_clips(
     catalog: Callable[[], Catalog],
     text: str,
     parameters: Mapping[str, object],
-    span: Span | None = None,
+    clip: str | None = None,
 ) -> Iterator[ShortestClip]:
     """The shortest clips that have a match of a query, or violate checks: one for each trace (and check).
+
+    Each clip that is tried is a trace of its own: what looks back or ahead sees nothing outside of it, and
+    who is in none of its frames is not in it.
 
     A violation is one that nothing can mend that may still come: what only the end of a trace refutes, the end
     of a clip would refute as well.
@@ -120,15 +125,18 @@ def shortest_clips(
     text : str
         A query, or ``CHECK`` statements.
     parameters : mapping of str to value
-    span : pair of FrameRef, optional
-        A clip, which is to be cut; by default every whole trace is.
+    clip : str, optional
+        What is cut: ``TRACE@12s..18s`` or ``TRACE#120..180``; by default every whole trace.
 
     Raises
     ------
     QueryError
         The text is neither, or has no meaning.
+    StoreError
+        There is no such clip.
     """
     with file.snapshot():
+        span = None if clip is None else _span(file, clip)
         held = catalog()
         window = None if span is None else _of_trace(held, span[0].trace_id)
         if any(isinstance(one, CheckClause) for one in parse(text)):
@@ -140,10 +148,21 @@ def shortest_clips(
         parts = [make(text, parameters)] if asked is None else asked.each(make, text)
         found: dict[str, ShortestClip] = {}
         for part in parts:
-            for clip in _matching(file, part, window, span):
-                if clip.trace not in found or clip.frames < found[clip.trace].frames:
-                    found[clip.trace] = clip
+            for one in _matching(file, part, window, span):
+                if one.trace not in found or one.frames < found[one.trace].frames:
+                    found[one.trace] = one
         yield from found.values()
+
+
+def _span(file: StoreFile, clip: str) -> Span:
+    """The first and the last frame of a clip, by its text."""
+    ends = range_of(clip)
+    if ends is None:
+        raise StoreError(f"{clip}: no clip; expected TRACE@12s..18s or TRACE#120..180")
+    first, last = (file.frame(end) for end in ends)
+    if first.frame_id > last.frame_id:
+        raise StoreError(f"{clip}: it ends before it begins")
+    return first, last
 
 
 def _of_trace(catalog: Catalog, trace_id: int) -> Window:
