@@ -337,6 +337,14 @@ def test_the_map_is_near_its_outlines(page: Page, store: Store) -> None:
         assert away < 0.06
 
 
+def test_a_trace_that_was_taken_out_meanwhile_has_no_map(
+    page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert page.get("/api/map", trace="town").status_code == 200
+    monkeypatch.setattr(type(page.explorer.store.file), "places", lambda _: {})
+    assert page.get("/api/map", trace="town").status_code == 404
+
+
 def test_what_never_moves_and_names(page: Page, store: Store) -> None:
     header, columns = unpacked(page.get("/api/static", trace="town").content)
     rows = store.sql("SELECT node_id, kind, is_static FROM entities ORDER BY node_id").values

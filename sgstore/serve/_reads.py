@@ -156,8 +156,10 @@ class Reads:
 
     def outlines(self, trace: str) -> bytes:
         """Outlines of the road map of a trace; without points where it has none."""
-        self._trace(trace)
-        key = self._store.file.places()[trace][2]
+        places = self._store.file.places()
+        if trace not in places:
+            raise StoreError(f"no trace {trace!r} in the store")
+        key = places[trace][2]
         with self._reading:  # one map at a time: two who ask for one do not read it twice
             if key not in self._maps:
                 self._maps[key] = self._outlines(trace)

@@ -83,7 +83,7 @@ export function Neighbours({ graph, states, north }) {
           ${on || inside || drawn.length < 9 ? html`<text class="halo" x=${((ax || 0) + (bx || 0)) / 2} y=${((ay || 0) + (by || 0)) / 2 - 3} font-size="9.5" text-anchor="middle" fill="currentColor">${text}</text>` : null}</g>`;
       })}
       ${shown.map((node) => {
-        const [x, y] = at.get(node) || [0, 0], one = name(node).slice(0, 12), wide = Math.max(one.length * 6 + 14, 34);
+        const [x, y] = at.get(node) || [0, 0], one = name(node).slice(0, 14), wide = Math.max(one.length * 6 + 14, 34);
         return html`<g key=${node} style=${{ cursor: node >= 0 ? "pointer" : "default" }} onMouseEnter=${() => { lit.value = new Set([node]); }} onMouseLeave=${() => { lit.value = new Set(); }}
           onClick=${() => { if (node >= 0) { chosen.value = node; panel.value = "near"; } }}><title>${about.get(node)?.name || node}</title>
           <rect x=${(x || 0) - wide / 2} y=${(y || 0) - 11} width=${wide} height="22" rx=${node < 0 ? 4 : 11} fill=${bound.has(node) ? "var(--soft)" : "var(--raised)"} stroke=${bound.has(node) ? "var(--mark)" : lit.value.has(node) ? "var(--accent)" : "var(--line)"} stroke-width=${bound.has(node) ? 2 : 1.2} />
