@@ -14,7 +14,7 @@ import tempfile
 from collections import Counter
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -167,7 +167,7 @@ class Told:
 
     # Margins: by how much a condition is true
 
-    def margin(self, e: Any, i: int, binding: Binding) -> float:
+    def margin(self, e: Any, i: int, binding: Binding) -> float:  # noqa: PLR0911 - a case each
         """By how much a condition holds at a frame: a comparison of numbers by their difference."""
         match e:
             case s.Logic(word=word, operands=operands):
@@ -183,6 +183,11 @@ class Told:
             case s.Temporal():
                 return self.margin_over_time(e, i, binding)
             case s.Comparison(word=word, left=left, right=right):
+                spoken = {p.name for p in parts_of(e) if isinstance(p, s.Variable | s.NodePattern)}
+                graph = self.frames[i].graph
+                here = all(binding[name] in graph for name in spoken & set(binding))
+                if not (here or is_temporal(e)):
+                    return -math.inf
                 frames = isinstance(right, s.Duration) and right.unit == "frames"
                 one = self.counted(left, i, binding) if frames else self.value(left, i, binding)
                 other = self.value(right, i, binding)
@@ -394,6 +399,9 @@ class Told:
         self, sequence: s.SequenceClause, policy: str
     ) -> Iterator[tuple[Binding, list[int], int]]:
         """Every match: the binding, the frames of the steps, and the frame at which it ends."""
+        if any(isinstance(step, s.GroupStep) for step in sequence.steps):
+            yield from self.expressions(sequence, policy)
+            return
         steps = list(sequence.steps)
         known = set().union(*(names_of(step) for step in steps if not step.absent))
         held = [self.holds(step, known) for step in steps]
@@ -415,6 +423,34 @@ class Told:
                 yield binding, best, end
                 if policy == "first":
                     break
+
+    def expressions(
+        self, sequence: s.SequenceClause, policy: str
+    ) -> Iterator[tuple[Binding, list[int], int]]:
+        """The same of an expression of steps: one match for each binding, first step, and run of it."""
+        ways = [*spelled_out(sequence)]
+        visible = visible_names(sequence)
+        every: dict[Any, list[tuple[list[int], int, int, Binding]]] = {}
+        for place, (steps, links) in enumerate(ways):
+            known = set().union(*(names_of(step) for step in steps if not step.absent))
+            held = [self.holds(step, known) for step in steps]
+            for binding in self.bindings(
+                [h for h, step in zip(held, steps, strict=True) if not step.absent]
+            ):
+                own = [{i for i, b in h if agrees(dict(b), binding)} for h in held]
+                seen = tuple(sorted((k, v) for k, v in binding.items() if k in visible))
+                for run in self.runs(own[0]):
+                    for t in (t for i in run for t in self.tuples(steps, links, own, [i])):
+                        last = max(n for n, step in enumerate(steps) if not step.absent)
+                        end = self.run(t[-1], own[last])[-1] if steps[last].hold else t[-1]
+                        group = seen if policy == "first" else (seen, steps[0].span, run[0])
+                        every.setdefault(group, []).append((t, place, end, dict(seen)))
+        for found in every.values():
+            best = min(found, key=lambda one: one[:2])
+            if policy == "longest":
+                begin = [one for one in found if one[0][0] == best[0][0]]
+                best = max(begin, key=lambda one: (one[0], -one[1]))
+            yield best[3], best[0], best[2]
 
     def over(self, e: s.OverExpression, span: tuple[int, int], binding: Binding) -> Any:
         """A value over some frames, both ends included."""
@@ -533,6 +569,48 @@ class Told:
         if limit.unit == "frames":
             return j - i <= limit.amount
         return self.times[j] - self.times[i] <= limit.ns + self.slack
+
+
+Way = tuple[list[s.StepClause], tuple[s.LinkClause, ...]]
+
+
+def spelled_out(sequence: s.SequenceClause) -> list[Way]:
+    """All sequences that an expression of steps stands for, in the order in which they are written."""
+    found: list[Way] = [([], ())]
+    for number, step in enumerate(sequence.steps):
+        more = ways_of(step) if isinstance(step, s.GroupStep) else [([step], ())]
+        link = sequence.links[number - 1 : number] if number else ()
+        found = [(a + b, (*x, *link, *y)) for a, x in found for b, y in more]
+    return found
+
+
+def ways_of(group: s.GroupStep) -> list[Way]:
+    once = [way for one in group.alternatives for way in spelled_out(one)]
+    again = s.LinkClause("then", None, None, group.span)
+    found: list[Way] = []
+    for times in range(group.low, group.high + 1):
+        for chosen in product(once, repeat=times):
+            links = [link for _, own in chosen for link in (again, *own)][1:]
+            found.append(([step for steps, _ in chosen for step in steps], tuple(links)))
+    return found
+
+
+def many_ways(sequence: s.SequenceClause) -> int:
+    """How many sequences an expression of steps stands for."""
+    found = 1
+    for step in sequence.steps:
+        if isinstance(step, s.GroupStep):
+            once = sum(map(many_ways, step.alternatives))
+            found *= sum(once**times for times in range(step.low, step.high + 1))
+    return found
+
+
+def visible_names(sequence: s.SequenceClause) -> set[str]:
+    """Names that every sequence binds."""
+    ways = [steps for steps, _ in spelled_out(sequence)]
+    return set.intersection(
+        *(set().union(*(names_of(s) for s in steps if not s.absent)) for steps in ways)
+    )
 
 
 def wrapped(degrees: float) -> float:
@@ -668,6 +746,90 @@ def random_sequence(rng: random.Random) -> str:
     if rng.random() < 0.1:
         text += f" THEN WITHIN 0.5s NOT MATCH (e) WHERE {condition(rng, pair, 0, temporal=False)}"
     return text
+
+
+def random_expression(rng: random.Random) -> str:
+    """An expression of steps, with alternatives and repetitions."""
+    first = rng.choice(FIRST)
+    pair = "(v" in first
+
+    def step(start: str) -> str:
+        text = start
+        if rng.random() < 0.8:
+            temporal = rng.random() < 0.15
+            text += f" WHERE {condition(rng, pair, rng.randint(0, 1), temporal=temporal)}"
+        return text + rng.choice(HOLDS)
+
+    def later() -> str:
+        return step(rng.choice([one for one in LATER if pair or "(v" not in one]))
+
+    def some(depth: int, start: str = "") -> str:
+        parts = [start or (group(depth) if rng.random() < 0.5 else later())]
+        for _ in range(rng.choice((0, 0, 1, 1, 2) if depth else (1, 1, 2))):
+            link = rng.choice(THEN)
+            if link == "THEN" and rng.random() < 0.15:
+                parts.append(f"THEN NOT {step('MATCH (e)').split(' FOR ')[0]}")
+            parts += [link, group(depth + 1) if rng.random() < 0.5 else later()]
+        return " ".join(parts)
+
+    def group(depth: int) -> str:
+        many = rng.choice((1, 2, 2))
+        inner = [later() if depth > 1 else some(depth + 1, later()) for _ in range(many)]
+        often = rng.choice(("", "", "{2}", "{1,2}", "{1,3}", "{2,3}"))
+        return f"({' | '.join(inner)}){often}"
+
+    if rng.random() < 0.3:  # the first step is one of several, or repeated
+        starts = " | ".join(step(first) for _ in range(rng.choice((1, 2))))
+        return f"({starts}){rng.choice(('', '{1,2}'))} {rng.choice(THEN)} {some(1, later())}"
+    text = some(0, step(first))
+    return text if "(MATCH" in text else f"{text} THEN {group(0)}"
+
+
+def compare_expression(world: World, store: Store, rng: random.Random) -> int:
+    """Ask an expression of steps of a store, frame by frame, and by definition; how many matches there are."""
+    text, policy = random_expression(rng), rng.choice(("all", "first", "longest"))
+    (statement,) = parse(text)
+    assert isinstance(statement, s.MatchClause)
+    if many_ways(statement.sequence) > 12:
+        return 0
+    names = sorted(visible_names(statement.sequence))
+    using = f"USING UNKNOWN false, MATCHES {policy}"
+    found = Counter(
+        (i.trace, i.start_seq, i.end_seq, *(i.values[name] for name in names))
+        for i in store.find(f"{using} {text}").intervals()
+    )
+    expected: Counter[Any] = Counter()
+    lasts: Counter[Any] = Counter()
+    for trace in world.traces:
+        told = Told(trace, periods(store)[trace.name])
+        for binding, frames, end in told.sequences(statement.sequence, policy):
+            nodes = tuple(binding[name] for name in names)
+            expected[trace.name, trace.frames[frames[0]].seq, trace.frames[end].seq, *nodes] += 1
+            lasts[trace.name, tuple(frames), nodes] += 1
+    assert set(found) == set(expected), (policy, text, found - expected, expected - found)
+    seen: Counter[Any] = Counter()
+    for trace in world.traces:
+        events: list[MonitorEvent] = []
+        about = {"on_event": events.append, "trace": trace.name}
+        monitor = Monitor(f"{using} {text}", period_s=periods(store)[trace.name] / 1e9, **about)
+        for frame in trace.frames:
+            monitor.look([graph_of(frame)])
+        monitor.finish()
+        for event in events:
+            nodes = tuple(event.nodes[name] for name in names)
+            seen[trace.name, tuple(step.seq for step in event.steps), nodes] += 1
+    assert seen == lasts, (policy, text, seen - lasts, lasts - seen)
+    return sum(lasts.values())
+
+
+def expressions(seeds: range, questions: int, folder: Path) -> int:
+    """Ask so many expressions of steps of each of some worlds; how many matches they had."""
+    found = 0
+    for seed in seeds:
+        world, store = worlds(seed, folder)
+        rng = random.Random(f"expressions {seed}")
+        found += sum(compare_expression(world, store, rng) for _ in range(questions))
+    return found
 
 
 def periods(store: Store) -> dict[str, int]:

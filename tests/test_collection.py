@@ -63,6 +63,9 @@ QUESTIONS = [
     "MATCH (a:Car)-[:near]->(b) FOR >= 0.2s RETURN INTERVALS, a",
     "MATCH (a:Car)-[:near]->(b) AS s THEN MATCH (a)-[:visible]->(b) AS t RETURN a, MIN(a.x) OVER match AS x,"
     " MAX(b.y) OVER s..t ORDER BY x LIMIT 9",
+    "MATCH (a:Car), (b:Car) WHERE HAPPENS collision(a, b) RETURN a, b, frame.seq",
+    "MATCH (a:Car)-[:near]->(b) RETURN HAPPENS collision(a) AS hit, COUNT(*) AS n",
+    "MATCH (a:Car) WHERE a.x > 100 THEN (MATCH (a)-[:near]->(b) | MATCH (a)-[:visible]->(b)) RETURN a, b",
     "MATCH (e:Ego) RETURN frame.class, class_count() ORDER BY class_count() DESC LIMIT 5",
     "MATCH (e:Ego) WHERE frame.class IN dataset_classes('trace3') RETURN FRAMES",
     "USING DATASET 'trace[45]' MATCH (a:Car) RETURN COUNT(*)",
@@ -358,7 +361,7 @@ RULES = {
     "Result": parts.MERGED,
     "Query": {
         *("scope", "result", "relations", "injective", "ego", "unknown_is_false"),
-        *("steps", "links", "policy", "gaps"),
+        *("steps", "links", "alternatives", "policy", "gaps", "stages"),
     },
     "BoundCheck": {
         *("name", "scope", "quantifiers", "formula", "reset", "relations", "injective", "ego"),
@@ -380,7 +383,7 @@ VALUES = {
         "EdgeAttribute",
     ),
     *("FrameAttribute", "TraceAttribute", "PairNumber", "Operation", "BlockValue", "Aggregate"),
-    *("Tense", "SignalCall", "StepTime", "OverMatch", "GroupKey"),
+    *("Tense", "SignalCall", "StepTime", "OverMatch", "GroupKey", "Happened"),
 }
 """Values: but for ``Aggregate`` and two units of ``FrameAttribute`` they speak of one trace."""
 UNITS = {

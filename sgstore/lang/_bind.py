@@ -139,8 +139,11 @@ def _of_steps(match: s.MatchClause, session: Session) -> b.Query:
     names = SymbolTable(session, found.scope(), found.meanings)
     result = _result(match.returns, names)
     found.take_in_ego(names.scope)
-    steps, links = tuple(found.steps), tuple(found.links)
-    return b.Query(_told(names.scope.finished()), result, frozenset(), steps=steps, links=links)
+    steps, ways = tuple(found.steps), tuple(found.ways)
+    query = b.Query(_told(names.scope.finished()), result, frozenset(), steps=steps)
+    if len(ways) == 1 and ways[0].steps == tuple(range(len(steps))):
+        return replace(query, links=ways[0].links)
+    return replace(query, alternatives=ways)
 
 
 def _told(scope: b.Scope) -> b.Scope:

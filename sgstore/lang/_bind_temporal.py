@@ -377,7 +377,11 @@ class BoundSequence:
         The nodes at their ends, named or not.
     meanings : dict of str to Symbol
         What names mean after all steps.
-    steps, links : list
+    partial : set of str
+        Names that some of the steps before bind, but not in every sequence that these stand for.
+    steps : list
+    ways : list
+        The sequences that they stand for.
     """
 
     session: Session
@@ -385,8 +389,9 @@ class BoundSequence:
     edges: list[b.Edge] = field(default_factory=list[b.Edge])
     ends: dict[str, b.Node] = field(default_factory=dict[str, b.Node])
     meanings: dict[str, Symbol] = field(default_factory=dict[str, Symbol])
+    partial: set[str] = field(default_factory=set[str])
     steps: list[o.BoundStep] = field(default_factory=list[o.BoundStep])
-    links: list[o.StepLink] = field(default_factory=list[o.StepLink])
+    ways: list[o.StepWay] = field(default_factory=list[o.StepWay])
 
     def scope(self) -> ScopeBuilder:
         """Scope of the values of a match: nodes and edges that have names, and the ego."""
@@ -398,19 +403,24 @@ class BoundSequence:
         ``told`` is what values of a match speak of.
         """
         key = self.session.the_ego
-        happen = [number for number, step in enumerate(self.steps) if not step.absent]
-        if key is None or any(key in self.steps[number].scope.nodes for number in happen):
+        if key is None:
             return
+        for way in self.ways:
+            happen = way.happen
+            if not any(key in self.steps[number].scope.nodes for number in happen):
+                self._take_in(key, happen[-1], told)
+
+    def _take_in(self, key: str, number: int, told: ScopeBuilder) -> None:
         spoken_of = [scope.nodes for scope in (told, *(step.scope for step in self.steps))]
         told.nodes[key] = ego = next(nodes[key] for nodes in spoken_of if key in nodes)
-        last = self.steps[happen[-1]]
+        last = self.steps[number]
         pairs = {(other, key) for other in last.scope.nodes} if self.session.injective else set()
         scope = replace(
             last.scope,
             nodes={**last.scope.nodes, key: ego},
             distinct=last.scope.distinct | pairs,
         )
-        self.steps[happen[-1]] = replace(last, scope=scope)
+        self.steps[number] = replace(last, scope=scope)
 
 
 @dataclass(frozen=True, slots=True)
@@ -424,6 +434,56 @@ class _Written:
     values: Mapping[str, Any] | None
     name: str
     called: TextSpan | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _WrittenSteps:
+    """Steps as they stand in the text with the links between them."""
+
+    steps: list[_Written | _WrittenGroup]
+    links: list[tuple[s.LinkClause, Mapping[str, Any] | None]]
+
+    def changed(self, change: Callable[[_Written], _Written]) -> _WrittenSteps:
+        """The same with a change made to every step."""
+        return _WrittenSteps(
+            [
+                change(one)
+                if isinstance(one, _Written)
+                else replace(one, alternatives=[each.changed(change) for each in one.alternatives])
+                for one in self.steps
+            ],
+            self.links,
+        )
+
+    def given(self, values: Mapping[str, Any]) -> _WrittenSteps:
+        """The same with values of parameters, in steps and links, unless they have these already."""
+        links: list[tuple[s.LinkClause, Mapping[str, Any] | None]] = [
+            (link, {**values, **(more or {})}) for link, more in self.links
+        ]
+        steps = [
+            replace(one, values={**values, **(one.values or {})})
+            if isinstance(one, _Written)
+            else replace(one, alternatives=[each.given(values) for each in one.alternatives])
+            for one in self.steps
+        ]
+        return _WrittenSteps(steps, links)
+
+    def flat(self) -> Iterator[_Written]:
+        """Every step, in reading order."""
+        for one in self.steps:
+            if isinstance(one, _Written):
+                yield one
+            else:
+                for each in one.alternatives:
+                    yield from each.flat()
+
+
+@dataclass(frozen=True, slots=True)
+class _WrittenGroup:
+    """Alternatives, and how often they are repeated."""
+
+    group: s.GroupStep
+    alternatives: list[_WrittenSteps]
 
 
 def bind_sequence(
@@ -444,21 +504,134 @@ def bind_sequence(
         A step or a link has no meaning where it stands.
     """
     found = BoundSequence(session)
-    steps, links = _spelled_out(sequence, session, 0)
-    if len(steps) > MAX_STEPS:
-        session.refuse(f"a sequence has at most {MAX_STEPS} steps", sequence.span)
-    _check_absent(steps, links, session)
-    for written in steps:
-        _bind_step(written, found, bind_block)
-    found.links = [_link(link, values, session) for link, values in links]
+    written = _spelled_out(sequence, session, 0)
+    ways = _ways(written, [], sequence.span, session)
+    for steps, links in ways:
+        _check_absent(steps, links, session)
+    _bind_steps(written, found, bind_block)
+    numbers = {id(step): number for number, step in enumerate(written.flat())}
+    bound: dict[int, o.StepLink] = {}
+    for steps, links in ways:
+        for link, values in links:
+            if id(link) not in bound:
+                bound[id(link)] = _link(link, values, session)
+        told = tuple(bound[id(link)] for link, _ in links)
+        happen = tuple(numbers[id(one)] for one in steps if not one.step.absent)
+        found.ways.append(o.StepWay(tuple(numbers[id(one)] for one in steps), happen, told))
     return found
 
 
-def _spelled_out(
-    sequence: s.SequenceClause, session: Session, depth: int
-) -> tuple[list[_Written], list[tuple[s.LinkClause, Mapping[str, Any] | None]]]:
+_Way = tuple[list[_Written], list[tuple[s.LinkClause, "Mapping[str, Any] | None"]]]
+
+MAX_WAYS: Final = 100
+"""Most sequences that an expression of steps may stand for."""
+
+
+def _ways(
+    written: _WrittenSteps, before: list[_Way], span: TextSpan, session: Session
+) -> list[_Way]:
+    """The sequences that steps stand for, in reading order, with what comes before them."""
+    found = before or [([], [])]
+    for number, one in enumerate(written.steps):
+        if number:
+            found = [(steps, [*links, written.links[number - 1]]) for steps, links in found]
+        if isinstance(one, _Written):
+            found = [([*steps, one], links) for steps, links in found]
+        else:
+            found = _ways_on(one, found, session)
+        if len(found) > MAX_WAYS:
+            reason = f"these steps stand for more than {MAX_WAYS} sequences"
+            session.refuse(reason, span, "repeat fewer of them, or less often")
+    if any(len(steps) > MAX_STEPS for steps, _ in found):
+        session.refuse(f"a sequence has at most {MAX_STEPS} steps", span)
+    return found
+
+
+def _ways_on(written: _WrittenGroup, before: list[_Way], session: Session) -> list[_Way]:
+    """Sequences with those that a group stands for behind them."""
+    group, found = written.group, list[_Way]()
+    again = s.LinkClause("then", None, None, group.span)
+    open_ended = before
+    for number in range(1, group.high + 1):
+        if number > 1:
+            open_ended = [(steps, [*links, (again, None)]) for steps, links in open_ended]
+        open_ended = [
+            way
+            for one in written.alternatives
+            for way in _ways(one, open_ended, group.span, session)
+        ]
+        if number >= group.low:
+            found += open_ended
+        if len(open_ended) + len(found) > 2 * MAX_WAYS:
+            break
+    return found
+
+
+def _bind_steps(
+    written: _WrittenSteps,
+    found: BoundSequence,
+    bind_block: Callable[[s.Block, SymbolTable], None],
+    *,
+    again: bool = False,
+) -> None:
+    """Bind steps in reading order; ``again``: they may happen several times."""
+    for one in written.steps:
+        if isinstance(one, _Written):
+            if again and one.step.name is not None:
+                found.session.refuse(
+                    f"'{one.step.name}' would be several steps: it is repeated",
+                    one.step.span,
+                    "name a step before or after the brackets, or write the repetitions one by one",
+                )
+            _bind_step(one, found, bind_block)
+        else:
+            _bind_group(one, found, bind_block, again=again or one.group.high > 1)
+
+
+def _bind_group(
+    written: _WrittenGroup,
+    found: BoundSequence,
+    bind_block: Callable[[s.Block, SymbolTable], None],
+    *,
+    again: bool,
+) -> None:
+    """Bind alternatives: each sees what is bound before; what all of them bind, others see, too."""
+    session = found.session
+    known, meanings, keys = dict(found.known), dict(found.meanings), set(session.keys)
+    edges, ends, partial = list(found.edges), dict(found.ends), set(found.partial)
+    told: list[tuple[dict[str, b.Node], dict[str, Symbol], set[str]]] = []
+    taken = set(keys)
+    for one in written.alternatives:
+        # The same name is the same node in all of them, and so has the same key.
+        found.known, found.meanings, session.keys = dict(known), dict(meanings), set(keys)
+        found.edges, found.ends, found.partial = list(edges), dict(ends), set(partial)
+        _bind_steps(one, found, bind_block, again=again)
+        told.append((found.known, found.meanings, found.partial))
+        taken |= session.keys
+    session.keys, found.edges, found.ends = taken, edges, ends
+    every = set.intersection(*(set(bound) for bound, _, _ in told))
+    found.known = {
+        key: _either([bound[key] for bound, _, _ in told]) for key in told[0][0] if key in every
+    }
+    found.meanings, found.partial = dict(meanings), set(partial).union(*(p for _, _, p in told))
+    for name, symbol in (item for _, means, _ in told for item in means.items()):
+        if symbol.node in every or name in meanings or symbol.value is not None:
+            found.meanings.setdefault(name, symbol)
+        else:
+            found.partial.add(name)
+
+
+def _either(nodes: list[b.Node]) -> b.Node:
+    """A node that is one of several kinds, as alternatives have it."""
+    kinds = nodes[0].kinds
+    for node in nodes[1:]:
+        kinds = kinds | node.kinds
+    return replace(nodes[0], kinds=kinds)
+
+
+def _spelled_out(sequence: s.SequenceClause, session: Session, depth: int) -> _WrittenSteps:
     """Steps and links, scenarios being what they stand for."""
-    steps: list[_Written] = []
+    steps: list[_Written | _WrittenGroup] = []
     links: list[tuple[s.LinkClause, Mapping[str, Any] | None]] = []
     taken = names_written(sequence)
     for number, step in enumerate(sequence.steps):
@@ -467,12 +640,17 @@ def _spelled_out(
         if isinstance(step, s.StepClause):
             steps.append(_Written(step, None, ""))
             continue
+        if isinstance(step, s.GroupStep):
+            alternatives = [_spelled_out(one, session, depth) for one in step.alternatives]
+            steps.append(_WrittenGroup(step, alternatives))
+            continue
         shipped = _shipped(step, session)
         if shipped is not None:
-            inner, between = _spelled_out(shipped, session, depth + 1)
+            inner = _spelled_out(shipped, session, depth + 1)
             inner = _with_own_names(step, inner, _parameters_shipped(step), taken, session)
-            steps += [replace(w, name=step.name, called=step.name_span) for w in inner]
-            links += [(link, {}) for link, _ in between]
+            about = {"name": step.name, "called": step.name_span}
+            steps += inner.changed(lambda one, about=about: replace(one, **about)).steps
+            links += [(link, {}) for link, _ in inner.links]
             continue
         definition = _scenario(step, session)
         if depth >= MAX_STEPS:
@@ -480,26 +658,25 @@ def _spelled_out(
         body = definition.body
         assert isinstance(body, s.SequenceClause)  # noqa: S101 - it was found as a scenario
         values = _values(step, definition, session)
-        inner, between = _spelled_out(body, session, depth + 1)
+        inner = _spelled_out(body, session, depth + 1)
         formals = (formal.name for formal in definition.parameters)
-        inner = _with_own_names(step, inner, formals, taken, session)
-        steps += [
-            replace(w, values={**values, **(w.values or {})}, name=definition.name) for w in inner
-        ]
-        links += [(link, {**values, **(more or {})}) for link, more in between]
-    return steps, links
+        inner = _with_own_names(step, inner, formals, taken, session).given(values)
+        called = definition.name
+        steps += inner.changed(lambda one, called=called: replace(one, name=called)).steps
+        links += inner.links
+    return _WrittenSteps(steps, links)
 
 
 def _with_own_names(
     step: s.ScenarioStep,
-    inner: list[_Written],
+    inner: _WrittenSteps,
     parameters: Iterable[str],
     taken: frozenset[str],
     session: Session,
-) -> list[_Written]:
+) -> _WrittenSteps:
     """The steps of a pattern, whose variables have the names that they are given."""
-    names = own_names(step, [written.step for written in inner], parameters, taken, session)
-    return [replace(written, step=renamed(written.step, names)) for written in inner]
+    names = own_names(step, [one.step for one in inner.flat()], parameters, taken, session)
+    return inner.changed(lambda one: replace(one, step=renamed(one.step, names)))
 
 
 def _entry(step: s.ScenarioStep) -> NamedPattern | None:
@@ -614,6 +791,12 @@ def _bind_step(
     written: _Written, found: BoundSequence, bind_block: Callable[[s.Block, SymbolTable], None]
 ) -> None:
     session, step = found.session, written.step
+    for name in sorted(found.partial & names_written(s.SequenceClause((step,), (), step.span))):
+        session.refuse(
+            f"'{name}' is bound in some of the sequences only that the steps before stand for",
+            written.called or step.span,
+            "bind it in all of them, or before",
+        )
     scope = StepScope(session, known=dict(found.known))
     names = SymbolTable(session, scope, dict(found.meanings))
     with _parameters(session, written.values, written.name, written.called):

@@ -638,7 +638,7 @@ class Compiled:
         if not query.steps:
             return query, None, None
         query, places = with_places(query)
-        span = SPAN if len(query.steps) > 1 else None
+        span = SPAN if query.spans else None
         told = (*places.values(), *(span or ()))
         if self.finder is None:
             found = nothing(query, len(told))

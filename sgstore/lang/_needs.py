@@ -266,12 +266,15 @@ def of_query(query: b.Query) -> tuple[Need, ...]:
     """
     if query.unknown_is_false:
         return ()
-    found: set[Need] = set()
     steps = [(step.scope, step.when) for step in query.steps]
     steps = steps or [(scope, ()) for scope in query.required]
+    needs: list[set[Need]] = []
     for scope, when in steps:
-        found |= {Need(k, n.kinds, None) for k, n in scope.nodes.items() if n.kinds.one_a_frame}
-        found |= _of_each([*scope.where, *when], scope.nodes, strict=False)
+        egos = {Need(k, n.kinds, None) for k, n in scope.nodes.items() if n.kinds.one_a_frame}
+        needs.append(egos | _of_each([*scope.where, *when], scope.nodes, strict=False))
+    every = tuple(range(len(steps)))
+    ways = [way.steps for way in query.ways] if query.steps else [every]
+    found = set.intersection(*(set[Need]().union(*(needs[n] for n in way)) for way in ways))
     # One ego is as good as another.
     egos = {need.kinds: need for need in found if need.attribute is None and not need.event}
     others = {need for need in found if need.attribute is not None or need.event}

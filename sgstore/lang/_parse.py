@@ -368,12 +368,18 @@ def _rank(text: str, position: int, terminal: Terminal) -> tuple[int, int, bool]
     return terminal.length_at(text, position), terminal.priority, bool(terminal.literal)
 
 
+_CLOSING: Final = "RPAR"
+
+
 def _take(machine: Tables, stack: list[_StackEntry], token: Token, text: str) -> None:
     """Reduce whatever ends before the token, then put it on the stack."""
+    before = [*stack]
     while True:
         action = machine.states[stack[-1].state].get(token.name)
         if action is None:
-            raise _unexpected(machine, stack, text, token.span.start)
+            # What closes brackets around steps ends all that is open, even where there are none.
+            shown = before if token.name == _CLOSING else stack
+            raise _unexpected(machine, shown, text, token.span.start)
         if action >= 0:
             break
         rule = machine.rules[-1 - action]
@@ -444,7 +450,7 @@ _LATER: Final = frozenset(
         "RESET",
         "SEMICOLON",
     }
-    | {"_ARROW", "HAVING", "OPTIONAL", "SKIP", "UNION", "WITH"}
+    | {"_ARROW", "_GROUP", "HAVING", "OPTIONAL", "SKIP", "UNION", "WITH"}
 )
 """What is not proposed, lest the list be long: what concerns time, and other words for what is proposed."""
 

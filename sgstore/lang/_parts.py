@@ -222,12 +222,14 @@ class Pruning:
 
     def __init__(self, compiled: Compiled) -> None:
         query = compiled.query
-        happen = [step.scope for step in query.steps if not step.absent]
-        self._scopes = happen or [*query.required]
+        steps, ways = query.steps, query.ways if query.steps else ()
+        self._ways = [tuple(steps[n].scope for n in way.happen) for way in ways]
+        self._ways = self._ways or [tuple(query.required)]
         self._known: dict[tuple[object, ...], bool] = {}
         self._edges = [
             (edge, scope.kinds(edge.src), scope.kinds(edge.dst))
-            for scope in self._scopes
+            for scopes in self._ways
+            for scope in scopes
             for edge in scope.edges
             if edge.high == 1
         ]
@@ -251,7 +253,9 @@ class Pruning:
             moving, fixed, mapped = kinds
             edges = dict.fromkeys(held, 1)
             catalog = Catalog(edges=edges, moving=moving, fixed=fixed, mapped=mapped)
-            self._known[key] = all(_possible(scope, catalog) for scope in self._scopes)
+            self._known[key] = any(
+                all(_possible(scope, catalog) for scope in scopes) for scopes in self._ways
+            )
         return self._known[key]
 
 

@@ -143,7 +143,9 @@ def names_written(sequence: s.SequenceClause) -> frozenset[str]:
     """The names that a sequence binds, as it is written."""
     found: set[str] = set()
     for step in sequence.steps:
-        if isinstance(step, s.StepClause):
+        if isinstance(step, s.GroupStep):
+            found |= frozenset[str]().union(*map(names_written, step.alternatives))
+        elif isinstance(step, s.StepClause):
             found |= set(_variables([step]))
         else:
             found |= {one.value.name for one in step.given if isinstance(one.value, s.Variable)}

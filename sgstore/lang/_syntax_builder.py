@@ -386,6 +386,22 @@ def _absent_step(span: TextSpan, children: Children) -> s.StepClause:
     return s.StepClause(step.block, absent=True, hold=None, name=None, span=span)
 
 
+def _group_step(span: TextSpan, children: Children) -> s.GroupStep:
+    *alternatives, often = children
+    low, high = often or (1, 1)
+    return s.GroupStep(tuple(alternatives), low, high, span)
+
+
+def _often(span: TextSpan, children: Children) -> tuple[int, int]:
+    low, high = children
+    least = _whole(low)
+    most = least if high is None else _whole(high)
+    if not 1 <= least <= most:
+        reason = f"steps cannot be repeated {least} to {most} times"
+        raise BuildError(reason, span, "write {2}, or {1,3}")
+    return least, most
+
+
 def _scenario_step(span: TextSpan, children: Children) -> s.ScenarioStep:
     name, *given = children
     values = tuple(value for value in given if value is not None)
@@ -592,6 +608,8 @@ BUILDERS: Final[dict[str, Callable[[TextSpan, Children], Any]]] = {
     "match_step": _match_step,
     "further": _further,
     "holds_step": _holds_step,
+    "group_step": _group_step,
+    "often": _often,
     "scenario_step": _scenario_step,
     "given": _given,
     "hold": _hold,

@@ -13,7 +13,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final, Literal, TypeGuard
 
 from sgstore.lang._catalog import NODE_ATTRIBUTES, Attribute, DisplayUnit, Type
-from sgstore.lang._durations import BoundHold, Length  # noqa: TC001  they are of this module
+from sgstore.lang._durations import (
+    BoundHold,  # noqa: TC001  they are of this module
+    Length,  # noqa: F401  # pyright: ignore[reportUnusedImport]
+)
 from sgstore.lang._ir_leaves import (
     Choices,
     EdgeAttribute,
@@ -33,6 +36,7 @@ from sgstore.lang._kind_sets import (
     any_relation,  # noqa: F401
     ego_kinds,  # noqa: F401
 )
+from sgstore.lang._links import StepLink, StepWay
 from sgstore.records import dataclass
 
 if TYPE_CHECKING:
@@ -542,7 +546,9 @@ class Query:
     steps : tuple of BoundStep
         Of a query that looks at more than one frame at a time; else empty.
     links : tuple of StepLink
-        Between the steps.
+        Between the steps; empty where :attr:`alternatives` have them.
+    alternatives : tuple of StepWay
+        Of an expression of steps: all sequences that it stands for.
     policy : str
         Which matches of a sequence are told: ``all``, ``first``, ``longest``.
     gaps : str
@@ -559,9 +565,28 @@ class Query:
     unknown_is_false: bool = False
     steps: tuple[BoundStep, ...] = ()
     links: tuple[StepLink, ...] = ()
+    alternatives: tuple[StepWay, ...] = ()
     policy: str = "all"
     gaps: str = "break"
     stages: tuple[Stage, ...] = ()
+
+    @property
+    def ways(self) -> tuple[StepWay, ...]:
+        """The sequences of its steps: mostly one."""
+        if self.alternatives:
+            return self.alternatives
+        happen = tuple(n for n, step in enumerate(self.steps) if not step.absent)
+        return (StepWay(tuple(range(len(self.steps))), happen, self.links),)
+
+    @property
+    def spans(self) -> bool:
+        """Tell whether a match may be of several frames, so that it is told once."""
+        return len(self.steps) > 1 or bool(self.alternatives)
+
+    @property
+    def certain(self) -> frozenset[int]:
+        """Numbers of the steps that happen in every match."""
+        return frozenset.intersection(*(frozenset(way.happen) for way in self.ways))
 
     @property
     def patterns(self) -> tuple[Scope, ...]:
@@ -718,23 +743,6 @@ class BoundStep:
     hold: BoundHold | None
     absent: bool
     span: TextSpan
-
-
-@dataclass(frozen=True, slots=True)
-class StepLink:
-    """Relation in time between a step and the one before it.
-
-    Attributes
-    ----------
-    kind : str
-        ``then``: from ``after`` on, up to ``within``, and in a later frame; ``immediately``: in the next frame;
-        ``until``: in the frame after a run of the step before; ``while``: in the same frame.
-    after, within : Length or None
-    """
-
-    kind: Literal["then", "immediately", "until", "while"]
-    after: Length | None
-    within: Length | None
 
 
 @dataclass(frozen=True, slots=True)

@@ -448,10 +448,28 @@ class LinkClause:
 
 
 @dataclass(frozen=True, slots=True)
+class GroupStep:
+    """``(A | B THEN C){2,3}``: one of several sequences, so many times, one time after another.
+
+    Attributes
+    ----------
+    alternatives : tuple of SequenceClause
+    low, high : int
+        How often, at least and at most.
+    span : TextSpan
+    """
+
+    alternatives: tuple[SequenceClause, ...]
+    low: int
+    high: int
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
 class SequenceClause:
     """Steps with links between them; there is one step more than links."""
 
-    steps: tuple[StepClause | ScenarioStep, ...]
+    steps: tuple[StepClause | ScenarioStep | GroupStep, ...]
     links: tuple[LinkClause, ...]
     span: TextSpan
 

@@ -59,7 +59,9 @@ class ReturnedValues:
         return b.OverMatch(self._word, value, AT_FRAME, AT_FRAME, None, value.type)
 
     def told(
-        self, part: Callable[[b.OverMatch], Any], seconds: Callable[[int], float] | None = None
+        self,
+        part: Callable[[b.OverMatch], Any],
+        seconds: Callable[[int], float | None] | None = None,
     ) -> dict[str, Any]:
         """The values by the names of their columns.
 

@@ -35,6 +35,7 @@ from sgstore.sgg import SceneGraphGenerator
 from sgstore.step import GcPaused, replayed
 from sgstore.temporal._check_monitor import CheckMonitor
 from sgstore.temporal._checks import Verdict
+from sgstore.temporal._expression_monitor import sequence_monitor
 from sgstore.temporal._sequence_monitor import FrameTime, MonitorEvent, SequenceMonitor
 from sgstore.temporal._valuation import NodeNames, QueryCache, StreamClock
 
@@ -237,9 +238,8 @@ class Monitor:
             if query.relations <= answers or query.unknown_is_false:
                 ego, questions = self._of_ego(query.ego)
                 waiting = _PendingEvents(of_query(query) if query.steps else ())
-                self._follows.append(
-                    (ego, SequenceMonitor(name, query, questions, self._pulse), waiting)
-                )
+                follow = sequence_monitor(name, query, questions, self._pulse)
+                self._follows.append((ego, follow, waiting))
         told = (follow.name for _, follow, _ in self._follows)
         self.names = (*(check.name for check in checks), *told)
 

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from sgstore.lang import Catalog, SqlStatement
-    from sgstore.lang.ir import BoundCheck, BoundHold, BoundStep, Length, StepLink
+    from sgstore.lang.ir import BoundCheck, BoundHold, BoundStep, Length, StepLink, StepWay
 
 
 _CONNECTIVES: Final = frozenset({"AND", "OR", "NOT", "XOR", "IMPLIES"})
@@ -415,12 +415,34 @@ def asks_of_steps(query: b.Query, steps: Sequence[BoundStep], kept: Iterable[str
     All nodes of a step are bound where its conditions need that, else those kept.
     """
     asks = [_ask_of_step(query, step, kept, n) for n, step in enumerate(steps, start=1)]
-    happen = [ask for ask, step in zip(asks, steps, strict=True) if not step.absent]
-    ordered = sorted(happen, key=lambda ask: ask.loose)
-    for number, (ask, step) in enumerate(zip(asks, steps, strict=True)):
-        before = ordered if step.absent else ordered[: ordered.index(ask)]
-        asks[number] = replace(ask, after=tuple(before))
-    return asks
+    happen = [n for n, step in enumerate(steps) if not step.absent]
+    ordered = sorted(happen, key=lambda n: asks[n].loose)
+    with_others = _together(query, len(steps))
+    found: list[Ask] = []
+    for number, step in enumerate(steps):
+        before = ordered if step.absent else ordered[: ordered.index(number)]
+        after = tuple(asks[n] for n in before if n in with_others[number])
+        found.append(replace(asks[number], after=after))
+    return found
+
+
+def tied_in_steps(query: b.Query) -> tuple[frozenset[str], frozenset[str]]:
+    """Return the nodes and edges by which steps of alternatives hang together: those that have names."""
+    happen = [step for step in query.steps if query.alternatives and not step.absent]
+    nodes = (node for step in happen for node in step.scope.nodes.values())
+    edges = (edge.key for step in happen for edge in step.scope.edges if edge.named)
+    named = (node.key for node in nodes if node.role == "named" or not node.kinds.other)
+    return frozenset(named), frozenset(edges)
+
+
+def _together(query: b.Query, size: int) -> list[frozenset[int]]:
+    """For each of so many steps those others that happen in every match in which it does."""
+    if not query.alternatives:
+        return [frozenset(range(size))] * size
+    ways = [frozenset(way.steps) for way in query.alternatives]
+    return [
+        frozenset.intersection(*(way for way in ways if number in way)) for number in range(size)
+    ]
 
 
 def _ask_of_step(query: b.Query, step: BoundStep, kept: Iterable[str], number: int) -> Ask:
@@ -568,6 +590,13 @@ def link_text(link: StepLink) -> str:
     after = f" after {length_text(link.after)}" if link.after else ""
     within = f" within {length_text(link.within)}" if link.within else ""
     return f"{link.kind}{after}{within}"
+
+
+def way_text(way: StepWay) -> str:
+    """Return one of the sequences that an expression of steps stands for as text."""
+    links = ["", *(f"{link_text(link)} " for link in way.links)]
+    steps = (f"{link}step {n + 1}" for link, n in zip(links, way.steps, strict=True))
+    return f"sequence {' '.join(steps)}"
 
 
 def length_text(length: Length) -> str:

@@ -8,11 +8,20 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import TextSpan
-from sgstore.lang.ir import BoundStep, OverMatch, Query, ReturnColumn, StepLink, StepTime, walk
+from sgstore.lang.ir import (
+    BoundStep,
+    OverMatch,
+    Query,
+    ReturnColumn,
+    StepLink,
+    StepTime,
+    StepWay,
+    walk,
+)
 from sgstore.temporal._formula import And, Formula, Past, Progression, ProgressionFrame, Term
 from sgstore.temporal._match_values import AT_FRAME, ReturnedValues
 from sgstore.temporal._match_values_monitor import MatchValues
-from sgstore.temporal._plan import asks_of_steps, plan_of_steps
+from sgstore.temporal._plan import asks_of_steps, plan_of_steps, tied_in_steps
 from sgstore.temporal._valuation import BindingTable, Partial, Valuation
 
 if TYPE_CHECKING:
@@ -270,6 +279,10 @@ Ways = tuple[StepFrame, ...] | str
 """The places of the steps from one on; :data:`FAILED`: there are none; :data:`OPEN`: it is not known yet."""
 
 
+FoundMatch = tuple[StepWay, Binding, tuple[StepFrame, ...]]
+"""A sequence that a query stands for, what its variables are bound to, and the places of its steps."""
+
+
 class SequenceMonitor:
     """A pattern, while a trace comes.
 
@@ -288,24 +301,27 @@ class SequenceMonitor:
         self._questions, self._pulse = questions, pulse
         one = BoundStep(query.scope, (), None, absent=False, span=TextSpan(0, 0))
         self._steps: Sequence[BoundStep] = query.steps or (one,)
+        self._asked = query.ways if query.steps else (StepWay((0,), (0,), ()),)
         self._named = _named(query)
-        self._edges = tuple(edge.key for edge in query.scope.edges if edge.named)
-        asks = asks_of_steps(query, self._steps, self._named)
+        nodes, edges = tied_in_steps(query)
+        self._tied = frozenset({*self._named, *nodes})
+        self._edges = frozenset({*(e.key for e in query.scope.edges if e.named), *edges})
+        asks = asks_of_steps(query, self._steps, self._tied)
         self._asks = [(questions.add(ask), ask.columns) for ask in asks]
         self._conditions = _Conditions(query, self._steps, questions, pulse)
         self._columns = [self._projected(number) for number in range(len(self._steps))]
         self._held: list[dict[Key, StepState]] = [{} for _ in self._steps]
-        self._apart = frozenset(self._named) if query.injective else frozenset[str]()
+        self._apart = self._tied if query.injective else frozenset[str]()
         self._told: dict[tuple[int, ...], int] = {}
         self._over: set[tuple[int, ...]] = set()
         self._names: dict[int, str] = {}
         self._ended = False
-        self._happen = [n for n, step in enumerate(self._steps) if not step.absent]
+        self._happen = {way: way.happen for way in self._asked}
         self._returned = ReturnedValues(_returned(query), "last")
         plan, bridge = partial(plan_of_steps, query, self._steps), query.gaps == "bridge"
         parts = self._returned.parts
         self._values = MatchValues(parts, plan, questions, pulse, bridge=bridge)
-        self._pending: list[tuple[Binding, tuple[StepFrame, ...]]] = []
+        self._pending: list[FoundMatch] = []
 
     # Frame by frame
 
@@ -342,7 +358,7 @@ class SequenceMonitor:
 
     def _projected(self, number: int) -> tuple[str, ...]:
         variables = self._asks[number][1]
-        return tuple(n for n in variables if n in self._named or n in self._edges)
+        return tuple(n for n in variables if n in self._tied or n in self._edges)
 
     def _decide(self, number: int) -> None:
         for key, one in list(self._held[number].items()):
@@ -356,43 +372,49 @@ class SequenceMonitor:
 
     def _found(self, here: FrameTime) -> list[MonitorEvent]:
         found: list[MonitorEvent] = []
-        if all(self._held[number] for number in self._happen):
-            for binding in self._bindings({}, self._happen):
-                for ways in self._matches(binding):
-                    self._pending.append((binding, ways))
-        for binding, ways in list(self._pending):
-            if self._ended or all(ways[n].run.over for n in self._lasting):
-                self._pending.remove((binding, ways))
-                found.append(self._event(binding, ways, here))
+        self._pending += self._certain()
+        for one in list(self._pending):
+            way, _, places = one
+            if self._ended or all(places[n].run.over for n in self._lasting[way]):
+                self._pending.remove(one)
+                found.append(self._event(one, here))
         self._forget()
         if self._returned.parts:
             self._values.forget(self._frames())
         return found
 
+    def _certain(self) -> Iterator[FoundMatch]:
+        """Matches that are certain from this frame on."""
+        (way,) = self._asked
+        if all(self._held[number] for number in self._happen[way]):
+            for binding in self._bindings({}, self._happen[way]):
+                for places in self._matches(way, binding):
+                    yield way, binding, places
+
     @cached_property
-    def _lasting(self) -> frozenset[int]:
+    def _lasting(self) -> dict[StepWay, frozenset[int]]:
         """Places among the steps that happen, of those whose runs must be over before a match can be told."""
+        return {way: frozenset(self._lasting_in(happen)) for way, happen in self._happen.items()}
+
+    def _lasting_in(self, happen: tuple[int, ...]) -> Iterator[int]:
         parts = self._returned.parts
-        found = {
-            self._happen.index(p.start)
-            for p in parts
-            if p.start == p.end and p.start in self._happen
-        }
-        held = self._steps[self._happen[-1]].hold is not None or len(self._steps) == 1
+        for part in parts:
+            if part.start == part.end and part.start in happen:
+                yield happen.index(part.start)
+        held = self._steps[happen[-1]].hold is not None or not self.query.spans
         if held and any(part.start is None for part in parts):
-            found.add(len(self._happen) - 1)
-        return frozenset(found)
+            yield len(happen) - 1
 
     def _frames(self) -> Iterator[int]:
         """Numbers of the frames at which a part of a match may begin or end."""
-        for number in self._happen:
+        for number in frozenset[int]().union(*self._happen.values()):
             for one in self._held[number].values():
                 yield from one.frames()
-        for _, ways in self._pending:
-            for place in ways:
+        for _, _, places in self._pending:
+            for place in places:
                 yield from place.ends
 
-    def _bindings(self, binding: Binding, steps: list[int]) -> Iterator[Binding]:
+    def _bindings(self, binding: Binding, steps: Sequence[int]) -> Iterator[Binding]:
         """Bindings of all steps together, each of which has places."""
         if not steps:
             yield binding
@@ -416,7 +438,7 @@ class SequenceMonitor:
             if all(key[place] == node for place, node in known)
         ]
 
-    def _matches(self, binding: Binding) -> Iterator[tuple[StepFrame, ...]]:
+    def _matches(self, way: StepWay, binding: Binding) -> Iterator[tuple[StepFrame, ...]]:
         held = self._of(0, binding)
         key = tuple(binding[name] for name in sorted(binding))
         waiting: int | None = None
@@ -424,7 +446,7 @@ class SequenceMonitor:
             run = place.run.number
             if run <= self._told.get(key, -1) or run == waiting or key in self._over:
                 continue
-            ways = self._ways(0, place, binding)
+            ways = self._ways(way, 0, place, binding)
             if ways == OPEN:
                 waiting = run
             elif isinstance(ways, tuple):
@@ -436,18 +458,18 @@ class SequenceMonitor:
     def _of(self, number: int, binding: Binding) -> StepState | None:
         return self._held[number].get(tuple(binding[name] for name in self._columns[number]))
 
-    def _ways(self, at: int, place: StepFrame, binding: Binding) -> Ways:
-        """The places of the steps from one on, the first of which is given."""
-        steps, following = self._steps, at + 1
+    def _ways(self, way: StepWay, at: int, place: StepFrame, binding: Binding) -> Ways:
+        """The places of the steps of a sequence from one on, the first of which is given."""
+        steps, following = way.steps, at + 1
         if following == len(steps):
             return (place,)
-        link, absent = self.query.links[at], None
-        if steps[following].absent:
-            absent = self._of(following, binding) or StepState(self._pulse)
+        link, absent = way.links[at], None
+        if self._steps[steps[following]].absent:
+            absent = self._of(steps[following], binding) or StepState(self._pulse)
             if following + 1 == len(steps):
                 return self._unfollowed(place, link, absent)
-            link, following = self.query.links[following], following + 1
-        held = self._of(following, binding)
+            link, following = way.links[following], following + 1
+        held = self._of(steps[following], binding)
         stop = (
             next((a.number for a in absent.places if a.number > place.number), NEVER)
             if absent
@@ -461,7 +483,7 @@ class SequenceMonitor:
         for other in reversed(found) if latest else found:
             if absent is not None and absent.undecided < other.number:
                 return OPEN
-            rest = self._ways(following, other, binding)
+            rest = self._ways(way, following, other, binding)
             if rest != FAILED:
                 return rest if isinstance(rest, str) else (place, *rest)
         return OPEN if open_end else FAILED
@@ -520,33 +542,37 @@ class SequenceMonitor:
             return FAILED
         return (place,) if self._closed(place, plain, absent, NEVER) else OPEN
 
-    def _event(
-        self, binding: Binding, ways: tuple[StepFrame, ...], here: FrameTime
-    ) -> MonitorEvent:
-        steps = tuple(self._moment(place) for place in ways)
+    def _event(self, found: FoundMatch, here: FrameTime) -> MonitorEvent:
+        way, binding, places = found
+        happen = self._happen[way]
+        steps = tuple(self._moment(place) for place in places)
         nodes = {name: node for name, node in binding.items() if name in self._named}
         names = {name: self._names.get(node, str(node)) for name, node in nodes.items()}
 
         def part(value: OverMatch) -> Any:
-            return self._values.value(value, binding, self._span(value, ways))
+            if not {value.start, value.end} <= {None, AT_FRAME, *happen}:
+                return None  # of a step of other sequences
+            return self._values.value(value, binding, self._span(value, happen, places))
 
-        def seconds(step: int) -> float:
-            return steps[self._happen.index(step)].t
+        def seconds(step: int) -> float | None:
+            return steps[happen.index(step)].t if step in happen else None
 
         values = self._returned.told(part, seconds)
         about = here, steps[0], steps[-1], nodes, names, steps
         return MonitorEvent("found", self.name, *about, values=values)
 
-    def _span(self, part: OverMatch, ways: tuple[StepFrame, ...]) -> tuple[int, int]:
+    def _span(
+        self, part: OverMatch, happen: tuple[int, ...], ways: tuple[StepFrame, ...]
+    ) -> tuple[int, int]:
         """The first and the last frame of a part of a match."""
         if part.start == AT_FRAME:
             return ways[-1].number, ways[-1].number
         if part.start is None or part.end is None:
-            last, whole = ways[-1], len(self._steps) == 1
-            held = whole or self._steps[self._happen[-1]].hold is not None
+            last, whole = ways[-1], not self.query.spans
+            held = whole or self._steps[happen[-1]].hold is not None
             first = last.run.number if whole else ways[0].number
             return first, last.run.last if held else last.number
-        one, other = (ways[self._happen.index(step)] for step in (part.start, part.end))
+        one, other = (ways[happen.index(step)] for step in (part.start, part.end))
         if part.start == part.end:
             return one.run.number, one.run.last
         return one.number, other.number
@@ -601,31 +627,31 @@ class SequenceMonitor:
                 runs.setdefault(place.run.number, place)
             places = list(runs.values())
         binding = dict(zip(self._columns[0], key, strict=True))
-        return [place for place in places if self._alive(0, binding, place)]
+        return [p for p in places if self._alive(self._asked[0], 0, binding, p)]
 
     def _alive(  # noqa: PLR0911 - a case each
-        self, at: int, binding: Binding, place: StepFrame
+        self, way: StepWay, at: int, binding: Binding, place: StepFrame
     ) -> bool:
-        """Tell whether it is still open what follows a place."""
-        following = at + 1
-        if following == len(self._steps):
+        """Tell whether it is still open what follows a place in a sequence."""
+        following, steps = at + 1, way.steps
+        if following == len(steps):
             return False
-        link = self.query.links[at]
-        if self._steps[following].absent:
-            if any(held.undecided < NEVER for _, held in self._agreeing(following, binding)):
+        link = way.links[at]
+        if self._steps[steps[following]].absent:
+            if any(held.undecided < NEVER for _, held in self._agreeing(steps[following], binding)):
                 return True
             following += 1
-            if following == len(self._steps):
+            if following == len(steps):
                 return not self._closed(place, replace(link, kind="then", after=None), None, NEVER)
-            link = self.query.links[at + 1]
+            link = way.links[at + 1]
         if not self._closed(place, link, None, NEVER):
             return True
-        for key, held in self._agreeing(following, binding):
+        for key, held in self._agreeing(steps[following], binding):
             if not self._closed(place, link, held, NEVER):
                 return True
-            both = {**dict(zip(self._columns[following], key, strict=True)), **binding}
+            both = {**dict(zip(self._columns[steps[following]], key, strict=True)), **binding}
             if any(
-                self._alive(following, both, other)
+                self._alive(way, following, both, other)
                 for other in self._reached(place, link, held, NEVER)
             ):
                 return True

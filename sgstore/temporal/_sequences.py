@@ -30,6 +30,8 @@ from sgstore.temporal._plan import (
     needs_text,
     plan_of_steps,
     sql_text,
+    tied_in_steps,
+    way_text,
 )
 
 if TYPE_CHECKING:
@@ -38,7 +40,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang import Catalog
-    from sgstore.lang.ir import BoundHold, Length
+    from sgstore.lang.ir import BoundHold, Length, StepWay
     from sgstore.store import StoreFile
     from sgstore.temporal._formula import Formula
     from sgstore.temporal._plan import Ask
@@ -355,6 +357,31 @@ _Part = tuple["Ints", "Ints", "Keys", list[list[Any]]]
 """Some matches: ids of their first and last frames, their nodes and edges, and the values of each place."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class MatchesOfWay:
+    """Matches of one of the sequences that a query stands for, with some of its bindings.
+
+    Attributes
+    ----------
+    happen : tuple of int
+        Numbers of its steps that happen.
+    part : JoinedBindings
+    at : list of (R,) int64
+        Places at which each of these steps holds.
+    told : (M, n) int64
+        Places of the steps of each match.
+    """
+
+    happen: tuple[int, ...]
+    part: JoinedBindings
+    at: list[Ints]
+    told: Ints
+
+    def chosen(self, rows: Any) -> MatchesOfWay:
+        """Some of the matches."""
+        return replace(self, told=self.told[rows])
+
+
 class Finder:
     """Finder of the matches of a query over several frames in a store.
 
@@ -373,7 +400,8 @@ class Finder:
         self._when = [tuple(map(self._plan.formula, step.when)) for step in query.steps]
         self._first = frozenset(self._plan.asks)  # what must be known before there are matches
         self._kept = tuple(sorted(query.scope.nodes))
-        self._steps = asks_of_steps(query, query.steps, self._kept)
+        self._tied = frozenset({*self._kept, *tied_in_steps(query)[0]})
+        self._steps = asks_of_steps(query, query.steps, self._tied)
         self._edges = tuple(edge.key for edge in query.scope.edges)
 
     def __call__(self, places: tuple[Bound, ...], window: Window | None) -> ExternalRelation:
@@ -401,7 +429,7 @@ class Finder:
         keys = np.concatenate([np.zeros((0, width), np.int64), *(part[2] for part in parts)]).T
         nodes = dict(zip(self._kept, keys.tolist(), strict=False))
         edges = dict(zip(self._edges, words()[keys[len(self._kept) :]].tolist(), strict=True))
-        many = len(places) + self._spans * 2
+        many = len(places) + self._query.spans * 2
         values = [[item for part in parts for item in part[3][n]] for n in range(many)]
         return ExternalRelation(first, last, nodes, edges, values)
 
@@ -433,7 +461,7 @@ class Finder:
         for place in places:
             for value in _worked_out(place):
                 self._planned(value)
-        happen = tuple(ask for n, ask in enumerate(self._steps) if not self._query.steps[n].absent)
+        happen = tuple(self._steps[number] for number in sorted(self._query.certain))
         asked = self._plan.asks.items()
         first = {name: ask for name, ask in asked if name in self._first}
         later = {name: replace(ask, after=happen) for name, ask in asked if name not in first}
@@ -451,7 +479,7 @@ class Finder:
         """The questions about single frames, and the formulas over their answers."""
         lines: list[str] = []
         for number, (step, ask) in enumerate(zip(self._query.steps, self._steps, strict=True)):
-            if number:
+            if number and not self._query.alternatives:
                 lines.append(link_text(self._query.links[number - 1]))
             lines.append(
                 f"{'not ' * step.absent}step {number + 1}({', '.join(self._named(number))})"
@@ -460,6 +488,7 @@ class Finder:
             lines += [f"    {hold_text(step.hold)}"] if step.hold else []
             if not ask.everywhere:
                 lines += sql_text(relation(ask.query, self._catalog, None, (), {*ask.columns}))
+        lines += map(way_text, self._query.alternatives)
         for place in places:
             for value in _worked_out(place):
                 asked = self._planned(value)
@@ -467,29 +496,81 @@ class Finder:
                 lines.append(f"returned {value_text(value)} = {name}")
         return "\n".join([*lines, *needs_text(self._plan, self._catalog)])
 
-    @property
-    def _spans(self) -> bool:
-        return len(self._query.steps) > 1
-
     def _find(self, trace: TraceReader, places: tuple[Bound, ...]) -> Iterator[_Part]:
         line = BindingLine(trace.clock)
         held = [self._held(trace, line, number) for number in range(len(self._steps))]
-        if not self._spans:
+        if not self._query.spans:
             yield self._frames(trace, held[0], places)
             return
-        happen = [n for n, step in enumerate(self._query.steps) if not step.absent]
+        ways = (each for way in self._query.ways for each in self._of_way(line, held, way))
+        for one in self._chosen(line, held, [*ways]) if self._query.alternatives else ways:
+            yield from self._matches(trace, line, one, places)
+
+    def _of_way(
+        self, line: BindingLine, held: list[TimedRelation], way: StepWay
+    ) -> Iterator[MatchesOfWay]:
+        """The matches of one of the sequences that the query stands for."""
+        happen = way.happen
         together = joined([(self._named(n), held[n]) for n in happen], self._apart)
         for part in together.parts([held[n] for n in happen]):
-            yield from self._matches(trace, line, held, part, places)
+            at = [self._placed(line, held[n], part.places[:, i]) for i, n in enumerate(happen)]
+            absent: dict[int, Ints] = {}
+            for number in way.steps:
+                if self._query.steps[number].absent:
+                    own = part.bindings[
+                        :, [part.variables.index(name) for name in self._named(number)]
+                    ]
+                    absent[number] = self._placed(line, held[number], held[number].find(own))
+            legs = self._legs(way, at, absent)
+            told = matches_of(line, at[0], legs, self._query.policy)
+            if len(told):
+                yield MatchesOfWay(happen, part, at, told)
+
+    def _chosen(
+        self, line: BindingLine, held: list[TimedRelation], found: list[MatchesOfWay]
+    ) -> Iterator[MatchesOfWay]:
+        """Of matches that begin in one run of one step, with one binding, the one that counts.
+
+        Places of steps are compared as those of one sequence are. One that goes on counts as later than one
+        that has ended; where all are the same, the sequence that is written first counts.
+        """
+        if not found:
+            return
+        width = max(len(one.happen) for one in found)
+        tables: list[Ints] = []
+        for number, one in enumerate(found):
+            frames = np.full((len(one.told), width), -1)
+            frames[:, : len(one.happen)] = line.frame(one.told)
+            runs = line.run_starts(one.at[0])[np.searchsorted(one.at[0], one.told[:, 0])]
+            owners = one.told[:, 0] // line.stride
+            keys = self._ordered(one.part.variables, one.part.bindings[owners])
+            about = np.full((len(frames), 3), one.happen[0])
+            about[:, 1], about[:, 2] = line.frame(runs), number
+            tables.append(np.column_stack((keys, about, frames)))
+        rows = np.concatenate(tables)
+        one_each = rows[:, : -width - 1]  # a binding, a step, and a run of it
+        if self._query.policy == "first":
+            one_each = rows[:, : -width - 3]
+        begin, rest = rows[:, -width], rows[:, rows.shape[1] - width + 1 :]
+        rest = -rest if self._query.policy == "longest" else rest
+        order = np.lexsort((rows[:, -width - 1], *rest.T[::-1], begin, *one_each.T[::-1]))
+        new = np.ones(len(order), np.bool_)
+        new[1:] = np.any(np.diff(one_each[order], axis=0) != 0, axis=1)
+        best = np.zeros(len(order), np.bool_)
+        best[order[new]] = True
+        ends = np.cumsum([len(one.told) for one in found])
+        for one, kept in zip(found, np.split(best, ends[:-1]), strict=True):
+            if kept.any():
+                yield one.chosen(kept)
 
     @property
-    def _apart(self) -> tuple[str, ...]:
-        return self._kept if self._query.injective else ()
+    def _apart(self) -> frozenset[str]:
+        return self._tied if self._query.injective else frozenset()
 
     def _named(self, number: int) -> tuple[str, ...]:
         """Return the columns of a step's relation that other steps or results use."""
         ask = self._steps[number]
-        return (*(n for n in ask.variables if n in self._kept), *ask.edges)
+        return (*(n for n in ask.variables if n in self._tied), *ask.edges)
 
     def _held(self, trace: TraceReader, line: BindingLine, number: int) -> TimedRelation:
         """Return the frames in which a step holds: its pattern, its other conditions, and its duration."""
@@ -555,37 +636,21 @@ class Finder:
     # Sequences
 
     def _matches(
-        self,
-        trace: TraceReader,
-        line: BindingLine,
-        held: list[TimedRelation],
-        part: JoinedBindings,
-        places: tuple[Bound, ...],
+        self, trace: TraceReader, line: BindingLine, one: MatchesOfWay, places: tuple[Bound, ...]
     ) -> Iterator[_Part]:
-        steps = self._query.steps
-        happen = [n for n, step in enumerate(steps) if not step.absent]
-        at = [self._placed(line, held[n], part.places[:, i]) for i, n in enumerate(happen)]
-        by_step = dict(zip(happen, at, strict=True))
-        absent: dict[int, Ints] = {}
-        for n, step in enumerate(steps):
-            if step.absent:
-                own = part.bindings[:, [part.variables.index(name) for name in self._named(n)]]
-                absent[n] = self._placed(line, held[n], held[n].find(own))
-        told = matches_of(line, by_step[0], self._legs(by_step, absent), self._query.policy)
-        if not len(told):
-            return
+        at, told = one.at, one.told
         owners = told[:, 0] // line.stride
         frames = line.frame(told)
         ends = frames[:, -1]
-        if steps[happen[-1]].hold is not None:
+        if self._query.steps[one.happen[-1]].hold is not None:
             runs = line.run_ends(at[-1])
             ends = line.frame(runs[np.searchsorted(at[-1], told[:, -1])])
-        keys = self._ordered(part.variables, part.bindings[owners])
+        keys = self._ordered(one.part.variables, one.part.bindings[owners])
         spans: dict[Bound, tuple[Ints, Ints]] = {}
         for place in places:
-            if isinstance(place, OverMatch):
-                spans[place] = self._span(line, place, by_step, told, ends)
-        values = self._at_matches(trace, part, owners, frames, places, spans)
+            if isinstance(place, OverMatch) and {place.start, place.end} <= {None, *one.happen}:
+                spans[place] = self._span(line, place, one, ends)
+        values = self._at_matches(trace, one, owners, frames, places, spans)
         values += [trace.frame_ids[frames[:, 0]].tolist(), trace.frame_ids[ends].tolist()]
         last = trace.frame_ids[frames[:, -1]]
         yield last, last, keys, values
@@ -594,43 +659,45 @@ class Finder:
         owner, rows = relation.rows_of(places)
         return owner * line.stride + relation.frames[rows]
 
-    def _legs(self, at: dict[int, Ints], absent: dict[int, Ints]) -> list[Leg]:
+    def _legs(self, way: StepWay, at: list[Ints], absent: dict[int, Ints]) -> list[Leg]:
         """The ways between the steps that happen; what must not happen lies on them."""
         legs: list[Leg] = []
-        links, number = self._query.links, 1
+        links, number, following = way.links, 1, iter(at[1:])
         while number <= len(links):
-            there = absent.get(number)
+            there = absent.get(way.steps[number])
             number += there is not None and number < len(links)
             link = links[number - 1]
-            legs.append(Leg(link.kind, link.after, link.within, there, at.get(number)))
+            happens = way.steps[number] not in absent
+            places = next(following) if happens else None
+            legs.append(Leg(link.kind, link.after, link.within, there, places))
             number += 1
         return legs
 
     def _span(
-        self, line: BindingLine, place: OverMatch, at: dict[int, Ints], told: Ints, ends: Ints
+        self, line: BindingLine, place: OverMatch, one: MatchesOfWay, ends: Ints
     ) -> tuple[Ints, Ints]:
         """(M,) and (M,) the first and the last frame of the part of each match that a value is about."""
+        told, happen = one.told, one.happen
         if place.start is None or place.end is None:
             return line.frame(told[:, 0]), ends
-        happen = list(at)
         here = told[:, happen.index(place.start)]
         if place.start != place.end:
             return line.frame(here), line.frame(told[:, happen.index(place.end)])
-        step = at[place.start]
+        step = one.at[happen.index(place.start)]
         row = np.searchsorted(step, here)
         return line.frame(line.run_starts(step)[row]), line.frame(line.run_ends(step)[row])
 
     def _at_matches(
         self,
         trace: TraceReader,
-        part: JoinedBindings,
+        one: MatchesOfWay,
         owners: Ints,
         frames: Ints,
         places: tuple[Bound, ...],
         spans: dict[Bound, tuple[Ints, Ints]],
     ) -> list[list[Any]]:
-        happen = [n for n, step in enumerate(self._query.steps) if not step.absent]
-        asked = tuple(place for place in places if not isinstance(place, StepTime))
+        happen, part = one.happen, one.part
+        asked = tuple(p for p in places if p in spans or not isinstance(p, StepTime | OverMatch))
         found: dict[Bound, list[Any]] = {place: [] for place in asked}
         size = trace.together
         for low in range(0, len(owners) if asked else 0, size):
@@ -646,9 +713,10 @@ class Finder:
                     value = picked(self._value(place, values), here, frames[rows, -1])
                 found[place] += value.tolist()
         for place in places:
-            if isinstance(place, StepTime):
+            if isinstance(place, StepTime) and place.step in happen:
                 times = trace.times[frames[:, happen.index(place.step)]] - trace.start
                 found[place] = (times / 1e9).tolist()
+            found.setdefault(place, [None] * len(owners))  # of a step of other sequences
         return [found[place] for place in places]
 
     # Values
