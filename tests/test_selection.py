@@ -479,3 +479,46 @@ def test_on_a_drive_of_sumo_the_set_of_clips_meets_its_bound_and_is_smaller_than
     assert found.result["cost"] <= 1.05 * found.result["bound"]
     assert found.result["kept"] == found.result["elements"]
     assert drawn.needed <= of_random * drawn.at_random
+
+
+@pytest.mark.parametrize("unit", ["frame", "clip", "trace"])
+@pytest.mark.parametrize("text", ["robustness(ego.speed < 4)", "ego.speed < 4", "4 - ego.speed"])
+def test_the_weakest_come_first(open_town: Store, unit: str, text: str) -> None:
+    spec = SelectionSpec(Strategy.weakest, SelectionUnit(unit), by=text)
+    found = select(whole(open_town), spec)
+
+    sql = "SELECT frame_id, 4 - speed FROM nodes WHERE is_ego"
+    margin = dict(tuple(row) for row in open_town.sql(sql))
+    units = found.units
+    assert found.values is not None
+    least = [
+        min(margin[frame] for frame in units.frame_id[a:z].tolist())
+        for a, z in zip(units.begin, units.end, strict=True)
+    ]
+    np.testing.assert_allclose(found.values, least, rtol=1e-6)
+    assert sorted(found.picked.tolist()) == list(range(len(units)))
+    assert (np.diff(found.values[found.picked]) >= 0).all()
+    assert listed(found).columns == ("unit", "frames", "least")
+    few = select(whole(open_town), replace(spec, budget=Budget.parse("2units")))
+    assert few.picked.tolist() == found.picked[:2].tolist()
+
+
+def test_traces_are_ordered_by_the_margin_of_a_check(open_town: Store) -> None:
+    def by(text: str, unit: SelectionUnit = SelectionUnit.trace) -> SelectionSpec:
+        return SelectionSpec(Strategy.weakest, unit, by=text)
+
+    check = "CHECK slow: ALWAYS ego.speed < 4 ROBUSTNESS"
+    found = select(whole(open_town), by(check))
+
+    margin = {v.trace: v.robustness.value for v in open_town.check(check) if v.robustness}
+    rows = [(row[0].partition("#")[0], row[2]) for row in listed(found).rows]
+    assert rows == sorted(margin.items(), key=lambda one: one[1])
+    with pytest.raises(ConfigError, match="one margin for a whole trace, and these are clips"):
+        by(check, SelectionUnit.clip)
+    for text, said in (
+        ("CHECK ALWAYS ego.speed < 4", "write CHECK … ROBUSTNESS"),
+        ("CHECK a: ALWAYS ego.speed < 4 ROBUSTNESS; CHECK b: ALWAYS ego.speed < 5", "one of them"),
+        ("trace.name", "expected a number, or a condition"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            select(whole(open_town), by(text))

@@ -505,6 +505,10 @@ class ChoiceOptions:
     stratify: Annotated[
         str, Option("--stratify", metavar="EXPR", help="Strata by a value: 'ego.speed > 8'.")
     ] = ""
+    weakest: Annotated[
+        str,
+        Option("--weakest", metavar="EXPR", help="Least value first: 'robustness(ego.speed < 9)'."),
+    ] = ""
     budget: Budget = ""
     unit: CaseUnit = "frame"
     clip: LongestClip = "2s"
@@ -549,7 +553,7 @@ class ChoiceOptions:
             self.combos,
             of_ego=self.ego,
             each=self.per_class or (0 if self.stratify else 1),
-            by=self.stratify,
+            by=self.stratify or self.weakest,
             alpha=self.alpha if self.temper is None else self.temper,
             budget=Budget.parse(self.budget) if self.budget else None,
             objective=self.least or self.objective,
@@ -569,10 +573,12 @@ class ChoiceOptions:
             Strategy.rarest: self.rarest,
             Strategy.stratify: bool(self.stratify),
             Strategy.per_class: per_class,
+            Strategy.weakest: bool(self.weakest),
         }
         asked = [way for way, wanted in ways.items() if wanted]
         if len(asked) > 1:
-            raise typer.BadParameter("give one of --minimal, --per-class, --rarest, --stratify")
+            known = "--minimal, --per-class, --rarest, --stratify, --weakest"
+            raise typer.BadParameter(f"give one of {known}")
         return asked[0] if asked else Strategy.every
 
 
@@ -601,8 +607,8 @@ def select(
 ) -> None:
     """Choose frames, clips or traces for tests, rate the choice, and lock it.
 
-    Without --minimal, --per-class, --rarest or --stratify all are taken, or some at
-    random within the --budget.
+    Without --minimal, --per-class, --rarest, --stratify or --weakest all are taken,
+    or some at random within the --budget.
     """
     from sgstore.locks import ENDING
     from sgstore.selection import listed, parse_split, split_table

@@ -22,7 +22,10 @@ from sgstore.selection._units import (
     Measure,
     SelectionUnit,
     holdings,
+    is_check,
     kept,
+    least_of_check,
+    least_values,
     sequence_holdings,
     units_of,
 )
@@ -117,6 +120,7 @@ class Strategy(StrEnum):
     per_class = "per-class"
     rarest = "rarest"
     stratify = "stratify"
+    weakest = "weakest"
 
 
 @dataclass(frozen=True)
@@ -143,7 +147,8 @@ class SelectionSpec:
     each : int
         In how many units each class is to be; of each stratum how many are taken, 0: as the budget allows.
     by : str
-        Expression whose value is the stratum of a frame.
+        Expression whose value is the stratum of a frame. Of the weakest: a number whose least value counts, a
+        condition, whose robustness is one, or, of whole traces, a ``CHECK`` with ``ROBUSTNESS``.
     alpha : float
         A stratum gets a share of the budget as the power of its size: 1 as it is, 0 the same for all.
     budget : Budget or None
@@ -198,6 +203,11 @@ class SelectionSpec:
             raise ConfigError(
                 "manoeuvres, and a time within which they happen, belong to --sequences"
             )
+        if self.strategy is Strategy.weakest and is_check(self.by) and self.unit != "trace":
+            raise ConfigError(
+                f"a CHECK has one margin for a whole trace, and these are {self.unit}s: take --unit trace,"
+                " or give its formula: --weakest 'robustness(…)'"
+            )
         if not 0 <= self.alpha <= 10:
             raise ConfigError(
                 f"--alpha {self.alpha:g}; expected 0 (the same for all) to 1 (as they are)"
@@ -247,6 +257,8 @@ class Selection:
         The same in sentences.
     strata : dict
         Of each stratum, by its value: units, and units that were chosen.
+    values : (U,) float64 or None
+        Of each unit the least value by which it was chosen; NaN: not known.
     """
 
     spec: SelectionSpec
@@ -256,6 +268,7 @@ class Selection:
     result: dict[str, Any] = field(default_factory=dict[str, Any])
     said: list[str] = field(default_factory=list[str])
     strata: dict[str, tuple[int, int]] = field(default_factory=dict[str, tuple[int, int]])
+    values: Floats | None = None
 
 
 def select(chosen: ChosenFrames, spec: SelectionSpec) -> Selection:
@@ -294,6 +307,8 @@ def _selected(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
             return _every(spec, units, rank)
         case Strategy.stratify:
             return _stratified(spec, units, rank)
+        case Strategy.weakest:
+            return _weakest(spec, units, rank)
         case _:
             held = _held(spec, units)
             if spec.strategy is Strategy.rarest:
@@ -474,6 +489,26 @@ def _allotted(
     return np.concatenate([picked, tracker.fitting(others[np.sort(first)])])
 
 
+def _weakest(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
+    """Units in the order of their least value, unknown ones last, as far as the budget goes."""
+    value = least_of_check(units, spec.by) if is_check(spec.by) else least_values(units, spec.by)
+    order = np.lexsort((rank, np.where(np.isnan(value), np.inf, value)))
+    if spec.budget is not None:
+        order = BudgetTracker.of(units, spec.budget.measure, spec.budget.most).fitting(order)
+    known = value[order][~np.isnan(value[order])]
+    silent, below = int(np.isnan(value).sum()), int((value < 0).sum())
+    said = [
+        f"the weakest first: {len(order)} of {len(units)} {units.unit}s by {spec.by}"
+        + (f", from {known[0]:.3g} to {known[-1]:.3g}" if len(known) else "")
+        + f"; below 0: {below}"
+        + (f"; not known: {silent}" if silent else "")
+    ]
+    result: dict[str, Any] = {"units": len(order), "of": len(units), "below": below}
+    result |= {"unknown": silent}
+    result |= {"weakest": float(known[0]), "strongest": float(known[-1])} if len(known) else {}
+    return Selection(spec, units, order, None, result, said, values=value)
+
+
 def _strata(spec: SelectionSpec, units: Units) -> tuple[Ints, list[str]]:
     """The stratum of each unit, the value that most of its frames have; and all values."""
     from sgstore.exporters import Labels
@@ -512,11 +547,15 @@ def listed(selection: Selection) -> ReportTable:
     -------
     ReportTable
         ``unit`` (``TRACE#FIRST-LAST``, as a lock calls it), ``frames``, and, if it was asked what units hold,
-        ``holds`` and ``new``: of these, how many no unit before it has.
+        ``holds`` and ``new``: of these, how many no unit before it has. Of the weakest: ``least``.
     """
     units, held = selection.units, selection.holdings
     names = names_of_units(units, selection.picked)
     frames = units.sizes[selection.picked].tolist()
+    if selection.values is not None:
+        least = selection.values[selection.picked].tolist()
+        rows = zip(names, frames, (None if v != v else v for v in least), strict=True)  # noqa: PLR0124 - NaN
+        return ReportTable(("unit", "frames", "least"), list(rows))
     if held is None:
         return ReportTable(("unit", "frames"), list(zip(names, frames, strict=True)))
     unit, element = held.pairs

@@ -28,7 +28,7 @@ from sgstore.pair_numbers import PAIR_FUNCTIONS
 from sgstore.selection._choose import BudgetTracker, names_of_units
 from sgstore.selection._learn import cross_fitted, features_of, learned_elsewhere, model_name
 from sgstore.selection._situations import OTHERS, SITUATION, situations
-from sgstore.selection._units import Budget, SelectionUnit, units_of
+from sgstore.selection._units import Budget, SelectionUnit, numbers_of_frames, units_of
 from sgstore.store import trace_of
 
 if TYPE_CHECKING:
@@ -380,15 +380,7 @@ def worst_values(units: Units, measures: Sequence[str]) -> tuple[WorstValues, ..
 
 
 def _worst_of_expression(units: Units, text: str) -> WorstValues:
-    from sgstore.exporters import Labels
-
-    asked = np.flatnonzero(units.asked)
-    labels = Labels.asked(units.chosen.store, {"measure": text}, units.frame_id[asked])
-    found = labels.of(units.frame_id[asked])["measure"]
-    wrong = next((v for v in found if not isinstance(v, int | float | None)), None)
-    if wrong is not None:
-        raise ConfigError(f"the measure {text} is {wrong!r}; expected a number")
-    value = np.array([np.nan if one is None else float(one) for one in found])
+    asked, value = numbers_of_frames(units, text)
     value = np.where(np.isnan(value), np.inf, value)
     return _worst_of(units, text, asked, value, np.full(len(asked), -1))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
@@ -525,3 +525,85 @@ def kept(pairs: Ints, weight: Ints, picked: Ints, units: int) -> Ints:
     first = order[np.unique(elements[order], return_index=True)[1]]
     gained = np.bincount(where[first], weight[elements[first]], minlength=len(picked))
     return np.cumsum(gained).astype(np.int64)
+
+
+# Numbers of frames, and the least one of each unit ----------------------------------------------
+
+
+def numbers_of_frames(units: Units, text: str) -> tuple[Ints, Floats]:
+    """Numbers of the frames of units that were asked for.
+
+    Parameters
+    ----------
+    units : Units
+    text : str
+        An expression; of a condition its robustness counts.
+
+    Returns
+    -------
+    rows : (R,) int64
+        Of those frames, among the frames of the units.
+    value : (R,) float64
+        NaN where it is not known.
+
+    Raises
+    ------
+    ConfigError
+        It is neither a number nor a condition.
+    QueryError, ExportError
+        It is no expression, or has several values in one frame.
+    """
+    from sgstore.exporters import Labels
+
+    rows = np.flatnonzero(units.asked)
+
+    def asked(expression: str) -> list[Any]:
+        labels = Labels.asked(units.chosen.store, {"measure": expression}, units.frame_id[rows])
+        return labels.of(units.frame_id[rows])["measure"]
+
+    found = asked(text)
+    if any(isinstance(one, bool) for one in found):
+        found = asked(f"robustness({text})")
+    wrong = next((v for v in found if not isinstance(v, int | float | None)), None)
+    if wrong is not None:
+        raise ConfigError(f"the measure {text} is {wrong!r}; expected a number, or a condition")
+    return rows, np.array([np.nan if one is None else float(one) for one in found], np.float64)
+
+
+def least_values(units: Units, text: str) -> Floats:
+    """(U,) the least value of :func:`numbers_of_frames` in each unit; NaN where none is known."""
+    rows, value = numbers_of_frames(units, text)
+    frames = np.full(len(units.frame_id) + 1, np.nan)
+    frames[rows] = value
+    ranges = np.stack([units.begin, units.end], axis=1).ravel()
+    return np.fmin.reduceat(frames, ranges)[::2]
+
+
+_CHECK: Final = re.compile(r"\s*(DEFINE|USING|CHECK)\b", re.IGNORECASE)
+
+
+def is_check(text: str) -> bool:
+    """Tell whether a text is a ``CHECK``, and no expression."""
+    return bool(_CHECK.match(text))
+
+
+def least_of_check(units: Units, text: str) -> Floats:
+    """(U,) margin by which each trace meets a check; NaN where it cannot be told.
+
+    Raises
+    ------
+    ConfigError
+        It is several checks, or does not ask for a margin.
+    QueryError
+        It is none.
+    """
+    verdicts = list(units.chosen.store.check(text))
+    if len({verdict.check for verdict in verdicts}) > 1:
+        raise ConfigError("several checks have no order together: give one of them")
+    known = [verdict for verdict in verdicts if verdict.robustness is not None]
+    if verdicts and not known:
+        raise ConfigError("the check asks for no margin: write CHECK … ROBUSTNESS")
+    margin = {v.trace: v.robustness.value for v in known if v.robustness is not None}
+    names = {one.trace_id: one.name for one in units.chosen.store.info()}
+    traces = trace_of(units.first).tolist()
+    return np.array([margin.get(names[trace], np.nan) for trace in traces], np.float64)
