@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 import sys
 from collections import Counter
-from itertools import groupby
+from dataclasses import replace
+from itertools import groupby, product
 from typing import TYPE_CHECKING, Any
 
 from oracle import (
@@ -66,6 +67,9 @@ class Row(Search):
     def call(self, e: s.Call, binding: Binding) -> Any:
         if e.name == "type" and binding[e.arguments[0].name] is None:  # type: ignore[union-attr]
             return None
+        if e.name in {"length", "nodes"}:
+            nodes = self.value(e.arguments[0], binding)
+            return nodes if e.name == "nodes" or nodes is None else len(nodes) - 1
         if e.name == "dist" and None in [self.value(one, binding) for one in e.arguments]:
             return None
         return super().call(e, binding)
@@ -76,13 +80,64 @@ class Row(Search):
         if all(outside.get(name, "") is not None for name in free_names(block)):
             yield from super().matches(block, outside, apart)
 
-    def found(self, block: s.Block) -> list[Binding]:
-        return list(self.matches(block, self.binding))
+    def found(self, block: s.Block) -> list[tuple[Binding, Binding]]:
+        """Matches of a block beside what is bound, each with its paths."""
+        if not paths_in(block):
+            return [(binding, {}) for binding in self.matches(block, self.binding)]
+        if any(self.binding.get(name, "") is None for name in free_names(block)):
+            return []
+        bare = replace(block, where=None)
+        apart = tuple(name for name in free_names(block) if name in self.binding)
+        found = self.matches(bare, self.binding, apart)
+        return [(b, p) for b in found for p in self.along(block, b)]
+
+    def along(self, block: s.Block, binding: Binding) -> Iterator[Binding]:
+        """The paths of a match of which the condition is true: each a list of nodes."""
+        names = {id(node): name for name, node in named_nodes(block)}
+        choices: list[list[tuple[Any, ...]]] = []
+        for path in paths_in(block):
+            found: list[tuple[Any, ...]] = [(binding[names[id(path.nodes[0])]],)]
+            for edge, node in zip(path.edges, path.nodes[1:], strict=True):
+                end = binding[names[id(node)]]
+                found = [
+                    (*way, *more, end) for way in found for more in self.ways(edge, way[-1], end)
+                ]
+            choices.append(found)
+        for chosen in product(*choices):
+            told = dict(zip([path.name or "" for path in paths_in(block)], chosen, strict=True))
+            row = Row(self, binding, {**self.passed, **told})
+            if block.where is None or row.value(block.where, binding) is True:
+                yield told
+
+    def ways(self, edge: s.EdgePattern, left: Any, right: Any) -> set[tuple[Any, ...]]:
+        """The nodes between the ends of an edge, for each way that it may stand for."""
+        if edge.low is None or edge.high is None:
+            return {()}
+        ends = (right, left) if edge.direction == "left" else (left, right)
+        single = replace(
+            edge, low=None, high=None, direction="any" if edge.direction == "any" else "right"
+        )
+        links = self.joined(single)
+        found: set[tuple[Any, ...]] = set()
+
+        def walk(seen: tuple[Any, ...], length: int) -> None:
+            if length == 0:
+                if seen[-1] == ends[1]:
+                    found.add(seen[1:-1])
+                return
+            for step in (b for a, b in links if a == seen[-1]):  # type: ignore[union-attr]
+                if self.injective and length > 1 and (step in seen or step == ends[1]):
+                    continue
+                walk((*seen, step), length - 1)
+
+        for length in range(edge.low, edge.high + 1):
+            walk((ends[0],), length)
+        return {way[::-1] for way in found} if edge.direction == "left" else found
 
 
 def rows_of(match: s.MatchClause, world: World, text: str) -> list[Row]:
     """The rows of a query before ``RETURN``."""
-    rows = [Row(search, binding, {}) for search, binding in assignments(match, world)]
+    rows = [row for search, binding in begun(match, world) for row in first(match, search, binding)]
     for part in match.later:
         if isinstance(part, s.WithClause):
             frames = groupby(rows, key=lambda row: row.frame.frame_id)
@@ -92,13 +147,35 @@ def rows_of(match: s.MatchClause, world: World, text: str) -> list[Row]:
     return rows
 
 
+def paths_in(block: s.Block) -> list[s.Path]:
+    return [path for path in block.paths if path.name]
+
+
+def begun(match: s.MatchClause, world: World) -> Iterator[tuple[Search, Binding]]:
+    """Matches of the first pattern; of one with named paths, without its condition."""
+    if not paths_in(match.block):
+        return assignments(match, world)
+    (step,) = match.sequence.steps
+    bare = replace(step, block=replace(match.block, where=None))
+    return assignments(replace(match, sequence=replace(match.sequence, steps=(bare,))), world)
+
+
+def first(match: s.MatchClause, search: Search, binding: Binding) -> Iterator[Row]:
+    if not paths_in(match.block):
+        yield Row(search, binding, {})
+        return
+    for told in Row(search, binding, {}).along(match.block, binding):
+        yield Row(search, binding, told)
+
+
 def joined(part: s.LaterMatch, row: Row) -> list[Row]:
     found = row.found(part.block)
     if not found and part.optional:
         edges = [edge.name for path in part.block.paths for edge in path.edges if edge.name]
         names = [*(name for name, _ in named_nodes(part.block)), *edges]
-        found = [{**dict.fromkeys(names), **row.binding}]
-    return [Row(row, binding, row.passed) for binding in found]
+        paths = dict.fromkeys(path.name or "" for path in paths_in(part.block))
+        found = [({**dict.fromkeys(names), **row.binding}, paths)]
+    return [Row(row, binding, {**row.passed, **told}) for binding, told in found]
 
 
 def passed_on(clause: s.WithClause, rows: list[Row], text: str) -> list[Row]:
@@ -235,6 +312,16 @@ SIMPLE = (
     ("(a:Vehicle)-[:near|visible]-()", ["a"]),
     ("(a:Ego)", ["a"]),
 )
+PATHS = (
+    ("{} = (a)-[:near*1..2]->(b)", ["a", "b"]),
+    ("{} = (a:Lane)-[:travelsTo*1..3]->(b)", ["a", "b"]),
+    ("{} = (a:Car)-[:isIn]->(b)-[:isIn*1..2]->(c)", ["a", "b", "c"]),
+    ("{} = (a)<-[:near|visible*2..3]-(b:Car)", ["a", "b"]),
+    ("{} = (a:Vehicle)-[:near*1..2]-(b)-[:isIn]->(c)", ["a", "b", "c"]),
+    ("{} = (a:Entity)", ["a"]),
+    ("{} = (a)<-[:near*1..3]-(b), (b)-[:isIn*1..2]->(:Road)", ["a", "b"]),
+)
+"""Patterns with a path that has a name, and their variables."""
 
 
 class PartsWriter(Writer):
@@ -257,11 +344,36 @@ class PartsWriter(Writer):
 
     def simple(self) -> str:
         """A pattern that most frames have."""
+        any_ = "USING NODES any " * (self.rng.random() < 0.2)
+        if self.rng.random() < 0.35:
+            text, nodes = self.rng.choice(PATHS)
+            self.nodes += nodes
+            return f"{any_}MATCH {text.format('p')}{self.of_path('p')}"
         text, nodes = self.rng.choice(SIMPLE)
         self.nodes += nodes
-        return f"MATCH {text}"
+        return f"{any_}MATCH {text}"
+
+    def of_path(self, name: str) -> str:
+        """A condition on a path that was just written; it has a value from here on."""
+        self.paths.append(name)
+        tests = [f"length({name}) {self.rng.choice(('>', '<=', '='))} {self.rng.choice('12')}"]
+        tests += [f"length({name}) < a.id" for _ in "a" if "a" in self.nodes]
+        return f" WHERE {self.rng.choice(tests)}" if self.rng.random() < 0.4 else ""
+
+    @property
+    def paths(self) -> list[str]:
+        return self.__dict__.setdefault("_paths", [])
 
     def further(self, letters: str, kind: str) -> str:
+        if self.rng.random() < 0.2:
+            text, nodes = self.rng.choice(PATHS)
+            names = {f"({n}": f"({n}{len(self.seen)}" for n in nodes if n not in self.nodes}
+            self.seen.append("q")
+            for old, new in names.items():
+                text = text.replace(old, new)
+            self.nodes += [new[1:] for new in names.values()]
+            name = f"q{len(self.seen)}"
+            return f" {'OPTIONAL ' if kind == 'o' else ''}MATCH {text.format(name)}{self.of_path(name)}"
         edges, self.edges = self.edges, []  # an edge is known only where it is bound
         before = set(self.nodes)
         text = self.block(letters, depth=2)
@@ -290,7 +402,7 @@ class PartsWriter(Writer):
             f"SUM({b}.width)",
         ]
         of_all += [f"MAX({a}.id) - MIN({b}.id)", *(f"MAX({v})" for v in self.values)]
-        some += self.values
+        some += [*self.values, *(f"length({path})" for path in self.paths)]
         chosen = self.rng.sample(of_all, self.rng.choice((1, 2))) if counted else []
         chosen += self.rng.sample(some, self.rng.choice((0, 1)) if chosen or kept else 1)
         for value in chosen:
@@ -299,15 +411,17 @@ class PartsWriter(Writer):
             items.append(f"{value} AS {name}")
             if ".kind" not in value:
                 values.append(name)
+        self.paths[:] = [path for path in self.paths if self.rng.random() < 0.5]
+        items += self.paths
         distinct = not counted and self.rng.random() < 0.3
         text = f" WITH {'DISTINCT ' * distinct}{', '.join(items)}"
         kept = list(called.values())
         unnamed = [*kept, *self.nodes] if not (counted or distinct) else kept
         self.values, self.edges = values, []
-        if (counted or distinct) and self.rng.random() < 0.3:
+        if (counted or distinct) and self.rng.random() < 0.3 and not self.paths:
             keys = [*values, *(f"{name}.id" for name in kept)]
             told = (item.rpartition(" ")[2] for item in items)
-            kinds = [name for name in told if name not in (*values, *kept)]
+            kinds = [name for name in told if name not in (*values, *kept, *self.paths)]
             text += f" ORDER BY {', '.join(k + self.rng.choice(('', ' DESC')) for k in [*keys, *kinds])}"
             text += self.rng.choice((" LIMIT 1", " LIMIT 2", " SKIP 1", " SKIP 1 LIMIT 1"))
         if self.rng.random() < 0.5 and (values or kept):
@@ -329,6 +443,8 @@ class PartsWriter(Writer):
         some += [f"{n}.name" for n in names] + [f"type({edge})" for edge in self.edges]
         some += [f"COUNT {{({n})-[:near]-()}}" for n in names]
         some += [f"EXISTS {{({n})-[:isIn]->(:Lane)}}" for n in names]
+        some += [*self.paths, *(f"length({path})" for path in self.paths)]
+        some += [f"nodes({path})" for path in self.paths]
         if len(names) > 1:
             some += [f"dist({names[0]}, {names[-1]})", f"{names[0]} = {names[-1]}"]
         chosen = self.rng.sample(some, min(len(some), self.rng.choice((1, 2, 3))))

@@ -545,6 +545,37 @@ def test_parquet_has_labels_lanes_and_gaps(export: Export, written: Callable[...
         }
 
 
+def test_parquet_says_who_is_who(export: Export, written: Callable[..., Path]) -> None:
+    folder = written("parquet")
+    entities = pq.read_table(folder / "entities.parquet").to_pylist()
+    nodes = pq.read_table(folder / "nodes.parquet").to_pylist()
+
+    present = {(row["clip"], row["node_id"]) for row in nodes if row["node_id"] >= 0}
+    assert [(row["clip"], row["node_id"]) for row in entities] == sorted(present)
+    told = export.store.sql("SELECT ident, type_name, kind FROM entities").dicts()
+    known = {tuple(row.values()) for row in told}
+    assert {(row["ident"], row["type_name"], row["kind"]) for row in entities} <= known
+
+
+def test_parquet_says_what_its_columns_are_and_is_a_data_set(
+    written: Callable[..., Path],
+) -> None:
+    folder = written("parquet")
+    fields = json.loads((folder / "fields.json").read_text(encoding="utf-8"))
+    card = (folder / "README.md").read_text(encoding="utf-8")
+
+    tables = sorted(path.stem for path in folder.glob("*.parquet"))
+    assert sorted(fields) == tables
+    for table in tables:
+        told = [column["name"] for column in fields[table]["columns"]]
+        assert told == pq.read_schema(folder / f"{table}.parquet").names
+        assert fields[table]["about"].startswith(("One row", "How", "The message"))
+        assert f"- config_name: {table}\n  data_files: {table}.parquet\n" in card
+    units = {c["name"]: c.get("unit") for c in fields["nodes"]["columns"]}
+    assert (units["speed"], units["yaw_rate"], units["kind"]) == ("m/s", "degrees/s", None)
+    assert card.startswith("---\n")
+
+
 # networkx --------------------------------------------------------------------------------------------
 
 

@@ -45,6 +45,7 @@ def world() -> World:
         "WITH v AS w OPTIONAL MATCH (w)-[:isIn]->(l:Lane) RETURN w, l",
         "WITH v, COUNT {(v)-[:near]->()} AS n MATCH (w:Entity) WHERE w.id > n RETURN v, w",
         "WITH * WHERE v.x > 101 RETURN COUNT(v)",
+        "OPTIONAL MATCH p = (v)-[:near*1..2]->(w) WHERE length(p) > 1 RETURN v, p, length(p)",
     ],
 )
 def test_parts_are_what_their_definition_says(text: str, world: World) -> None:
@@ -120,6 +121,18 @@ def test_a_shell_shows_what_is_absent(store: Store, capsys: pytest.CaptureFixtur
     assert json.loads(capsys.readouterr().out) == [{"v": "car 3"}, {"v": None}]
 
 
+def test_paths_are_lists_of_nodes_in_every_form(store: Store, tmp_path: Path) -> None:
+    text = "MATCH p = (a:Car)-[:near*1..3]->(b:Car) WHERE a.x < b.x AND frame.seq = 3"
+    found = store.find(f"{text} RETURN nodes(p) AS p, length(p) AS n ORDER BY n, a.id")
+
+    assert [(row.p, row.n) for row in found][-1] == ([0, 1, 2, 3], 3)
+    assert [row.n for row in found] == [1, 1, 1, 2, 2, 3]
+    assert store.find(text).rows()[0].p in ([0, 1], [1, 2], [2, 3])
+    assert store.find(f"{text} AND length(p) > 1").count() == 1
+    assert len(found.arrow().to_pydict()["p"]) == found.csv(tmp_path / "x.csv") == 6
+    assert json.loads(json.dumps([list(row) for row in found]))[-1] == [[0, 1, 2, 3], 3]
+
+
 def test_why_not_and_explain_speak_of_the_parts(store: Store) -> None:
     text = (
         "MATCH (e:Ego) WHERE e.speed > 20 OPTIONAL MATCH (v:Car) WITH e, COUNT(v) AS n WHERE n > 1"
@@ -132,5 +145,6 @@ def test_why_not_and_explain_speak_of_the_parts(store: Store) -> None:
 
 
 def test_a_monitor_refuses_parts() -> None:
-    with pytest.raises(QueryError, match="a monitor tells when a pattern is there"):
-        Monitor("MATCH (e:Ego) OPTIONAL MATCH (v:Car)")
+    for text in ("MATCH (e:Ego) OPTIONAL MATCH (v:Car)", "MATCH p = (e:Ego)-[:near]->(v)"):
+        with pytest.raises(QueryError, match="a monitor tells when a pattern is there"):
+            Monitor(text)

@@ -1,11 +1,16 @@
-"""Tables of the clips as Parquet: ``clips``, ``frames`` with their labels, ``nodes``, ``edges``, ``payloads``.
+"""Tables of the clips as Parquet: ``clips``, ``frames``, ``nodes``, ``entities``, ``edges``, ``payloads``.
 
 Their columns are those of the public views, behind the number of the clip, so a frame that is in two clips
-comes twice; ``edges`` have the attributes of lanes and gaps beside them. Rows are in order of clip and frame.
+comes twice; ``frames`` have their labels, ``edges`` the attributes of lanes and gaps. Rows are in order of
+clip and frame. ``entities`` has those that are in a clip, once each, with the names that the simulator
+gives them: it is joined to ``nodes`` by ``clip`` and ``node_id``. ``fields.json`` says of each column what
+it is, and ``README.md`` is the card by which the Hugging Face hub and ``datasets`` know the tables.
 """
 
 from __future__ import annotations
 
+import json
+from collections import defaultdict
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
@@ -46,7 +51,25 @@ _PAYLOADS: Final = """
 SELECT * FROM payloads WHERE frame_id >= $first AND frame_id <= $last
 ORDER BY frame_id, channel, log_time_ns, chunk_offset, message_offset
 """
+_ENTITIES: Final = """
+SELECT * EXCLUDE (trace_id) FROM entities WHERE trace_id = $trace ORDER BY node_id
+"""
 TABLES: Final = {"frames": _FRAMES, "nodes": _NODES, "edges": _EDGES, "payloads": _PAYLOADS}
+
+_NOWHERE: Final = {"first": 0, "last": 0}
+
+UNITS: Final = {
+    **dict.fromkeys(("x", "y", "z", "length", "width", "height", "gap", "along"), "m"),
+    "lane_offset": "m",
+    **dict.fromkeys(("heading", "pitch", "roll", "heading_error"), "degrees"),
+    **dict.fromkeys(("speed", "vx", "vy", "vz", "speed_limit"), "m/s"),
+    **dict.fromkeys(("accel", "ax", "ay", "az"), "m/s²"),
+    "yaw_rate": "degrees/s",
+    "curvature": "1/m",
+    **dict.fromkeys(("t", "offset_s"), "s"),
+    **dict.fromkeys(("time_ns", "log_time_ns", "start_ns", "end_ns"), "ns"),
+}
+"""Units of columns; others are names, numbers of things, shares or truth values."""
 
 _CLIPS: Final = {
     "clip": "INTEGER",
@@ -64,21 +87,60 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
     with ParquetTable(folder / "clips.parquet", _CLIPS.items()) as clips:
         columns = {name: [clip.get(name) for clip in about] for name in _CLIPS}
         clips.add(columns | {"clip": list(range(1, len(about) + 1))})
-    counts = {"clips": clips.rows}
+    counts, present = {"clips": clips.rows}, _Present()
+    fields = {"clips": dict(_CLIPS)}
     for name in TABLES:
-        counts[name] = _write_table(export, folder, name)
-    return [_tested(folder / f"{name}.parquet", name, count) for name, count in counts.items()]
+        counts[name], fields[name] = _write_table(export, folder, name, present)
+    counts["entities"], fields["entities"] = _write_entities(export, folder, present)
+    written = [_tested(folder / f"{name}.parquet", name, count) for name, count in counts.items()]
+    (folder / "fields.json").write_bytes(_described(export.store.file, fields))
+    (folder / "README.md").write_bytes(_card(export, counts).encode())
+    columns = sum(map(len, fields.values()))
+    written.append(WrittenFile.of(folder / "fields.json", "columns", columns))
+    return [*written, WrittenFile.of(folder / "README.md", "card", 1)]
 
 
-def _write_table(export: Export, folder: Path, name: str) -> int:
+class _Present:
+    """Entities that are in each clip, and the trace of each clip, by the clip's number."""
+
+    def __init__(self) -> None:
+        self.nodes: defaultdict[int, set[int]] = defaultdict(set)
+        self.trace: dict[int, int] = {}
+
+    def see(self, name: str, clip: int, columns: Mapping[str, Any]) -> None:
+        """Take note of the rows of a table."""
+        if name == "frames" and len(columns["trace_id"]):
+            self.trace.setdefault(clip, int(columns["trace_id"][0]))
+        elif name == "nodes":
+            node = np.unique(np.asarray(columns["node_id"]))
+            self.nodes[clip].update(node[node >= 0].tolist())
+
+
+def _write_entities(export: Export, folder: Path, present: _Present) -> tuple[int, dict[str, str]]:
+    file = export.store.file
+    columns = {"clip": "INTEGER", **_types(file, _ENTITIES, {"trace": 0})}
+    with ParquetTable(folder / "entities.parquet", columns.items()) as table:
+        for clip, trace in present.trace.items():
+            found = file.arrays(_ENTITIES, {"trace": trace})
+            rows = np.isin(np.asarray(found["node_id"]).astype(np.int64), [*present.nodes[clip]])
+            told: dict[str, Any] = {name: values[rows] for name, values in found.items()}
+            table.add(told | {"clip": np.full(int(rows.sum()), clip, np.int32)})
+    return table.rows, columns
+
+
+def _write_table(
+    export: Export, folder: Path, name: str, present: _Present
+) -> tuple[int, dict[str, str]]:
     file = export.store.file
     kinds = _label_types(export) if name == "frames" else {}
     columns = {"clip": "INTEGER", **_types(file, TABLES[name]), **kinds}
     with ParquetTable(folder / f"{name}.parquet", columns.items()) as table:
         for frames in export.windows():
             found = file.arrays(TABLES[name], frames.bounds)
-            table.add(_of_clip(export, frames, found, kinds))
-    return table.rows
+            rows = _of_clip(export, frames, found, kinds)
+            present.see(name, frames.number, rows)
+            table.add(rows)
+    return table.rows, columns
 
 
 def _of_clip(
@@ -97,8 +159,8 @@ def _of_clip(
     return columns
 
 
-def _types(file: StoreFile, sql: str) -> dict[str, str]:
-    found = file.rows(sql, {"first": 0, "last": 0})
+def _types(file: StoreFile, sql: str, bounds: Mapping[str, int] = _NOWHERE) -> dict[str, str]:
+    found = file.rows(sql, dict(bounds))
     return dict(zip(found.columns, found.types, strict=True))
 
 
@@ -133,3 +195,85 @@ def _tested(file: Path, name: str, count: int) -> WrittenFile:
     if found != count:
         raise ExportError(f"{file.name}: {count} rows were written, {found} are read back")
     return WrittenFile.of(file, name, count)
+
+
+# What describes the tables ---------------------------------------------------------------------------
+
+_ABOUT_CLIPS: Final = (
+    "One row a clip: its trace, its first and last log time, and the recording that it is of."
+)
+_VIEWS: Final = "SELECT view_name, comment FROM duckdb_views() WHERE schema_name = 'main'"
+
+
+def _described(file: StoreFile, fields: Mapping[str, Mapping[str, str]]) -> bytes:
+    """Names, types and units of all columns, by table, with what is said of each table, as JSON."""
+    about = {str(name): str(comment or "") for name, comment in file.rows(_VIEWS, {})}
+    told = {
+        table: {
+            "about": about.get(table, _ABOUT_CLIPS),
+            "columns": [
+                {"name": name, "type": _plain(kind)} | _unit(table, name)
+                for name, kind in columns.items()
+            ],
+        }
+        for table, columns in fields.items()
+    }
+    return (json.dumps(told, indent=1, ensure_ascii=False) + "\n").encode()
+
+
+def _plain(kind: str) -> str:
+    return "VARCHAR" if kind.startswith("ENUM") else kind
+
+
+def _unit(table: str, column: str) -> dict[str, str]:
+    if (table, column) == ("payloads", "length"):
+        return {"unit": "bytes"}
+    return {"unit": UNITS[column]} if column in UNITS else {}
+
+
+def _card(export: Export, counts: Mapping[str, int]) -> str:
+    """The card of a data set, with the head by which Hugging Face's hub finds the tables."""
+    about = export.about()
+    head = ["---", "tags:", "- autonomous-driving", "- scene-graph", "configs:"]
+    for name in counts:
+        head += [f"- config_name: {name}", f"  data_files: {name}.parquet"]
+    sources = dict.fromkeys((one["source"], one["source_sha256"]) for one in about["clips"])
+    rows = "\n".join(f"| `{name}` | {count:,} |" for name, count in counts.items())
+    files = "\n".join(f"* {_code(name)} (SHA-256 `{digest}`)" for name, digest in sources)
+    query = about["provenance"].get("query", "")
+    asked = f"\nFound by:\n\n{_quoted(query)}\n" if query else ""
+    return "\n".join(head) + _CARD.format(
+        clips=counts["clips"], asked=asked, rows=rows, files=files
+    )
+
+
+def _code(text: str) -> str:
+    return f"`{text.replace('`', chr(39))}`"
+
+
+def _quoted(text: str) -> str:
+    """A text that stands as it is: indented, whatever is in it."""
+    return "\n".join(f"    {line}" for line in text.splitlines())
+
+
+_CARD: Final = """
+---
+
+# Driving scenes as scene graphs
+
+{clips:,} clips of driving recordings: in each frame, entities and parts of the road map as nodes, and the
+relations among them as edges. `fields.json` says what each column is, and in which unit.
+{asked}
+| table | rows |
+|---|--:|
+{rows}
+
+Rows belong together by `clip` and `frame_id`; `entities` is joined to `nodes` by `clip` and `node_id`.
+
+    from datasets import load_dataset
+    nodes = load_dataset("FOLDER", "nodes", split="train")
+
+Made from:
+
+{files}
+"""

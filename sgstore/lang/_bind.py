@@ -14,7 +14,7 @@ from sgstore.lang import ir as o
 from sgstore.lang import syntax as s
 from sgstore.lang._bind_expressions import BINDERS, edge_attribute, node_attribute, parameter
 from sgstore.lang._bind_match_values import over_match
-from sgstore.lang._bind_stages import StageBinder
+from sgstore.lang._bind_stages import StageBinder, name_path
 from sgstore.lang._bind_temporal import StepScope, bind_sequence, settled, tense, timespan
 from sgstore.lang._catalog import TRACE_ATTRIBUTES, Catalog, Type
 from sgstore.lang._functions import FUNCTIONS, call, happens
@@ -97,7 +97,8 @@ def bind_query(
 
 
 def _of_match(match: s.MatchClause, session: Session) -> b.Query:
-    if not match.later:
+    named = any(path.name for path in match.block.paths)
+    if not match.later and not (named and _is_plain(match)):
         return _of_one_step(match, session) if _is_plain(match) else _of_steps(match, session)
     if not _is_plain(match):
         session.refuse(
@@ -312,8 +313,13 @@ def bind_block(block: s.Block, names: SymbolTable) -> None:
     for path in block.paths:
         keys = [_node(node, names) for node in path.nodes]
         pending += zip(path.nodes, keys, strict=True)
-        for edge, left, right in zip(path.edges, keys, keys[1:], strict=False):
-            pending.append((edge, _edge(edge, left, right, names)))
+        edges = [
+            (edge, _edge(edge, left, right, names))
+            for edge, left, right in zip(path.edges, keys, keys[1:], strict=False)
+        ]
+        pending += edges
+        if path.name is not None:
+            name_path(path, keys, [key for _, key in edges], names)
     for pattern, key in pending:
         _inline(pattern, key, names)
     if block.where is not None:

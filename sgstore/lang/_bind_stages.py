@@ -1,4 +1,4 @@
-"""The binder of queries in several parts: ``OPTIONAL MATCH``, ``WITH``, and a ``MATCH`` behind them.
+"""The binder of queries in several parts: ``OPTIONAL MATCH``, ``WITH``, a ``MATCH`` behind them, named paths.
 
 All parts are about one frame. A part sees what those before it have bound, as a block sees what is bound
 around it; what ``WITH`` does not pass on keeps its place among the matches, unless they are grouped, but has no
@@ -7,14 +7,22 @@ name any more.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from sgstore.lang import ir as b
 from sgstore.lang import syntax as s
 from sgstore.lang._bind_temporal import settled
 from sgstore.lang._catalog import Type
-from sgstore.lang._symbols import ScopeBuilder, Session, Symbol, SymbolTable
+from sgstore.lang._symbols import (
+    RESERVED,
+    THE_EGO,
+    ScopeBuilder,
+    Session,
+    Symbol,
+    SymbolTable,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -97,8 +105,8 @@ class StageBinder:
         bind_columns: BindColumns,
     ) -> None:
         self._session, self._bind_block, self._bind_columns = session, bind_block, bind_columns
-        self._span = match.later[0].span
-        self._stages: list[tuple[ScopeBuilder, bool] | _With] = []
+        self._span = match.later[0].span if match.later else match.span
+        self._stages: list[tuple[ScopeBuilder, bool, list[b.PathValue]] | _With] = []
         first = ScopeBuilder(session)
         self._told = StagedScope(session, first=first)
         self.names = SymbolTable(session, self._told)
@@ -115,15 +123,26 @@ class StageBinder:
     # Patterns
 
     def _match(self, names: SymbolTable, block: s.Block, *, optional: bool) -> None:
+        names.paths = []
         self._bind_block(block, names)
         scope = names.scope
+        self._refuse_many(scope, names.paths)
         scope.where = [self._checked(part) for part in scope.where]
-        self._stages.append((scope, optional))
+        self._stages.append((scope, optional, names.paths))
         told = self._told
         self._session.maybe |= set(scope.nodes) if optional else set()
         told.nodes |= scope.nodes
         told.edges += [edge for edge in scope.edges if edge.named]
         self.names = replace(self.names, meanings={**self.names.meanings, **names.meanings})
+
+    def _refuse_many(self, scope: ScopeBuilder, paths: Iterable[b.PathValue]) -> None:
+        lengths = {edge.key: edge.high - edge.low + 1 for edge in scope.edges}
+        if math.prod(lengths[key] for path in paths for key, _ in path.edges) > MOST_WAYS:
+            self._session.refuse(
+                f"the edges of these paths may be repeated in more than {MOST_WAYS} ways",
+                self._span,
+                "bound them closer: -[:travelsTo*1..3]->",
+            )
 
     def _checked(self, value: b.Bound) -> b.Bound:
         """An expression about one frame in which no block speaks of what ``WITH`` passes on."""
@@ -212,8 +231,7 @@ class StageBinder:
             if value is None:
                 continue
             self._checked(value)
-            self._session.numbers += 1
-            place = b.passed_on(f"{b.PASSED}{name} {self._session.numbers}", value.type)
+            place = _place(name, value.type, self._session, path=b.is_path(value))
             values.append(b.ReturnColumn(name, value))
             places.append(place)
             symbols[name] = Symbol(value=place)
@@ -292,8 +310,42 @@ class StageBinder:
             if isinstance(part, _With):
                 found.append(part.finished(ego))
             else:
-                found.append(b.MatchStage(part[0].finished(), part[1]))
+                scope, optional, paths = part
+                found.append(b.MatchStage(scope.finished(), optional, tuple(paths)))
         return tuple(found)
+
+
+MOST_WAYS: Final = 100
+"""So many lengths the paths with names of a pattern may have, all combinations counted."""
+
+
+def _place(name: str, kind: Type, session: Session, *, path: bool) -> b.FrameAttribute:
+    """What stands for a value, or a path, that has a name."""
+    session.numbers += 1
+    return b.passed_on(f"{b.PASSED}{name} {'p' * path}{session.numbers}", kind)
+
+
+def name_path(path: s.Path, nodes: list[str], edges: list[str], names: SymbolTable) -> None:
+    """Take note of a path that has a name; its value is the list of its nodes.
+
+    Raises
+    ------
+    QueryError
+        It cannot have a name here, or the name is taken.
+    """
+    session, span = names.session, path.name_span
+    assert path.name is not None  # noqa: S101 - who calls has looked
+    assert span is not None  # noqa: S101 - a name has a place
+    if names.paths is None:
+        hint = "MATCH p = (a)-[:near*1..2]->(b) RETURN nodes(p)"
+        session.refuse("a path has a name in a pattern of one frame, outside of braces", span, hint)
+    if path.name in RESERVED or path.name == THE_EGO or names.meaning(path.name) is not None:
+        session.refuse(f"'{path.name}' is bound already", span)
+    place = _place(path.name, Type.list, session, path=True)
+    backwards = [edge.direction == "left" for edge in path.edges]
+    found = b.PathValue(place, tuple(nodes), tuple(zip(edges, backwards, strict=True)))
+    names.paths.append(found)
+    names.meanings[path.name] = Symbol(value=place)
 
 
 def _bare(nodes: Mapping[str, b.Node], edges: Iterable[b.Edge]) -> b.Scope:

@@ -26,7 +26,10 @@ if TYPE_CHECKING:
 
 
 _OTHERS: Final = frozenset(
-    {"class_count", "coalesce", "dataset_classes", "in_range", "known", "type", *OF_TEXT}
+    {
+        *("class_count", "coalesce", "dataset_classes", "in_range", "known", "length", "nodes"),
+        *("type", *OF_TEXT),
+    }
 )
 _COURSES: Final = (
     "prev",
@@ -251,6 +254,18 @@ def _type(e: s.Call, names: SymbolTable) -> b.EdgeRelation:
     return b.EdgeRelation(meaning.edge)
 
 
+def _path_function(e: s.Call, names: SymbolTable) -> b.Bound:
+    """``nodes(p)``, which is the value of a path, and ``length(p)``."""
+    _expect(e, 1, 1, names)
+    found = names.bind(e.arguments[0])
+    if not b.is_path(found):
+        hint = "MATCH p = (a)-[:near*1..2]->(b) RETURN length(p), nodes(p)"
+        names.session.refuse(f"{e.name}() takes a path that has a name", e.arguments[0].span, hint)
+    if normalize_name(e.name) == "nodes":
+        return found
+    return b.Operation("length", (found,), Type.number)
+
+
 def _text_function(e: s.Call, names: SymbolTable) -> b.Operation:
     _expect(e, 1, 1, names)
     found = names.bind(e.arguments[0])
@@ -411,5 +426,7 @@ _FUNCTIONS: Final[dict[str, Callable[[s.Call, SymbolTable], b.Bound]]] = {
     "inrange": _in_range,
     CLASSES: _after_in,
     "known": _known,
+    "length": _path_function,
+    "nodes": _path_function,
     "type": _type,
 }

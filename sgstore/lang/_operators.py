@@ -179,6 +179,14 @@ def _member(parts: Sequence[str]) -> str:
 # Strict operators -------------------------------------------------------------------------------
 
 
+def _edges_between(nodes: Sequence[int]) -> int:
+    return len(nodes) - 1
+
+
+def _no_columns(*_: Any) -> Any:
+    raise TypeError("a path is no column")
+
+
 def _strict(
     sql: str | SqlOf,
     one: Callable[..., Any],
@@ -580,6 +588,7 @@ OPERATORS: Final[Mapping[str, Operator]] = {
         partial=True,
     ),
     "negative": _strict("(- {0})", operator.neg, _ufunc("negative")),
+    "length": _strict("(len({0}) - 1)", _edges_between, _no_columns),
     "coalesce": _ruled("coalesce(...)", _first_known, _first_known_columns),
     "case": Operator(_case, _chosen, _chosen_columns),
     "IS NULL": _null_test("IS NULL", null=True),

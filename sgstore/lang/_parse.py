@@ -450,7 +450,7 @@ _LATER: Final = frozenset(
         "RESET",
         "SEMICOLON",
     }
-    | {"_ARROW", "_GROUP", "HAVING", "OPTIONAL", "SKIP", "UNION", "WITH"}
+    | {"_ARROW", "_GROUP", "HAVING", "OPTIONAL", "PATH_NAME", "SKIP", "UNION", "WITH"}
 )
 """What is not proposed, lest the list be long: what concerns time, and other words for what is proposed."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from itertools import combinations, pairwise
+from itertools import combinations, pairwise, product
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.lang._catalog import (
@@ -36,6 +36,7 @@ from sgstore.lang.ir import (
     NodeAttribute,
     NodeValue,
     Operation,
+    PathWay,
     Query,
     Result,
     ReturnColumn,
@@ -52,7 +53,7 @@ from sgstore.lang.ir import (
 from sgstore.vocabulary import KINDS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
     from sgstore.lang._formulas import Leaf
 
@@ -112,12 +113,16 @@ def _staged(query: Query, catalog: Catalog) -> Query:
     stages: list[Stage] = []
     for stage in query.stages:
         if isinstance(stage, MatchStage):
-            alone = replace(query, scope=stage.scope, result=Result(), stages=())
-            scope = _ruled(alone, catalog).scope
-            for key, node in scope.nodes.items():
-                either = Kinds(node.kinds.ego, node.kinds.every)
-                kinds[key] = either if stage.optional else node.kinds
-            stages.append(replace(stage, scope=scope))
+            ways: list[PathWay] = []
+            for way in _ways(stage, injective=query.injective):
+                alone = replace(query, scope=way.scope, result=Result(), stages=())
+                ways.append(replace(way, scope=_ruled(alone, catalog).scope))
+            own = _kinds_in([way.scope for way in ways])
+            if stage.optional:
+                own = {key: Kinds(one.ego, one.every) for key, one in own.items()}
+            kinds |= own
+            scope = next((w.scope for w in ways if w.scope.where != (FALSE,)), ways[0].scope)
+            stages.append(replace(stage, scope=scope, ways=tuple(ways)))
             continue
         kinds |= {new: kinds[key] for new, key in stage.nodes}
         result = Result(columns=stage.values)
@@ -135,6 +140,35 @@ def _staged(query: Query, catalog: Catalog) -> Query:
         )
     scope = told(query.scope)
     return replace(query, scope=scope, result=values(query.result), stages=tuple(stages))
+
+
+def _ways(stage: MatchStage, *, injective: bool) -> Iterator[PathWay]:
+    """The pattern of a stage, once for all the lengths that its paths with names may have."""
+    edges = {edge.key: edge for edge in stage.scope.edges}
+    repeated = [edges[key] for path in stage.paths for key, _ in path.edges if edges[key].high > 1]
+    for lengths in product(*(range(edge.low, edge.high + 1) for edge in repeated)):
+        scope, stops = stage.scope, dict[str, list[str]]()
+        for edge, length in zip(repeated, lengths, strict=True):
+            scope = chain(scope, edge, length, injective=injective)
+            stops[edge.key] = [f"#{edge.key}.{number}" for number in range(1, length)]
+        nodes: list[tuple[str, ...]] = []
+        for path in stage.paths:
+            keys = [path.nodes[0]]
+            for (key, backwards), node in zip(path.edges, path.nodes[1:], strict=True):
+                between = stops.get(key, [])
+                keys += [*(reversed(between) if backwards else between), node]
+            nodes.append(tuple(keys))
+        yield PathWay(scope, tuple(nodes))
+
+
+def _kinds_in(scopes: Iterable[Scope]) -> dict[str, Kinds]:
+    """The kinds that nodes may have in any of some patterns, those that cannot match left out."""
+    every = list(scopes)
+    found: dict[str, Kinds] = {}
+    for scope in [one for one in every if one.where != (FALSE,)] or every:
+        for key, node in scope.nodes.items():
+            found[key] = found[key] | node.kinds if key in found else node.kinds
+    return found
 
 
 def _expression(value: Any, values: Callable[[Result], Result]) -> Any:

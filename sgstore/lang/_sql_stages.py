@@ -22,12 +22,14 @@ from sgstore.lang._formulas import (
 )
 from sgstore.lang._plan import SharedRelation
 from sgstore.lang._results import directed, in_order
+from sgstore.lang._rewrite import FALSE
 from sgstore.lang._sql_frames import frames
 from sgstore.lang._sql_masks import SqlBuilder, folded
 from sgstore.lang.ir import (
     Bound,
     GroupKey,
     MatchStage,
+    PathWay,
     Query,
     Result,
     Scope,
@@ -72,39 +74,87 @@ def staged_matches(query: Query, catalog: Catalog, window: Window | None) -> Sql
 
 def _first(sql: SqlBuilder, query: Query, stage: MatchStage) -> SharedRelation:
     nodes, edges = _bound(stage.scope)
-    sql.query, sql.found = replace(query, scope=stage.scope, result=Result(), stages=()), None
-    text = frames(sql, stage.scope, None, nodes, edges)
-    return SharedRelation(sql.share(text, "match"), nodes, edges)
+    late, wanted = _late(stage)
+    text = _pattern(sql, query, stage, None, wanted)
+    paths = {path.place: column_of(path.place) for path in stage.paths}
+    if late:
+        keep = ['"frame_id"', *columns_of(nodes, edges), *map(quoted, paths.values())]
+        leaf = _leaf_of({})
+        tests = [expression_text(one, leaf, sql.values) for one in late]
+        text = Select(keep, [nested(text, ":rows")], tests).text()
+    return SharedRelation(sql.share(text, "match"), nodes, edges, paths)
+
+
+def _late(stage: MatchStage) -> tuple[list[Bound], list[Leaf]]:
+    """Conditions about what has been passed on, and paths, and what of the pattern they are made of."""
+    late = [one for one in stage.scope.where if _speaks_of_passed(one)]
+    wanted = [leaf for one in late for leaf in leaves(one) if not is_passed_on(leaf)]
+    return late, list(dict.fromkeys(wanted))
+
+
+def _pattern(
+    sql: SqlBuilder,
+    query: Query,
+    stage: MatchStage,
+    rows: SharedRelation | None,
+    wanted: list[Leaf],
+) -> str:
+    """The matches of the pattern of a stage, with its paths as lists, and some values."""
+    nodes, edges = _bound(stage.scope)
+    outer = frozenset(stage.scope.outer)
+    texts: list[str] = []
+    given: SharedRelation | None = None
+    for way in [one for one in stage.ways if one.scope.where != (FALSE,)] or stage.ways[:1]:
+        where = tuple(one for one in way.scope.where if not _speaks_of_passed(one))
+        scope = replace(way.scope, where=where)
+        # Conditions of blocks in a later pattern are looked for in the query; it is not the outermost scope.
+        asked = scope if rows is None else replace(scope)
+        sql.query, sql.found = replace(query, scope=asked, result=Result(), stages=()), None
+        if rows is not None and outer and given is None:
+            given = _given(sql, rows, outer)
+        stops = frozenset(key for keys in way.nodes for key in keys)
+        text = frames(sql, scope, given, nodes | outer | stops, edges, wanted)
+        if stage.paths:
+            text = _with_paths(text, stage, way, columns_of(nodes | outer, edges), wanted)
+        texts.append(text)
+    return "\nUNION ALL\n".join(texts)
+
+
+def _with_paths(
+    text: str, stage: MatchStage, way: PathWay, columns: list[str], wanted: list[Leaf]
+) -> str:
+    names = dict.fromkeys(['"frame_id"', *columns, *(quoted(column_of(leaf)) for leaf in wanted)])
+    select = Select(list(names), [nested(text, ":way")])
+    for path, keys in zip(stage.paths, way.nodes, strict=True):
+        ids = ", ".join(quoted(f"{key}.id") for key in keys)
+        select.columns.append(f"[{ids}] AS {quoted(column_of(path.place))}")
+    return select.text()
 
 
 def _joined(
     sql: SqlBuilder, query: Query, rows: SharedRelation, stage: MatchStage
 ) -> SharedRelation:
     """The rows so far with the matches of a further pattern beside them."""
-    whole = stage.scope
-    late = [one for one in whole.where if _speaks_of_passed(one)]
-    scope = replace(whole, where=tuple(one for one in whole.where if one not in late))
-    outer = frozenset(scope.outer)
-    # Conditions of blocks in it are looked for in the query, but it is not the outermost scope.
-    sql.query, sql.found = replace(query, scope=replace(scope), result=Result(), stages=()), None
-    given = _given(sql, rows, outer) if outer else None
-    nodes, edges = _bound(scope)
-    wanted = [leaf for one in late for leaf in leaves(one) if not is_passed_on(leaf)]
-    text = frames(sql, scope, given, nodes | outer, edges, wanted)
+    outer = frozenset(stage.scope.outer)
+    nodes, edges = _bound(stage.scope)
+    late, wanted = _late(stage)
+    text = _pattern(sql, query, stage, rows, wanted)
+    paths = {path.place: column_of(path.place) for path in stage.paths}
     more = quoted(":more")
     select = Select(['":rows".*'])
-    select.columns += [f"{more}.{column}" for column in columns_of(nodes, edges)]
+    own = [*columns_of(nodes, edges), *map(quoted, paths.values())]
+    select.columns += [f"{more}.{column}" for column in own]
     select.join(f'{quoted(rows.name)} AS ":rows"', [])
     on = [f'{more}.{column} = ":rows".{column}' for column in ('"frame_id"', *columns_of(outer))]
 
     def leaf(found: Leaf) -> str:
-        table = '":rows"' if is_passed_on(found) else more
+        table = '":rows"' if is_passed_on(found) and found not in paths else more
         return f"{table}.{quoted(column_of(found))}"
 
     on += [expression_text(one, leaf, sql.values) for one in late]
     select.join(nested(text, ":more"), on, "LEFT JOIN" if stage.optional else "JOIN")
     name = sql.share(select.text(), "optional" if stage.optional else "match")
-    return SharedRelation(name, rows.nodes | nodes, rows.edges | edges, rows.told)
+    return SharedRelation(name, rows.nodes | nodes, rows.edges | edges, {**rows.told, **paths})
 
 
 def _bound(scope: Scope) -> tuple[frozenset[str], frozenset[str]]:

@@ -232,6 +232,8 @@ class SymbolTable:
         Whether what stands here is inside of one.
     over : bool
         Whether values over a match may stand here.
+    paths : list of PathValue or None
+        Paths with names, where there may be some.
     aliases : mapping of str to Bound
         What ``RETURN`` calls its values, where these may be spoken of; a name of one is no variable there.
     """
@@ -243,6 +245,7 @@ class SymbolTable:
     aggregates: bool = False
     aggregated: bool = False
     over: bool = False
+    paths: list[b.PathValue] | None = None
     aliases: Mapping[str, Bound] = field(default_factory=dict[str, "Bound"])
 
     def block(self) -> SymbolTable:

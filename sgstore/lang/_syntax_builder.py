@@ -7,6 +7,7 @@ returns a part of the syntax tree. Signs and keywords are no children; an absent
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -343,6 +344,11 @@ def _path(_: TextSpan, children: Children) -> s.Path:
     return s.Path(tuple(children[::2]), tuple(children[1::2]))
 
 
+def _named_path(_: TextSpan, children: Children) -> s.Path:
+    name, path = children
+    return replace(path, name=name.text, name_span=name.span)
+
+
 def _block_body(span: TextSpan, children: Children) -> s.Block:
     paths, where = children
     return s.Block(paths, where, span)
@@ -623,6 +629,7 @@ BUILDERS: Final[dict[str, Callable[[TextSpan, Children], Any]]] = {
     "where": _only,
     "patterns": _all,
     "path": _path,
+    "named_path": _named_path,
     "node": _node,
     "edge_right": partial(_edge, "right"),
     "edge_left": partial(_edge, "left"),

@@ -439,6 +439,33 @@ class Result:
 
 
 @dataclass(frozen=True, slots=True)
+class PathValue:
+    """A path that has a name: its value is the list of its nodes.
+
+    Attributes
+    ----------
+    place : FrameAttribute
+        What stands for it.
+    nodes : tuple of str
+        Keys of the nodes that are written in it.
+    edges : tuple of (str, bool)
+        Keys of the edges between these, and whether each is written from its ``dst`` to its ``src``.
+    """
+
+    place: FrameAttribute
+    nodes: tuple[str, ...]
+    edges: tuple[tuple[str, bool], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PathWay:
+    """A pattern whose paths with names have certain lengths; ``nodes`` are the keys of the nodes of each."""
+
+    scope: Scope
+    nodes: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True, slots=True)
 class MatchStage:
     """A pattern of a query in several parts.
 
@@ -448,10 +475,15 @@ class MatchStage:
         What stands in ``MATCH``; its outer nodes are those of the stages before that it speaks of.
     optional : bool
         Whether what goes before stays where it has no match.
+    paths : tuple of PathValue
+    ways : tuple of PathWay
+        Of a rewritten query: the pattern once for all the lengths that its paths may have.
     """
 
     scope: Scope
     optional: bool
+    paths: tuple[PathValue, ...] = ()
+    ways: tuple[PathWay, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -525,6 +557,11 @@ def is_passed_on(value: Bound) -> TypeGuard[FrameAttribute]:
     return isinstance(value, FrameAttribute) and value.attribute.name.startswith(PASSED)
 
 
+def is_path(value: Bound) -> bool:
+    """Tell whether something stands for a path."""
+    return is_passed_on(value) and value.attribute.name.rpartition(" ")[2][0] == "p"
+
+
 @dataclass(frozen=True, slots=True)
 class Query:
     """A bound query.
@@ -554,7 +591,7 @@ class Query:
     gaps : str
         Whether a gap in the recording ends a run (``break``) or not (``bridge``).
     stages : tuple of MatchStage and WithStage
-        Of a query with ``OPTIONAL MATCH`` or ``WITH``: its parts, the first of which is a pattern.
+        Of a query with ``OPTIONAL MATCH``, ``WITH`` or a path with a name: its parts; the first is a pattern.
     """
 
     scope: Scope
@@ -613,6 +650,8 @@ def passed_values(query: Query) -> tuple[FrameAttribute, ...]:
     for stage in query.stages:
         if isinstance(stage, WithStage):
             found = stage.places if stage.grouped else found + stage.places
+        else:
+            found += tuple(path.place for path in stage.paths)
     return found
 
 

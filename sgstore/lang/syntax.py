@@ -299,10 +299,12 @@ class EdgePattern:
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """Nodes with edges between them; there is one node more than edges."""
+    """Nodes with edges between them, one node more than edges; ``name = (a)-->(b)`` has a name."""
 
     nodes: tuple[NodePattern, ...]
     edges: tuple[EdgePattern, ...]
+    name: str | None = None
+    name_span: TextSpan | None = None
 
 
 @dataclass(frozen=True, slots=True)

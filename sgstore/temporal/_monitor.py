@@ -485,14 +485,16 @@ def _bound(
         if isinstance(one, Define):
             defined.append(one)
         elif isinstance(one, MatchClause):
-            if one.later:
+            query = bind_query(text, [*defined, one], catalog, given([*defined, one]))
+            if query.stages:
                 raise QueryError(
-                    "a monitor tells when a pattern is there, and OPTIONAL MATCH and WITH are about its rows",
+                    "a monitor tells when a pattern is there; OPTIONAL MATCH, WITH and paths with names"
+                    " are about its rows",
                     text=text,
-                    span=one.later[0].span,
+                    span=one.later[0].span if one.later else one.block.span,
                     hint="they are asked of a store, by find; EXISTS {…} and COUNT {…} can be watched",
                 )
-            queries.append(bind_query(text, [*defined, one], catalog, given([*defined, one])))
+            queries.append(query)
     return checks, queries
 
 

@@ -1,6 +1,6 @@
 // @ts-check
 // The matches as small pictures, grouped by trace; only what is in sight is there.
-import { h, htm, useEffect, useLayoutEffect, useRef, useState } from "../vendor/core.js";
+import { h, htm, useEffect, useLayoutEffect, useMemo, useRef, useState } from "../vendor/core.js";
 import { arrived, mapOf, stillOf, thumbOf, wantThumbs } from "./data.js";
 import { fitted, lookAt, paintScene } from "./draw.js";
 import { keyOf, notes, offline, open, openMatch, paints, tick, ticked, traces } from "./state.js";
@@ -81,7 +81,8 @@ export function Gallery({ found, none, word = ["match", "matches"] }) {
     measure();
     return () => { watch.disconnect(); element.removeEventListener("scroll", measure); };
   }, []);
-  const { rows, height, wide, high } = layout(found, box.width);
+  // Of thousands of matches it is made once, not while it is scrolled.
+  const { rows, height, wide, high } = useMemo(() => layout(found, box.width), [found, box.width]);
   // The first row in sight, by halving.
   let low = 0, end = rows.length;
   while (low < end) {
