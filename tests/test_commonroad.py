@@ -21,7 +21,7 @@ from sgstore.errors import StoreError, TraceError
 from sgstore.ingest import recordings
 from sgstore.opendrive import read_map
 from sgstore.readers import open_recording, open_trace, read_message
-from sgstore.vocabulary import KIND_CODE
+from sgstore.vocabulary import KIND_CODE, KINDS
 from sgstore.world import FrameBlock, TraceReport
 
 if TYPE_CHECKING:
@@ -155,6 +155,37 @@ def _edges(found: RoadMap) -> list[tuple[str, int, int]]:
     edges = found.edges
     columns = (edges.relation.tolist(), edges.src.tolist(), edges.dst.tolist())
     return [(str(RELATIONS[r]), s, d) for r, s, d in zip(*columns, strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("code", "value", "kind", "subkind"),
+    [
+        ("274", 50 / 3.6, "speed_limit", "50"),
+        ("274.1", 30 / 3.6, "speed_limit", "zone 30"),
+        ("R2-1", 11.176, "speed_limit", "25 mph"),
+        ("C43", 90 / 3.6, "speed_limit", "90"),
+        ("206", math.nan, "stop_sign", ""),
+        ("205", math.nan, "yield_sign", ""),
+        ("306", math.nan, "sign", "306"),
+        ("274", math.nan, "sign", "274"),
+    ],
+)
+def test_signs_mean_what_their_codes_say(
+    tmp_path: Path, code: str, value: float, kind: str, subkind: str
+) -> None:
+    plate = f"<additionalValue>{value}</additionalValue>" if value == value else ""  # noqa: PLR0124
+    text = re.sub(
+        "<trafficSignID>274<(.*?)</additionalValue>",
+        f"<trafficSignID>{code}</trafficSignID>{plate}",
+        scenario(frames=9),
+    )
+    path = tmp_path / "signs.xml"
+    path.write_text(text)
+    _, blocks, _ = read(path)
+    row = blocks[0].entities.ident.index("20")
+
+    assert KINDS[blocks[0].entities.kind[row]] == kind
+    assert blocks[0].entities.subkind[row] == subkind
 
 
 def test_an_obstacle_can_be_the_ego(made: Path) -> None:

@@ -68,12 +68,16 @@ _CROSSED: Final = {
 
 _MPH: Final = 0.44704
 _KMH: Final = 1 / 3.6
+_ZONE: Final = "274.1"
 _CODES: Final = {
     # Code of a sign → kind. Each country has codes of its own, none of which means something else in another.
     # Source: CommonRoad: XML format documentation, and commonroad-io 2024.3, traffic_sign.
     **dict.fromkeys(("206", "R1-1", "r2"), "stop_sign"),
     **dict.fromkeys(("205", "R1-2", "r1"), "yield_sign"),
-    **dict.fromkeys(("274", "274.1", "R2-1", "r301"), "speed_limit"),
+    **dict.fromkeys(("274", _ZONE, "R2-1", "R15", "r301"), "speed_limit"),
+    **dict.fromkeys(
+        ("B14", "B31", "C43", "3.24", "\N{GREEK CAPITAL LETTER RHO}-32"), "speed_limit"
+    ),
 }
 
 
@@ -93,7 +97,8 @@ def meaning_of(sign: ScenarioSign) -> SignMeaning:
         if kind == "speed_limit" and 0 < value < 200:
             miles = code.startswith("R2")
             number = value / (_MPH if miles else _KMH)
-            return SignMeaning(kind, f"{number:.0f} mph" if miles else f"{number:.0f}", value)
+            zone = "zone " if code == _ZONE else ""
+            return SignMeaning(kind, f"{zone}{number:.0f}{' mph' if miles else ''}", value)
         if kind is not None and kind != "speed_limit":
             return SignMeaning(kind, "")
     return SignMeaning("sign", "+".join(code for code, _ in sign.plates)[:100])
