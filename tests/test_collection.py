@@ -101,6 +101,15 @@ QUESTIONS = [
     "MATCH (a:Car)-[:near]->(b) RETURN SUBGRAPHS LIMIT 4 UNION ALL MATCH (a:Car)-[:visible]->(b)"
     " RETURN SUBGRAPHS LIMIT 3",
     "MATCH (a:Car) WHERE NOT EXISTS {(a)-[:near]->(b)} RETURN trace.map, COUNT(*)",
+    "MATCH (a:Car) OPTIONAL MATCH (a)-[:near]->(b) RETURN b, b.kind, COUNT(*) AS n ORDER BY n LIMIT 1 PER b",
+    "MATCH (a:Car) OPTIONAL MATCH (a)-[:near]->(b) WHERE b.x > 101",
+    "MATCH (a:Car) OPTIONAL MATCH (a)-[:near]->(b) RETURN DISTINCT b, b.name",
+    "MATCH (a:Car)-[:near]->(b) WITH b, COUNT(*) AS n, collect(a.name) AS who WHERE n > 1 RETURN b, n, who",
+    "MATCH (a:Car)-[:near]->(b) WITH b.kind AS k, COUNT(*) AS n RETURN k, AVG(n), collect(n), COUNT(*)",
+    "MATCH (a:Car)-[:near]->(b) WITH a, b ORDER BY dist(a, b) LIMIT 1 RETURN INTERVALS, a, b",
+    "MATCH (a:Car)-[:near]->(b) WITH COUNT(*) AS n",
+    "MATCH p = (a:Car)-[:near*1..2]->(b) RETURN p, length(p) AS n ORDER BY n DESC LIMIT 40",
+    "MATCH p = (a:Car)-[:near*1..2]->(b) WITH a, MIN(length(p)) AS n RETURN SUBGRAPHS, n",
 ]
 CHECKS = [
     "CHECK calm: FORALL (a:Car) ALWAYS a.speed < 8",

@@ -30,12 +30,10 @@ from sgstore.lang._ir_leaves import (
     TraceAttribute,
     Value,
 )
-from sgstore.lang._kind_sets import (
-    Kinds,  # noqa: TC001
-    any_kinds,  # noqa: F401
-    any_relation,  # noqa: F401
-    ego_kinds,  # noqa: F401
-)
+from sgstore.lang._kind_sets import Kinds as Kinds  # noqa: PLC0414, TC001
+from sgstore.lang._kind_sets import any_kinds as any_kinds  # noqa: PLC0414
+from sgstore.lang._kind_sets import any_relation as any_relation  # noqa: PLC0414
+from sgstore.lang._kind_sets import ego_kinds as ego_kinds  # noqa: PLC0414
 from sgstore.lang._links import StepLink, StepWay
 from sgstore.records import dataclass
 
