@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -574,6 +575,58 @@ def test_parquet_says_what_its_columns_are_and_is_a_data_set(
     units = {c["name"]: c.get("unit") for c in fields["nodes"]["columns"]}
     assert (units["speed"], units["yaw_rate"], units["kind"]) == ("m/s", "degrees/s", None)
     assert card.startswith("---\n")
+
+
+# OpenLABEL -------------------------------------------------------------------------------------------
+
+
+def test_openlabel_has_everybody_in_every_frame_with_boxes_and_relations(
+    export: Export, written: Callable[..., Path]
+) -> None:
+    folder = written("openlabel")
+    ids = [frame_id for clip, frame_id in frames_in(export) if clip == 1]
+    told = json.loads((folder / "town_001.openlabel.json").read_text(encoding="utf-8"))
+    told = told["openlabel"]
+
+    named = {node: one["name"] for node, one in told["objects"].items()}
+    known = export.store.sql("SELECT node_id, ident FROM entities").dicts()
+    assert named.items() <= {str(one["node_id"]): one["ident"] for one in known}.items()
+    for frame_id in ids[:: max(len(ids) // 8, 1)]:
+        graph = export.store.file.graph(frame_id)
+        frame = told["frames"][str(graph.seq)]
+        there = {node: about for node, about in graph.nodes.items() if node >= 0}
+        assert {*map(int, frame["objects"])} == {*there}
+        assert frame["frame_properties"]["labels"].keys() == TEXTS.keys()
+        for node, about in there.items():
+            held = frame["objects"][str(node)] or told["objects"][str(node)]
+            (box,) = held["object_data"]["cuboid"]
+            x, y, z, _, _, qz, qw, *size = box["val"]
+            assert (x, y, z) == pytest.approx([about[key] for key in "xyz"], abs=1e-5)
+            assert size == pytest.approx(
+                [about[k] for k in ("length", "width", "height")], abs=1e-5
+            )
+            if not about.get("pitch") and not about.get("roll"):
+                turn = math.remainder(
+                    2 * math.atan2(qz, qw) - math.radians(about["heading"]), math.tau
+                )
+                assert turn == pytest.approx(0, abs=1e-5)
+        held = {
+            (int(r["rdf_subjects"][0]["uid"]), r["type"], int(r["rdf_objects"][0]["uid"]))
+            for r in told["relations"].values()
+            if any(s["frame_start"] <= graph.seq <= s["frame_end"] for s in r["frame_intervals"])
+        }
+        assert held == {edge[:3] for edge in graph.edges if edge[0] >= 0 and edge[2] >= 0}
+
+
+@pytest.mark.data
+def test_openlabel_is_valid_by_its_schema(data: Path, written: Callable[..., Path]) -> None:
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = json.loads((data / "schemas/openlabel_1.0.0.json").read_text(encoding="utf-8"))
+    check = jsonschema.Draft7Validator(schema)
+
+    for file in written("openlabel").glob("*.openlabel.json"):
+        faults = check.iter_errors(json.loads(file.read_text(encoding="utf-8")))
+        assert next(faults, None) is None
 
 
 # networkx --------------------------------------------------------------------------------------------

@@ -148,7 +148,7 @@ def export(
     """Cut matches out of their recordings, as clips with the original messages.
 
     Other formats: tables (parquet), pictures and clouds (frames), scenarios to drive
-    again (xosc), recordings for Rerun (rrd), graphs for networkx (nx), PyTorch
+    again (xosc), labels (openlabel), recordings for Rerun (rrd), graphs for networkx (nx), PyTorch
     Geometric (pyg) and S3C (s3c). RETURN CLIPS(-3s, +5s) in the query wins over
     --before and --after.
     """

@@ -73,6 +73,7 @@ EXPORTERS: Final = (
     _of("pyg", "abstraction"),
     _of("s3c", "abstraction"),
     _of("xosc"),
+    _of("openlabel"),
     _of("rrd", "mounts"),
 )
 """The formats of this package."""

@@ -27,6 +27,7 @@ import numpy as np
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import WrittenFile, clip_name, safe_name, tool
 from sgstore.mcap import Loss
+from sgstore.roads import is_lane_text
 from sgstore.vocabulary import VEHICLES
 
 if TYPE_CHECKING:
@@ -173,6 +174,8 @@ def _write_map(export: Export, folder: Path, trace: str) -> Path | None:
     if told is None:
         return None
     name, text = told
+    if is_lane_text(text):  # lanes of a recording or map that is no OpenDRIVE
+        return None
     stem = safe_name(name.removesuffix(".xodr").rpartition("/")[2], "map")
     data = text.encode("utf-8")
     for number in range(1, len(export.clips) + 2):
