@@ -43,6 +43,11 @@ QUESTIONS = [
     "MATCH (a:Car)-[:near]->(b) RETURN b.kind AS k, COUNT(*) AS n, COUNT(DISTINCT b) AS d,"
     " COUNT(DISTINCT b.kind), AVG(a.speed) AS v, MAX(a.x) - MIN(a.x) AS w ORDER BY n DESC, k LIMIT 4",
     "MATCH (a:Car) RETURN trace.name, SUM(frame.seq), MIN(a.name)",
+    "MATCH (a:Car) OPTIONAL MATCH (a)-[:opposes]->(b) RETURN a, b.kind ORDER BY a.speed, a LIMIT 9",
+    "MATCH (a:Car) OPTIONAL MATCH (a)-[:opposes]->(b:Truck) RETURN a.kind, COUNT(*), COUNT(b)",
+    "MATCH (a:Car)-[:near]->(b) WITH a, COUNT(b) AS n WHERE n > 1 RETURN trace.name, MAX(n), COUNT(*)",
+    "MATCH (a:Car)-[:near]->(b) WITH a, b ORDER BY b.x LIMIT 2 RETURN INTERVALS, b",
+    "MATCH (a:Car) WHERE NOT HAPPENS collision(a) RETURN a.kind, COUNT(*)",
     "MATCH (a:Car)-[:near]->(b) RETURN b, COUNT(*) ORDER BY AVG(a.speed)",
     "MATCH (a:Car)-[:near]->(b) RETURN DISTINCT a, b.kind",
     "MATCH (a:Car)-[:near]->(b) RETURN DISTINCT trace.name, b.kind LIMIT 6",

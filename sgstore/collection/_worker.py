@@ -10,8 +10,8 @@ import base64
 import json
 import secrets
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -225,15 +225,21 @@ def _check(
     path = to / f"{secrets.token_hex(8)}.ndjson"
     with path.open("w", encoding="utf-8") as lines:
         for verdict in run:
-            lines.write(json.dumps(as_plain(verdict)))
+            lines.write(json.dumps(verdict, default=_plain))
             lines.write("\n")
     return {"lines": str(path)}
 
 
-def as_plain(verdict: Verdict) -> dict[str, Any]:
-    """A verdict as plain values."""
-    status = None if verdict.status is None else verdict.status.tolist()
-    return asdict(replace(verdict, status=None)) | {"status": status}
+def _plain(value: Any) -> Any:
+    """What JSON is to write of a part of a verdict, whose parts it then asks for."""
+    if is_dataclass(value):
+        return {name: getattr(value, name) for name in _names_of(type(value))}
+    return value.tolist()  # an array
+
+
+@cache
+def _names_of(kind: type) -> tuple[str, ...]:
+    return tuple(one.name for one in fields(kind))
 
 
 def as_verdict(values: dict[str, Any]) -> Verdict:

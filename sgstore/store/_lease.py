@@ -107,19 +107,15 @@ class AttachedFile:
         settings: tuple[object, ...],
     ) -> None:
         place = path.resolve()
-        key = place.parent, *settings
-        with _instances_lock:
-            if key not in _instances:
-                _instances[key] = connect(place.parent)
-            self._instance = _instances[key]
+        self._instance = shared_instance((place.parent, *settings), lambda: connect(place.parent))
         self.name = f"file {place.name}"
         told = f"ATTACH {literal(str(place))} AS {quoted(self.name)} (READ_ONLY)"
         self._instance.cursor().execute(told)
 
-    def cursor(self) -> DuckDBPyConnection:
-        """A connection that reads the file."""
+    def cursor(self, schema: str = "main") -> DuckDBPyConnection:
+        """A connection that reads the file, and looks for names in a schema of it."""
         connection = self._instance.cursor()
-        connection.execute(f"USE {quoted(self.name)}.main")
+        connection.execute(f"USE {quoted(self.name)}.{schema}")
         return connection
 
     def close(self) -> None:
@@ -128,9 +124,19 @@ class AttachedFile:
 
 
 _instances: Final[dict[tuple[object, ...], DuckDBPyConnection]] = {}
-"""The instances of the database for the files of a folder, by it and their settings."""
+"""Instances of the database that are kept as long as the process lives, by what they are for."""
 
 _instances_lock = threading.Lock()
+
+
+def shared_instance(
+    key: tuple[object, ...], make: Callable[[], DuckDBPyConnection]
+) -> DuckDBPyConnection:
+    """The instance of the database for a purpose, made when it is first asked for; ask its cursors."""
+    with _instances_lock:
+        if key not in _instances:
+            _instances[key] = make()
+        return _instances[key]
 
 
 @dataclass(slots=True, eq=False)

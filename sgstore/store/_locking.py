@@ -435,9 +435,13 @@ class Access:
                     else:
                         self._check(instance, "", file.opened)
                     file.checked = True
-                connection = instance.cursor()
-                if self._checked and not public:
-                    connection.execute(f"USE {shape.INSIDE}")  # a cursor does not inherit it
+                inside = self._checked and not public
+                if isinstance(instance, AttachedFile):
+                    connection = instance.cursor(shape.INSIDE if inside else "main")
+                else:
+                    connection = instance.cursor()
+                    if inside:
+                        connection.execute(f"USE {shape.INSIDE}")  # a cursor does not inherit it
             except BaseException:
                 file.close()
                 raise
