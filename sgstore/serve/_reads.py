@@ -79,7 +79,7 @@ class Reads:
                 "map_key": places[name][2],
                 "origin": places[name][:2],
                 "ego": one.ego,
-                "cameras": sorted(c.topic for c in file.channels(name) if "Image" in c.schema),
+                "cameras": places[name][3],
                 "answers": list(one.answers),
             }
             for name, one in traces.items()

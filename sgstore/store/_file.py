@@ -514,8 +514,8 @@ class StoreFile:
         with self.access.reading() as connection:
             return names_of_nodes(connection, trace_named(connection, str(trace))[0])
 
-    def places(self) -> dict[str, tuple[float, float, str]]:
-        """By trace: the place that its positions are about, and the digest of its map; see ``_states``."""
+    def places(self) -> dict[str, tuple[float, float, str, list[str]]]:
+        """By trace: the place that its positions are about, the digest of its map, cameras; see ``_states``."""
         from sgstore.store._states import places
 
         with self.access.reading() as connection:

@@ -110,13 +110,18 @@ def names_of_nodes(connection: DuckDBPyConnection, trace_id: int) -> dict[int, t
     return {node: tuple(about) for node, *about in rows}
 
 
-def places(connection: DuckDBPyConnection) -> dict[str, tuple[float, float, str]]:
-    """By trace: the place that its positions are about (m, in the axes of its map), and the map's digest."""
+def places(connection: DuckDBPyConnection) -> dict[str, tuple[float, float, str, list[str]]]:
+    """By trace: the place that its positions are about (m, in the axes of its map), the map's digest, cameras.
+
+    Of all traces at once, because there may be thousands. Cameras are topics of pictures, by name.
+    """
     rows = connection.execute(
-        "SELECT t.name, t.origin_x, t.origin_y, coalesce(m.digest, '')"
+        "SELECT t.name, t.origin_x, t.origin_y, coalesce(m.digest, ''), coalesce(c.topics, [])"
         " FROM trace t LEFT JOIN map m ON m.map_id = t.map_id"
+        " LEFT JOIN (SELECT trace_id, list(DISTINCT topic ORDER BY topic) AS topics FROM channel"
+        " WHERE contains(schema, 'Image') GROUP BY trace_id) c ON c.trace_id = t.trace_id"
     ).fetchall()
-    return {trace: (x, y, digest) for trace, x, y, digest in rows}
+    return {trace: tuple(about) for trace, *about in rows}
 
 
 def kinds_of(connection: DuckDBPyConnection) -> dict[str, list[str]]:
