@@ -45,6 +45,7 @@ def world() -> World:
         "WITH v AS w OPTIONAL MATCH (w)-[:isIn]->(l:Lane) RETURN w, l",
         "WITH v, COUNT {(v)-[:near]->()} AS n MATCH (w:Entity) WHERE w.id > n RETURN v, w",
         "WITH * WHERE v.x > 101 RETURN COUNT(v)",
+        "OPTIONAL MATCH (v)-[d]->(w) WITH v, w RETURN v, w, COUNT(*)",
         "OPTIONAL MATCH p = (v)-[:near*1..2]->(w) WHERE length(p) > 1 RETURN v, p, length(p)",
     ],
 )

@@ -384,6 +384,8 @@ class _RowStatement:
         roles = {"named", "unnamed"} if counted and not self.result.whole else {"named"}
         self.nodes = frozenset(k for k, node in scope.nodes.items() if node.role in roles)
         self.edges = frozenset(edge.key for edge in scope.edges if edge.named)
+        if query.stages and writer.found is not None:  # what WITH does not pass on counts, too
+            self.nodes, self.edges = writer.found.nodes, writer.found.edges
         if self.result.framed or self.result.distinct:
             self.nodes, self.edges = frozenset(), frozenset()
         if self.result.whole:
