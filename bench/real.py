@@ -6,8 +6,9 @@
 
 Each replica of a recording is moved and turned as a whole (:mod:`bench.replicas`), so that nothing is small
 because it repeats. Without the shared recordings the bundled sample is replicated. ``--quick`` makes 38 traces
-instead of 1,007. ``SGSTORE_BENCH_REAL=FILE`` keeps the store, and takes it if it is there. Processor times are
-of one processor, scaled to a million frames, and stand beside that of a fixed statement of the same process.
+instead of 1,007. ``SGSTORE_BENCH_REAL=FILE`` keeps the store, and takes it if it is there. Beside the bytes of
+a table stands its floor (:mod:`bench.least_bytes`). Processor times are of one processor, scaled to a million
+frames, and stand beside that of a fixed statement of the same process.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bench.least_bytes import floors
 from bench.measure import Measure
 from bench.patterns import QUESTIONS, REFERENCE, asked, reference
 from bench.replicas import given, replicate, sources
@@ -67,18 +69,25 @@ def made(path: Path, traces: int) -> Iterator[Measure]:
 
 
 def bytes_of(path: Path, frames: int, folder: Path) -> Iterator[Measure]:
-    """Bytes a frame, whole and by table."""
+    """Bytes a frame, whole and by table, beside the least that tables and their largest columns take."""
     table = list(sizes(path, folder))
+    floor = {name: (least, columns) for name, least, columns in floors(path)}
     whole = path.stat().st_size
     maps = sum(size for label, size, _ in table if OF_MAPS.match(label))
     yield Measure("whole file without maps", (whole - maps) / frames, "B/frame", f"aim {BYTES}")
     for label, size, rows in sorted(table, key=lambda line: -line[1]):
         if size >= frames / 10:
-            yield Measure(
-                f"  {label}", size / frames, "B/frame", f"{rows / frames:.2f} rows a frame"
-            )
+            note = f"{rows / frames:.2f} rows a frame"
+            least, columns = floor.get(label, (0.0, {}))
+            if columns:
+                named = sorted(columns, key=lambda name: -columns[name])
+                large = [f"{name} {columns[name]:.0f}" for name in named if columns[name] >= 1]
+                note += f"; floor {least:.1f}" + (f": {', '.join(large)}" if large else "")
+            yield Measure(f"  {label}", size / frames, "B/frame", note)
     rest = whole - sum(size for _, size, _ in table)
     yield Measure("  what else is in the file", rest / frames, "B/frame")
+    lowest = sum(least for least, _ in floor.values())
+    yield Measure("floor of all tables but maps", lowest, "B/frame", "columns packed one by one")
     yield Measure("tables of maps", maps / 2**20, "MiB")
 
 
