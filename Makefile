@@ -160,7 +160,7 @@ maps: $(VENV)/.base
 	build/maps/bin/python tests/oracle_sumo.py
 
 # Files of tests that try more where SGSTORE_LONG is set (tests/thorough.py).
-LONG := collection collection_landing collection_ray commonroad collection_spark temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \
+LONG := collection collection_landing collection_ray collection_remote commonroad collection_spark temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \
   lang_after lang_attributes lang_counting lang_match lang_oracle lang_parts lang_subgraphs doors frozen importing ingest_data ingest_hardship library \
   export_scenarios monitor store_verify notebook assistant online parts serve sgg_traces step_expressions store_transactions tolerance lane_places criticality_recorded crime
 oracle: $(VENV)/.dev
