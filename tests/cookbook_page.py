@@ -8,6 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from carla_recordings import Bridge, vehicle
 from library_scenes import LEFT, LIGHTS, RIGHT, SCENES, WAYS, aside, lamp
 from scenes import Scene, actor, along, ego, store_of, through
 
@@ -80,7 +81,22 @@ def drawn_store(where: Path) -> Store:
         for number, scene in enumerate(SCENES[name])
         if scene is not None
     }
-    return store_of(where, scenes | {name: [scene] for name, scene in OWN.items()})
+    store_of(where, scenes | {name: [scene] for name, scene in OWN.items()})
+    ingest(where, [bump(where.parent / "bump.mcap")])
+    return Store(where)
+
+
+def bump(path: Path) -> Path:
+    """A recording of CARLA's bridge in which the ego runs into a car that stands, and its sensor says so."""
+    with Bridge(path) as bridge:
+        bridge.actors({1: ("vehicle.tesla.model3", "hero"), 2: ("vehicle.audi.tt", "other")})
+        for i in range(60):
+            x, speed = (0.8 * i, 8.0) if i < 40 else (32.0, 0.0)
+            there = [vehicle(1, x, v=(speed, 0, 0)), vehicle(2, 36.5)]
+            bridge.objects(i / 10, there)
+            if i == 40:
+                bridge.collision(4.0, 2, (9000, 0, 0))
+    return path
 
 
 def answer_to(entry: Entry, store: Store) -> str:
