@@ -353,6 +353,7 @@ def test_a_monitor_is_seen_while_it_runs(visit: Callable[..., Any]) -> None:
         seen(page, "live")
         if AXE.exists():
             assert faults(page) == []
+        page.context.close()  # before what it listens to is gone
     finally:
         child.terminate()
         child.communicate(timeout=20)
