@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 import packages
 import pytest
 
+import sgstore
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -89,6 +91,14 @@ def test_every_package_that_is_needed_has_bounds(needed: str) -> None:
     assert lower
     # A major version of it each quarter, and what we use has not changed in any.
     assert upper or name == "pyarrow"
+
+
+def test_the_citation_is_of_this_version_and_licence() -> None:
+    text = (packages.REPOSITORY / "CITATION.cff").read_text(encoding="utf-8")
+    told = dict(re.findall(r"^(version|license): (.+)$", text, re.MULTILINE))
+
+    assert sgstore.__version__.startswith(told["version"])
+    assert told["license"] == packages.project()["license"]
 
 
 def test_every_package_that_is_imported_is_named_as_needed() -> None:
