@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: help demo check test tests test-edges test-ui test-wheel test-versions lint format bench fuzz kill mutants soak soak-explorer pyg viewers maps oracle patterns sample clean duckdb-versions fuzz-queries frozen house api vendor cluster
+.PHONY: help demo check test tests test-edges test-ui test-wheel test-versions lint format bench fuzz kill mutants soak soak-explorer pyg viewers maps oracle patterns sample clean duckdb-versions fuzz-queries frozen house reproduce api vendor cluster
 
 help:
 	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
@@ -16,6 +16,7 @@ help:
 	@echo "make test-wheel  build the wheel, install it elsewhere, and run the short tests there"
 	@echo "make test-versions  ingest, verify and find under the lowest and the highest versions of other packages"
 	@echo "make lint    format, lint and types only"
+	@echo "make reproduce  make the tables of docs/reproduction.md again from public data (SGSTORE_DATA; minutes)"
 	@echo "make house   figures of the code, each beside its target: files, lines, classes, circles, what a find runs"
 	@echo "make bench   print speeds and sizes, each beside a baseline measured in the same run"
 	@echo "make fuzz    look at 100,000 recordings, texts and stores that were hurt on purpose (about an hour)"
@@ -124,6 +125,9 @@ fuzz-queries: $(VENV)/.dev
 
 frozen: $(VENV)/.dev
 	$(BIN)/python tests/frozen.py
+
+reproduce: $(VENV)/.dev
+	SGSTORE_LONG=1 PYTHONPATH=. $(BIN)/python tests/reproduce.py
 
 house: $(VENV)/.dev
 	@$(BIN)/python tests/house.py --walk

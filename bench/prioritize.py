@@ -52,6 +52,7 @@ SIZES: Final = {
 """Kind, length and width of each model, which the data do not tell; m."""
 
 SPLITS: Final = 10
+TIES: Final = 20
 PERSON: Final = ("person", 0.5, 0.5)
 BESIDE: Final = {"closing_time": ("closing_time",), "dce_3s": ("dce_3s",), "wttc": ("wttc",)}
 
@@ -99,6 +100,7 @@ def run(quick: bool = False) -> Iterator[Measure]:
             runs[strategy] = selection_of(str(store)), failed
         for strategy, title in STRATEGIES.items():
             yield from by_risk(title, *runs[strategy])
+            yield from diverse(title, *runs[strategy])
             (other,) = runs.keys() - {strategy}
             yield from learned(title, runs[strategy], runs[other])
 
@@ -115,6 +117,40 @@ def by_risk(title: str, chosen: ChosenFrames, failed: dict[str, bool]) -> Iterat
     rng = np.random.default_rng(0)
     chance = fault_detection(rng.permutation(np.array(list(failed.values()))))
     yield Measure(f"{title}, in random order", chance.apfd, "APFD", chance.said)
+
+
+_KINDS: Final = """
+  SELECT frame_id, min(ROW(gap, dst, dst_kind::VARCHAR
+    || CASE WHEN abs(rel_heading) < 135 AND abs(rel_heading) > 45 THEN ' across' ELSE '' END
+    || CASE WHEN abs(rel_heading) >= 135 THEN ' oncoming' WHEN lat_gap <= 0 THEN ' in lane' ELSE ' beside' END
+    || CASE WHEN lon > 0 THEN ' ahead' ELSE ' behind' END))[3] AS kind
+  FROM criticality WHERE src_is_ego GROUP BY frame_id ORDER BY frame_id
+"""
+"""The kind of whoever is nearest, its direction, whether it is in the ego's lane, beside or oncoming."""
+
+
+def kinds_found(chosen: ChosenFrames, failed: dict[str, bool], by: Priority, ties: int) -> float:
+    """Kinds of failures in the first tenth of an order, the mean of so many orders of what is equal."""
+    rows = chosen.store.file.arrays(_KINDS)
+    kinds = dict(zip(rows["frame_id"].tolist(), rows["kind"].tolist(), strict=True))
+    found: list[int] = []
+    for seed in range(ties):
+        order = prioritize(chosen, PrioritySpec(by, seed=seed))
+        first = order.units.first[order.picked][: len(order.picked) // 10].tolist()
+        hit = failed_in_order(order, failed)[: len(first)].tolist()
+        found.append(len({kinds.get(one) for one, wrong in zip(first, hit, strict=True) if wrong}))
+    return float(np.mean(found))
+
+
+def diverse(
+    title: str, chosen: ChosenFrames, failed: dict[str, bool], ties: int = TIES
+) -> Iterator[Measure]:
+    """Kinds of failures that orders by risk, by diversity and by both find early."""
+    for by in (Priority.risk, Priority.diverse, Priority.both):
+        many = kinds_found(chosen, failed, by, ties)
+        yield Measure(
+            f"{title}, by {by}: kinds in the first tenth", many, "kinds", f"mean of {ties}"
+        )
 
 
 def learned(

@@ -184,10 +184,10 @@ Published = tuple[int, str, str, dict[str, np.ndarray], np.ndarray]
 @pytest.fixture(scope="module")
 def published(data: Path) -> list[Published]:
     """Files of each property of every fifth route; of all in a long run."""
-    return list(_published(data / "sgsm" / "extending_sgsm_results.tar.xz"))
+    return list(files_of(data / "sgsm" / "extending_sgsm_results.tar.xz"))
 
 
-def _published(path: Path) -> Iterator[Published]:
+def files_of(path: Path) -> Iterator[Published]:
     with tarfile.open(path) as archive:
         files = (member for member in archive if member.name.endswith(".csv"))
         for number, member in enumerate(files):
