@@ -341,7 +341,11 @@ def test_a_trace_that_was_taken_out_meanwhile_has_no_map(
     page: Page, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert page.get("/api/map", trace="town").status_code == 200
-    monkeypatch.setattr(type(page.explorer.store.file), "places", lambda _: {})
+
+    def nobody(_: object) -> dict[str, Any]:
+        return {}
+
+    monkeypatch.setattr(type(page.explorer.store.file), "places", nobody)
     assert page.get("/api/map", trace="town").status_code == 404
 
 
