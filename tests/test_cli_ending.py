@@ -50,7 +50,7 @@ OUTPUTS = {
     "prioritize": ["-o", "{new}.lock", "--no-payloads"],
     "timeline": ["-o", "{new}.svg"],
     "coverage growth": ["-o", "{new}.csv", "--picture", "{new}.png"],
-} | {verb: [] for verb in ("why-not", "show", "export", "report")}
+} | {verb: [] for verb in ("why-not", "show", "export", "shrink", "report")}
 """What verbs write beside what their lines say; the others rows."""
 
 MATCHES = (
