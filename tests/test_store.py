@@ -15,6 +15,7 @@ from sgstore.config import Config, RangeSettings
 from sgstore.errors import StoreError
 from sgstore.store import StoreFile
 from sgstore.store._lease import give_back
+from sgstore.store._locking import BLOCK_SIZE
 from sgstore.vocabulary import RELATIONS
 
 if TYPE_CHECKING:
@@ -377,3 +378,14 @@ def test_a_compacted_store_gives_the_same_answers(tmp_path: Path) -> None:
     relations = [row[0] for row in store.rows("SELECT relation FROM inside.edge ORDER BY rowid")]
     assert relations == sorted(relations, key=RELATIONS.index)
     assert content(tmp_path / "s.db")
+
+
+def test_an_empty_store_is_small_and_one_written_anew_stays_so(tmp_path: Path) -> None:
+    file = StoreFile.create(tmp_path / "s.db")
+    publish(file, RandomTrace(1, frames=60))
+    for _ in range(2):
+        file.close()
+        with duckdb.connect(str(file.path), read_only=True) as connection:
+            (size,) = connection.execute("SELECT block_size FROM pragma_database_size()").fetchone()
+        assert size == BLOCK_SIZE
+        file.compact()

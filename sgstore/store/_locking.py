@@ -183,6 +183,9 @@ except ImportError:  # not on Windows: there writers and readers take their turn
 STORAGE_VERSION: Final = "v1.5.0"
 """Format of the file: the newest that every supported DuckDB can read."""
 
+BLOCK_SIZE: Final = 1 << 16
+"""Size of the blocks of a new file; bytes. Each of some thirty tables takes whole ones, however few rows."""
+
 _BUSY: Final = ("Could not set lock on file", "Conflicting lock is held")
 """What DuckDB says when another process has the file."""
 

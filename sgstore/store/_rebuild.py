@@ -23,6 +23,7 @@ from sgstore.errors import StoreError
 from sgstore.quoting import literal, quoted
 from sgstore.records import dataclass
 from sgstore.store._locking import (
+    BLOCK_SIZE,
     STORAGE_VERSION,
     Access,
     BusyError,
@@ -43,6 +44,10 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
 
     from sgstore.store._schema import Objects
+
+
+_NEW: Final = f"STORAGE_VERSION '{STORAGE_VERSION}', BLOCK_SIZE {BLOCK_SIZE}"
+"""Options of a new file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,7 +325,7 @@ def attach_empty(connection: DuckDBPyConnection, place: Path) -> None:
     """Make an empty store and attach it as ``fresh``."""
     write_empty(place)
     file = literal(str(place.absolute()))
-    connection.execute(f"ATTACH {file} AS fresh (STORAGE_VERSION '{STORAGE_VERSION}')")
+    connection.execute(f"ATTACH {file} AS fresh ({_NEW})")
 
 
 def write_empty(place: Path) -> None:
@@ -352,7 +357,7 @@ _empty: Final[list[bytes]] = []
 def _make_empty(place: Path) -> None:
     file = literal(str(place.absolute()))
     with duckdb.connect(":memory:") as connection:
-        connection.execute(f"ATTACH {file} AS fresh (STORAGE_VERSION '{STORAGE_VERSION}')")
+        connection.execute(f"ATTACH {file} AS fresh ({_NEW})")
         connection.execute("USE fresh")
         connection.begin()  # one: of its own, each of the 130 statements would be written through
         connection.execute(schema_sql())
