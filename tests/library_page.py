@@ -186,7 +186,8 @@ PARTS: Final = (
         "drawings show scenes that violate them.\n\n"
         "**What is not there**: of R_I2 the case of a broad lane marking between the two (maps keep where "
         "lanes may be changed, not how lines are painted); of R_IN2 the turn on red; R_IN3 to R_IN5, which "
-        "ask for the priority of two turns; R_IN6, whose text we could not find; of UN R157 what depends on the state of the system (transition "
+        "ask for the priority of two turns; R_IN6, whose text we could not find; of UN R157 what "
+        "depends on the state of the system (transition "
         "demand, minimal risk manoeuvre); of ISO 34502 16 of 24 disturbances, whose formulas we could not "
         "find, and of its cut-out (2) only a sketch; IEEE 2846, which names quantities and no limits.",
     ),
