@@ -20,7 +20,7 @@ from sgstore.quoting import literal, quoted
 from sgstore.records import dataclass
 from sgstore.store._joins import tables_folder
 from sgstore.store._lease import shared_instance
-from sgstore.store._locking import default_memory, spill_folder, translated, without_faults
+from sgstore.store._locking import default_memory, spill_folder, translated
 from sgstore.store._packing import SEQ_BITS
 from sgstore.store._rows import Batches, arrays, write_parquet
 from sgstore.store._staging import scratch
@@ -277,7 +277,6 @@ def _tables(parts: Parts, words: Mapping[str, Sequence[str]]) -> Generator[DuckD
 def _merging(kinds: Mapping[str, Sequence[str]]) -> DuckDBPyConnection:
     """A database with the enumerations that all bundles have together: to make one takes 15 ms."""
     connection = scratch(spill_folder(), memory=default_memory(), threads=os.cpu_count() or 1)
-    without_faults(connection)
     for enum, labels in kinds.items():
         connection.execute(f"CREATE TYPE {enum} AS ENUM ({', '.join(map(literal, labels))})")
     return connection

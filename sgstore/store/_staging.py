@@ -31,7 +31,7 @@ from sgstore.store._columns import (
     parted,
     types_of,
 )
-from sgstore.store._locking import Folder, memory_setting
+from sgstore.store._locking import Folder, memory_setting, without_faults
 from sgstore.store._schema import enums_of, own_labels
 from sgstore.store._traces import Identity
 from sgstore.vocabulary import NAMES
@@ -518,6 +518,7 @@ def scratch(spill: Path, *, memory: int = 0, threads: int = 1) -> DuckDBPyConnec
     }
     connection = duckdb.connect(":memory:", config=config)
     connection.execute("SET enable_progress_bar = false")  # on stdout, where Python is interactive
+    without_faults(connection)
     return connection
 
 
