@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from sgstore.lang import MOTION, TOLD_WEATHER, of_query, told_events, traces_with, with_places
-from sgstore.lang.ir import OverMatch, walk
+from sgstore.lang.ir import BlockValue, OverMatch, walk
 from sgstore.matches import Matches
 
 if TYPE_CHECKING:
@@ -60,6 +60,11 @@ def _knowing(file: StoreFile, every: frozenset[int], need: Need) -> frozenset[in
     return known | ((every - known) - having(None, moving=need.attribute.name in MOTION))
 
 
+def _has_braces(query: Query) -> bool:
+    spoken = (part for scope in query.required for part in scope.where)
+    return any(isinstance(part, BlockValue) for one in spoken for part in walk(one))
+
+
 class TemporalMatches(Matches):
     """Matches of a query over single frames or several; see :class:`sgstore.matches.Matches`.
 
@@ -75,15 +80,15 @@ class TemporalMatches(Matches):
 
     @contextmanager
     def _compiled(self) -> Generator[Compiled]:
-        with super()._compiled() as compiled:
-            if compiled.query.steps:
-                # Where time begins what is unknown is false, and would find what nobody knows.
-                unknowing = frozenset(self._lacking(compiled))
-                knowing = replace(compiled.catalog, unknowing=unknowing)
-                ready = replace(compiled, catalog=knowing)
-                yield replace(ready, finder=self._finder(ready))
+        with super()._compiled() as ready:
+            steps = bool(ready.query.steps)
+            if steps or _has_braces(ready.query):
+                # Where time begins, and in braces, what is unknown is false, and would find what nobody knows.
+                unknowing = frozenset(self._lacking(ready))
+                knowing = replace(ready, catalog=replace(ready.catalog, unknowing=unknowing))
+                yield replace(knowing, finder=self._finder(knowing)) if steps else knowing
             else:
-                yield compiled
+                yield ready
 
     @contextmanager
     def asked(self) -> Generator[Compiled]:
