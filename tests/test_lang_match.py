@@ -41,7 +41,11 @@ def view_of(frame: Frame) -> FrameView:
     start = frame.trace.frames[0].time_ns
     nodes = dict(graph.nodes(data=True))
     key = (frame.frame_id, frame.trace.name, frame.seq, frame.time_ns, frame.ego)
-    scene = SceneGraph(*key, nodes, edges)
+    events = {
+        kind: [(a, b) for told, a, b in frame.events if told == kind]
+        for kind in frame.trace.records
+    }
+    scene = SceneGraph(*key, nodes, edges, events=events)
     about = {"id": frame.frame_id, "seq": frame.seq, "t": (frame.time_ns - start) / 1e9}
     return FrameView(scene, about, {"name": frame.trace.name, "id": frame.trace.trace_id})
 
