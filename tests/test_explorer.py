@@ -444,7 +444,8 @@ def test_no_serious_fault_of_accessibility(page: Any, scheme: str) -> None:
     page.locator(".dialog dl").wait_for()
     assert faults(page) == []
     page.keyboard.press("Escape")
-    for view, sign in (("Coverage", ".chart"), ("Selection", "h2"), ("Compare", "h2 >> nth=2")):
+    views = {"Coverage": ".chart", "Selection": "h2", "Compare": "h2", "Tables": "h2 >> nth=2"}
+    for view, sign in views.items():
         page.get_by_role("button", name=view).click()
         page.locator(sign).first.wait_for()
         assert faults(page) == []
