@@ -28,8 +28,8 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
     "msd": measure(
         "minimum stopping distance: how far a still goes if it brakes by 11.5 m/s²",
         "m",
-        "pace * pace / 23e0",
-        "whoever b is",
+        "CASE WHEN lon IS NOT NULL THEN pace * pace / 23e0 END",
+        "whoever b is, if it has a place of its own",
         "Allen, Shin and Cooper, Analysis of Traffic Conflicts and Collisions, 1978",
         worse="high",
     ),
