@@ -70,7 +70,8 @@ def test_a_role_counts_in_blocks_and_under_the_abstraction(store: Any) -> None:
 
 
 def test_roles_in_memory_and_online_are_those_of_the_store(store: Any) -> None:
-    matcher = Matcher(compile_query(BESIDE, store.catalog(), {}).bound)
+    query = compile_query(BESIDE, store.catalog(), {}).bound
+    matcher = Matcher(query)
     replay, compared, held = Replay(), 0, 0
     with open_trace(RECORDING) as recording:
         road_map = read_map(recording.info.map_text, recording.info.map_name)
@@ -82,7 +83,7 @@ def test_roles_in_memory_and_online_are_those_of_the_store(store: Any) -> None:
                     continue
                 ref = store.file.frame(f"town#{seq}")
                 assert online.roles_of() == store.file.abstracted.roles_of(ref.frame_id)
-                held += matcher.holds(store._view(ref, ()))
+                held += matcher.holds(store._view(ref, query))
                 compared += 1
     frames = {f.seq for f in store.find(BESIDE).frames() if f.seq % 10 == 0}
     assert compared > 10

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from thorough import LONG, some
 
-from sgstore.lang import Attribute, Binding, Type
+from sgstore.lang import Attribute, Binding, Type, compile_query
 from sgstore.lang._catalog import (
     EDGE_ATTRIBUTES,
     ENV_ATTRIBUTES,
@@ -52,8 +52,9 @@ def found(store: Store) -> Found:
 
 @pytest.fixture(scope="module")
 def view(store: Store) -> FrameView:
-    asked = [FrameAttribute(one, one.type) for one in ENV_ATTRIBUTES.values()]
-    return store._view(store.file.frame(f"town#{SEQ}"), asked)
+    told = " AND ".join(f"env.{name} IS NULL" for name in ENV_ATTRIBUTES)
+    query = compile_query(f"MATCH (e:Ego) WHERE {told}", store.catalog()).bound
+    return store._view(store.file.frame(f"town#{SEQ}"), query)
 
 
 def in_memory(expression: Any, view: FrameView) -> Callable[[int], Any]:
