@@ -239,7 +239,7 @@ def test_a_disk_that_is_full_leaves_the_old_store(tmp_path: Path, room: int) -> 
     before = content(store)
 
     run = subprocess.run(
-        [sys.executable, "-c", FULL.format(most=room), store, *paths[1:]],
+        [sys.executable, "-B", "-c", FULL.format(most=room), store, *paths[1:]],
         capture_output=True,
         text=True,
         check=False,

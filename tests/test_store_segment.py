@@ -537,7 +537,9 @@ def test_a_disk_that_is_full_leaves_a_whole_store(store: Any, room: Any, is_in: 
     most = max(store.path.stat().st_size + room, 20_000)
     code = FULL.format(path=[str(Path(__file__).parent)], store=str(store.path), most=most)
 
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    run = subprocess.run(
+        [sys.executable, "-B", "-c", code], capture_output=True, text=True, check=False
+    )
 
     assert (f"{store.path}: " in run.stdout) != is_in, run.stderr
     assert len(store.traces()) == 1 + is_in
