@@ -29,7 +29,7 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
         "minimum stopping distance: how far a still goes if it brakes by 11.5 m/s²",
         "m",
         "CASE WHEN lon IS NOT NULL THEN pace * pace / 23e0 END",
-        "whoever b is, if it has a place of its own",
+        "whoever b is",
         "Allen, Shin and Cooper, Analysis of Traffic Conflicts and Collisions, 1978",
         worse="high",
     ),
