@@ -11,14 +11,14 @@ from __future__ import annotations
 import json
 import math
 from functools import cache
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from mcap.records import Channel, Schema
 
 from sgstore.errors import MapError, TraceError
 from sgstore.mcap import MESSAGE_HEAD, Findings, Loss, Messages, mark_of_open, open_regular
+from sgstore.readers._file import MessageFile
 from sgstore.readers.commonroad._document import (
     MAX_BYTES,
     ROOT,
@@ -29,12 +29,8 @@ from sgstore.readers.commonroad._document import (
 from sgstore.readers.commonroad._lanelets import light_place, map_text, meaning_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator
     from pathlib import Path
-
-    from mcap.records import Metadata
-
-    from sgstore.mcap import RecordPlace
 
 ENDINGS: Final = (".xml",)
 """How the names of such files end; :func:`is_scenario` tells them from others."""
@@ -61,7 +57,7 @@ def is_scenario(path: Path) -> bool:
         return False
 
 
-class CommonRoadFile:
+class CommonRoadFile(MessageFile):
     """A CommonRoad scenario that is read once or more often, in the words of an MCAP file.
 
     Parameters
@@ -76,22 +72,12 @@ class CommonRoadFile:
         ``/commonroad/map`` and ``/commonroad/steps``, with their schemas.
     counts : dict
         Messages of each channel.
-    window : tuple of int
-        All log times there are.
-    profile, compression : str
-    metadata, attachments
-        What an MCAP file that holds the same has: no profile, zstd, nothing beside the messages.
 
     Raises
     ------
     TraceError
         The file cannot be opened, or is no scenario.
     """
-
-    window = (0, (1 << 63) - 1)
-    profile, compression = "", "zstd"
-    metadata: Final[Mapping[RecordPlace, Metadata]] = MappingProxyType({})
-    attachments: tuple[RecordPlace, ...] = ()
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -127,20 +113,6 @@ class CommonRoadFile:
         self.counts = {_STEP_CHANNEL: len(self._steps)}
         if self._map:
             self.counts[_MAP_CHANNEL] = 1
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_exception: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Nothing is open once the file was read."""
-
-    def pieces(self, place: RecordPlace) -> Iterator[memoryview]:
-        """The bytes of an attachment; there are none."""
-        del place
-        return iter(())
 
     def walk(
         self,

@@ -14,8 +14,7 @@ import struct
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import islice
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import zstandard
@@ -33,6 +32,7 @@ from sgstore.mcap import (
     mark_of_open,
     open_regular,
 )
+from sgstore.readers._file import MessageFile
 from sgstore.readers.osi._schema import (
     DECODE_ERRORS,
     GROUND_TRUTH,
@@ -49,13 +49,9 @@ from sgstore.readers.osi._schema import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator
     from pathlib import Path
     from typing import BinaryIO
-
-    from mcap.records import Metadata
-
-    from sgstore.mcap import RecordPlace
 
 
 PREFIX: Final = struct.Struct("<I")
@@ -224,7 +220,7 @@ _ENOUGH, _TRIED = 8, 1000
 _VERSION, _TIMESTAMP = 1, 2
 
 
-class OsiFile:
+class OsiFile(MessageFile):
     """A single-channel OSI file that is read once or more often, in the words of an MCAP file.
 
     Parameters
@@ -239,11 +235,6 @@ class OsiFile:
         The one schema and the one channel, whose topic is ``ground_truth`` or ``sensor_view``.
     counts : None
         Nobody counted the messages.
-    window : tuple of int
-        All log times there are.
-    profile, compression : str
-    metadata, attachments
-        What an MCAP file that holds the same has: no profile, zstd, nothing beside the messages.
 
     Raises
     ------
@@ -252,10 +243,6 @@ class OsiFile:
     """
 
     counts = None
-    window = (0, (1 << 63) - 1)
-    profile, compression = "", "zstd"
-    metadata: Final[Mapping[RecordPlace, Metadata]] = MappingProxyType({})
-    attachments: tuple[RecordPlace, ...] = ()
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -275,20 +262,9 @@ class OsiFile:
             )
         }
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_exception: object) -> None:
-        self.close()
-
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-    def pieces(self, place: RecordPlace) -> Iterator[memoryview]:
-        """The bytes of an attachment; there are none."""
-        del place
-        return iter(())
 
     def walk(
         self,

@@ -8,8 +8,7 @@ stands behind a cut, is a loss.
 from __future__ import annotations
 
 import re
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from mcap.records import Channel, Schema
@@ -24,15 +23,12 @@ from sgstore.mcap import (
     mark_of_open,
     open_regular,
 )
+from sgstore.readers._file import MessageFile
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
     from typing import BinaryIO
-
-    from mcap.records import Metadata
-
-    from sgstore.mcap import RecordPlace
 
 STEP: Final = "sumo.Timestep"
 """Schema of the messages."""
@@ -74,7 +70,7 @@ def time_ns(step: bytes) -> int | None:
     return round(seconds * 1e9) if abs(seconds) < 1e9 else None
 
 
-class SumoFile:
+class SumoFile(MessageFile):
     """Floating-car data, read once or more often, in the words of an MCAP file.
 
     Parameters
@@ -89,11 +85,6 @@ class SumoFile:
         One channel, ``/sumo/fcd``, with its schema.
     counts : None
         How many steps there are is known when they were read.
-    window : tuple of int
-        All log times there are.
-    profile, compression : str
-    metadata, attachments
-        What an MCAP file that holds the same has: no profile, zstd, nothing beside the messages.
 
     Raises
     ------
@@ -101,11 +92,7 @@ class SumoFile:
         The file cannot be opened.
     """
 
-    window = (0, (1 << 63) - 1)
-    profile, compression = "", "zstd"
     counts = None
-    metadata: Final[Mapping[RecordPlace, Metadata]] = MappingProxyType({})
-    attachments: tuple[RecordPlace, ...] = ()
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -122,20 +109,9 @@ class SumoFile:
             )
         }
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_exception: object) -> None:
-        self.close()
-
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-    def pieces(self, place: RecordPlace) -> Iterator[memoryview]:
-        """The bytes of an attachment; there are none."""
-        del place
-        return iter(())
 
     def walk(
         self,

@@ -1,0 +1,45 @@
+"""Files that are no MCAP, told in its words."""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final, Self
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from mcap.records import Metadata
+
+    from sgstore.mcap import RecordPlace
+
+
+class MessageFile:
+    """A file of messages alone: no profile, zstd, nothing beside them, and any log time.
+
+    Attributes
+    ----------
+    window : tuple of int
+        All log times there are.
+    profile, compression : str
+    metadata, attachments
+        What an MCAP file that holds the same has.
+    """
+
+    window = (0, (1 << 63) - 1)
+    profile, compression = "", "zstd"
+    metadata: Final[Mapping[RecordPlace, Metadata]] = MappingProxyType({})
+    attachments: tuple[RecordPlace, ...] = ()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close what is open; here nothing is."""
+
+    def pieces(self, place: RecordPlace) -> Iterator[memoryview]:
+        """The bytes of an attachment; there are none."""
+        del place
+        return iter(())
