@@ -16,18 +16,21 @@ import sys
 import time
 from collections import Counter
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from sgstore.lang import parse
 from sgstore.lang import syntax as s
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     import networkx as nx
     from oracle_worlds import Frame, World
 
     from sgstore.lang import SqlStatement
+
+    Compared = Callable[[World], tuple[str, int]]
 
 VEHICLES = {"car", "truck", "van", "bus", "motorcycle", "bicycle", "trailer", "train", "vehicle"}
 MAP_KINDS = {"lane", "road", "junction", "crosswalk", "offroad", "waypoint"}
@@ -689,39 +692,54 @@ def with_worlds(first: int, count: int) -> Iterator[tuple[int, World]]:
             yield number, world
 
 
-def try_many(first: int, count: int) -> dict[str, int]:
-    """Random queries on random worlds; how many, how many have a match, how many are refused.
+def try_each(
+    first: int, count: int, made: Callable[[int], tuple[str, Compared]], found: str = "with rows"
+) -> Counter[str]:
+    """Random queries on random worlds; how many, how many find something, how many are refused.
 
-    Of three queries one returns values. The frames are counted, too, of every fourth.
+    Parameters
+    ----------
+    made : function
+        Gives the text of a query by its number, and what tells the difference on a world and how much is found.
+    found : str
+        The word for those that find something.
     """
-    from oracle_patterns import Writer
-
     from sgstore.errors import QueryError
 
     seen = Counter[str]()
     for number, world in with_worlds(first, count):
-        writer = Writer(number)
-        text = writer.query()
+        text, compared = made(number)
         LINKS.clear()
         FREE.clear()
+        name = f"query {number}, world {number - (number - first) % WORLD}: {text}"
         try:
-            if number % 3:
-                problem, frames = disagreement(text, world, counted=number % 4 == 0)
-            else:
-                text += writer.results()
-                problem, frames = disagreement_of_results(text, world)
+            problem, rows = compared(world)
         except QueryError as error:
             seen["refused"] += 1
             seen[error.reason.split("'")[0]] += 1
             continue
         except Exception as error:
-            error.add_note(f"pattern {number}, world {number - (number - first) % WORLD}: {text}")
+            error.add_note(name)
             raise
         seen["tried"] += 1
-        seen["matched"] += frames > 0
-        world_of = number - (number - first) % WORLD
-        assert not problem, f"pattern {number}, world {world_of}: {text}\n{problem}"
-    return dict(seen)
+        seen[found] += rows > 0
+        assert not problem, f"{name}\n{problem}"
+    return seen
+
+
+def try_many(first: int, count: int) -> dict[str, int]:
+    """Random patterns; of three one returns values. The frames are counted, too, of every fourth."""
+    from oracle_patterns import Writer
+
+    def made(number: int) -> tuple[str, Compared]:
+        writer = Writer(number)
+        text = writer.query()
+        if number % 3:
+            return text, partial(disagreement, text, counted=number % 4 == 0)
+        text += writer.results()
+        return text, partial(disagreement_of_results, text)
+
+    return dict(try_each(first, count, made, "matched"))
 
 
 def tried(first: int, count: int, jobs: int) -> Counter[str]:

@@ -9,18 +9,17 @@ from __future__ import annotations
 import math
 import sys
 from collections import Counter
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from oracle import (
-    FREE,
-    LINKS,
     Edge,
     Search,
     asked,
     assignments,
     identity,
     shown,
-    with_worlds,
+    try_each,
 )
 from oracle_patterns import Writer
 
@@ -29,7 +28,7 @@ from sgstore.lang import syntax as s
 from sgstore.vocabulary import natural
 
 if TYPE_CHECKING:
-    from oracle import Binding
+    from oracle import Binding, Compared
     from oracle_worlds import World
 
     At = tuple[Search, Binding]
@@ -321,28 +320,14 @@ def disagreement_after(text: str, world: World, *, in_order: bool = True) -> tup
 
 def try_many_after(first: int, count: int) -> Counter[str]:
     """Random queries on random worlds."""
-    from sgstore.errors import QueryError
 
-    seen = Counter[str]()
-    for number, world in with_worlds(first, count):
+    def made(number: int) -> tuple[str, Compared]:
         writer = AfterWriter(number)
         text = writer.query()
         text += writer.after()
-        LINKS.clear()
-        FREE.clear()
-        try:
-            problem, rows = disagreement_after(text, world, in_order=not writer.edges)
-        except QueryError as error:
-            seen["refused"] += 1
-            seen[error.reason.split("'")[0]] += 1
-            continue
-        except Exception as error:
-            error.add_note(f"query {number}: {text}")
-            raise
-        seen["tried"] += 1
-        seen["with rows"] += rows > 0
-        assert not problem, f"query {number}: {text}\n{problem}"
-    return seen
+        return text, partial(disagreement_after, text, in_order=not writer.edges)
+
+    return try_each(first, count, made)
 
 
 if __name__ == "__main__":

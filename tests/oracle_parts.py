@@ -11,12 +11,11 @@ import math
 import sys
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from itertools import groupby, product
 from typing import TYPE_CHECKING, Any
 
 from oracle import (
-    FREE,
-    LINKS,
     Edge,
     Entity,
     Search,
@@ -26,7 +25,7 @@ from oracle import (
     free_names,
     named_nodes,
     shown,
-    with_worlds,
+    try_each,
 )
 from oracle_after import is_counted, rounded, said
 from oracle_patterns import Writer
@@ -37,7 +36,7 @@ from sgstore.lang import syntax as s
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from oracle import Binding
+    from oracle import Binding, Compared
     from oracle_worlds import World
 
 
@@ -490,31 +489,16 @@ def disagreement_of_matches(text: str, world: World) -> tuple[str, int]:
 
 def try_many_parts(first: int, count: int) -> Counter[str]:
     """Random queries on random worlds."""
-    from sgstore.errors import QueryError
 
-    seen = Counter[str]()
-    for number, world in with_worlds(first, count):
+    def made(number: int) -> tuple[str, Compared]:
         writer = PartsWriter(number)
         text = writer.whole()
-        LINKS.clear()
-        FREE.clear()
-        try:
-            if number % 3:
-                text += writer.told()
-                problem, rows = disagreement_of_parts(text, world)
-            else:
-                problem, rows = disagreement_of_matches(text, world)
-        except QueryError as error:
-            seen["refused"] += 1
-            seen[error.reason.split("'")[0]] += 1
-            continue
-        except Exception as error:
-            error.add_note(f"query {number}: {text}")
-            raise
-        seen["tried"] += 1
-        seen["with rows"] += rows > 0
-        assert not problem, f"query {number}: {text}\n{problem}"
-    return seen
+        if number % 3:
+            text += writer.told()
+            return text, partial(disagreement_of_parts, text)
+        return text, partial(disagreement_of_matches, text)
+
+    return try_each(first, count, made)
 
 
 if __name__ == "__main__":
