@@ -37,6 +37,7 @@ from sgstore.coverage import (
     read_specifications,
     selection_of,
     slot_coverage,
+    slot_matrix,
     specification,
     venn,
 )
@@ -496,6 +497,26 @@ def test_values_of_slots_are_combined_as_loops_combine_them(
     assert {row[1] for row in missing.rows} == {t for t, n in wanted.items() if not n}
     store = sgstore.open(a)
     assert all(store.find(query).count() == 0 for query in missing.column("query")[:6])
+
+
+def test_the_matrix_of_slots_is_that_of_loops(worlds: Worlds, tmp_path: Path) -> None:
+    a, _, of_a, _ = worlds
+    file = tmp_path / "slots.toml"
+    file.write_text(f"{SLOTS}[[impossible]]\ncar = 'none'\n")
+    (declared,) = read_specifications(file)
+    items, frames, wanted = slot_matrix(selection_of(a), declared)
+    there = [slots_of(scene) for trace in of_a for scene in trace]
+
+    assert items[:4] == [(s, v) for s in ("person",) for v in ("none", "near", "seen")] + [
+        ("truck", "none")
+    ]
+    for i, (one, value) in enumerate(items):
+        for j, (other, beside) in enumerate(items):
+            both = sum(value in of[one] and beside in of[other] for of in there)
+            cannot = {(one, value), (other, beside)} == {("person", "none"), ("truck", "none")}
+            never = ("car", "none") in {(one, value), (other, beside)}
+            assert frames[i, j] == both
+            assert wanted[i, j] == (one != other and not cannot and not never)
 
 
 @pytest.mark.parametrize("width", [1, 2])

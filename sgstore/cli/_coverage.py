@@ -38,7 +38,7 @@ from sgstore.cli._output import count_bar, say
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sgstore.coverage import ChosenFrames, Classed, ReportTable
+    from sgstore.coverage import ChosenFrames, Classed, ReportTable, Specification
     from sgstore.locks import Lock
     from sgstore.query import Store
     from sgstore.selection import Selection, SelectionSpec, Strategy
@@ -130,18 +130,12 @@ class WindowOptions:
 
     def of(self, ask: FrameAskOptions, *texts: str, slots: Path | None = None) -> list[Classed]:
         """Frames that texts mean, with their classes; says which traces cannot answer a query."""
-        from sgstore.coverage import classed, read_specifications
+        from sgstore.coverage import classed
 
         found: list[Classed] = []
+        declared = None if slots is None else _one_specification(slots)
         for chosen in ask.frames(*texts):
             say_left_out(chosen)
-            declared = None
-            if slots is not None:
-                declared, *more = read_specifications(slots)
-                if more:
-                    raise typer.BadParameter(
-                        f"--slots {slots}: several specifications; expected one here"
-                    )
             found.append(classed(chosen, self.abstraction, self.window, self.incomplete, declared))
         return found
 
@@ -271,11 +265,11 @@ def combos_(
     from sgstore.coverage import combos
 
     if slots is not None:
-        if by or picture or of_ego:
-            raise typer.BadParameter(
-                "--slots declares what there is: not with --by, --ego or --picture"
-            )
+        if by or of_ego:
+            raise typer.BadParameter("--slots declares what there is: not with --by or --ego")
         ask.report(_slot_table(a, slots, k, ask, covered=covered, missing=missing), limit)
+        if picture is not None:
+            _slot_picture(a, slots, ask, picture)
         return
     ours, *others = WindowOptions(abstraction).of(ask, a, *([] if by is None else [by]))
     found = combos(ours, abstraction, k, *others, of_ego=of_ego)
@@ -346,6 +340,7 @@ def spec_(
     ] = None,
     missing: Missing = False,
     covered: Covered = False,
+    picture: Picture = None,
     limit: Limit = None,
     *,
     ask: FrameAskOptions,
@@ -360,7 +355,11 @@ def spec_(
             raise typer.BadParameter("--slots declares what there is: not with --by or --cells")
         declared = slots or Path()
         ask.report(_slot_table(a, declared, 0, ask, covered=covered, missing=missing), limit)
+        if picture is not None:
+            _slot_picture(a, declared, ask, picture)
         return
+    if picture is not None:
+        raise typer.BadParameter("--picture draws pairs of values of declared slots: give --slots")
     if by and cells:
         raise typer.BadParameter("give one of --by and --cells")
     chosen, *reference = ask.frames(a, *([by] if by else []))
@@ -461,6 +460,30 @@ def _slot_table(
     (chosen,) = ask.frames(text)
     tables = slot_coverage(chosen, read_specifications(slots), k)
     return tables[1 if covered else 2 if missing else 0]
+
+
+def _slot_picture(text: str, slots: Path, ask: FrameAskOptions, to: Path) -> None:
+    """Draw the pairs of values of the slots in a file, and its gaps."""
+    from sgstore.coverage import slot_matrix
+    from sgstore.draw import draw_matrix
+
+    (chosen,) = ask.frames(text)
+    declared = _one_specification(slots)
+    items, frames, wanted = slot_matrix(chosen, declared)
+    names = [f"{slot}: {value}" for slot, value in items]
+    title = f"Pairs of {declared.name} in {_short(text)}"
+    draw_matrix(names, frames, wanted, to, title=title, groups=[slot for slot, _ in items])
+    say(f"drawn: {to}")
+
+
+def _one_specification(slots: Path) -> Specification:
+    """The only specification in a file."""
+    from sgstore.coverage import read_specifications
+
+    declared, *more = read_specifications(slots)
+    if more:
+        raise typer.BadParameter(f"--slots {slots}: several specifications; expected one here")
+    return declared
 
 
 def _short(text: str) -> str:

@@ -41,8 +41,10 @@ from ._sequences import happenings as happenings
 from ._sequences import manoeuvres_named as manoeuvres_named
 from ._sequences import sequences as sequences
 from ._sequences import sequences_in as sequences_in
+from ._slots import Specification as Specification
 from ._slots import read_specifications as read_specifications
 from ._slots import slot_coverage as slot_coverage
+from ._slots import slot_matrix as slot_matrix
 from ._slots import specification as specification
 
 __all__ = [
@@ -56,6 +58,7 @@ __all__ = [
     "ReportTable",
     "S3C_THRESHOLD",
     "SequenceCoverage",
+    "Specification",
     "UNKNOWN",
     "WITHIN_S",
     "check_sequences",
@@ -87,6 +90,7 @@ __all__ = [
     "sequences_in",
     "shared",
     "slot_coverage",
+    "slot_matrix",
     "specification",
     "told_outcomes",
     "venn",

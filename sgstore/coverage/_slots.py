@@ -434,6 +434,47 @@ def slot_coverage(
     )
 
 
+def slot_matrix(
+    chosen: ChosenFrames, specification: Specification
+) -> tuple[list[tuple[str, str]], NDArray[np.int64], Bools]:
+    """Pairs of values of declared slots: which occur together, and which should.
+
+    Returns
+    -------
+    items : list of (str, str)
+        Slot and value, slot by slot, ``none`` first.
+    frames : (F, F) int64
+        Frames with both, symmetric; on the diagonal, with the value.
+    wanted : (F, F) bool
+        Pairs of values of two slots that can be.
+
+    Raises
+    ------
+    QueryError
+        A pattern is none.
+    ConfigError
+        There are more pairs than can be gone through.
+    """
+    items = [(slot.name, value) for slot in specification.slots for value in slot.domain]
+    if len(items) ** 2 > MOST:
+        raise ConfigError(
+            f"{specification.name}: {len(items) ** 2:,} pairs; {MOST:,} can be gone through"
+        )
+    with chosen.snapshot():
+        there = _Held(chosen).values(specification)
+    bits = np.stack([there[item] for item in items])
+    frames = np.stack([np.bitwise_count(bits & own).sum(axis=1, dtype=np.int64) for own in bits])
+    names = np.array([name for name, _ in items])
+    wanted = names[:, None] != names[None, :]
+    for one in specification.impossible:
+        if len(one) <= 2:  # of three values each two may be together
+            ends = [items.index(item) for item in one.items()]
+            wanted[ends[0], ends[-1]] = wanted[ends[-1], ends[0]] = False
+            if len(ends) == 1:
+                wanted[ends[0]] = wanted[:, ends[0]] = False
+    return items, frames, wanted
+
+
 def _query(one: Specification, slots: Sequence[Slot], values: Sequence[str]) -> str:
     there = [block_of(one.where) or ""] if one.where else []
     absent: list[str] = []

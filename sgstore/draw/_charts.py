@@ -99,6 +99,7 @@ def _key(axes: Axes) -> None:
 
 
 _GAP: Final = "#f5b877"
+_CANNOT: Final = "#dcdcdc"
 _CELL: Final = 11.0
 MOST_FEATURES: Final = 120
 """Features that a matrix shows; of more, those with the most gaps."""
@@ -202,13 +203,14 @@ def draw_matrix(
     to: Path,
     *,
     title: str,
+    groups: Sequence[str] = (),
 ) -> None:
     """Draw which pairs of features occur together, and mark the gaps: pairs that are wanted and do not.
 
     Parameters
     ----------
     names : sequence of str
-        F features.
+        F features, or values of slots.
     frames : (F, F) int64
         Frames with both, symmetric; on the diagonal, with the feature.
     wanted : (F, F) bool
@@ -216,6 +218,8 @@ def draw_matrix(
     to : Path
         As in :func:`draw_rank_sizes`.
     title : str
+    groups : sequence of str, optional
+        Slot of each value, those of one slot together: lines part the slots, and pairs that cannot be are grey.
 
     Raises
     ------
@@ -226,6 +230,8 @@ def draw_matrix(
     -----
     Of more than :data:`MOST_FEATURES` features, those with the most gaps are shown, and the picture says so.
     """
+    from matplotlib.colors import to_rgb
+
     from sgstore.draw._page import printable
 
     shown = np.arange(len(names))
@@ -234,15 +240,21 @@ def draw_matrix(
     below = f"{int((pairs & (frames > 0)).sum())} of {int(pairs.sum())} pairs occur"
     if len(names) > MOST_FEATURES:
         shown = np.sort(np.argsort(-gaps.sum(axis=0), kind="stable")[:MOST_FEATURES])
-        below += f"; the {MOST_FEATURES} of {len(names)} features with the most gaps"
-    frames, gaps = frames[np.ix_(shown, shown)], gaps[np.ix_(shown, shown)]
-    names = [names[i] for i in shown.tolist()]
-    names = [printable(name) for name in names]
+        what = "values" if groups else "features"
+        below += f"; the {MOST_FEATURES} of {len(names)} {what} with the most gaps"
+    square = np.ix_(shown, shown)
+    image = _colours(frames[square], gaps[square])
+    if groups:
+        image[~wanted[square] & ~np.eye(len(shown), dtype=np.bool_)] = to_rgb(_CANNOT)
+        groups = [groups[i] for i in shown.tolist()]
+    gaps = gaps[square]
+    names = [printable(names[i]) for i in shown.tolist()]
     side = len(names) * _CELL
     label = 12 + 3.7 * max((len(name) for name in names), default=0)
-    with _page(to, title, below, max(label + side + 30, 420), side + label + 90) as page:
+    least = 480 if groups else 420  # for the words that explain the colours
+    with _page(to, title, below, max(label + side + 30, least), side + label + 90) as page:
         axes = page.plot(label, 30.0, label + side, 30.0 + side)
-        axes.imshow(_colours(frames, gaps), interpolation="nearest", aspect="auto")
+        axes.imshow(image, interpolation="nearest", aspect="auto")
         axes.grid(visible=False)
         axes.spines[:].set_visible(False)
         axes.xaxis.tick_top()
@@ -250,7 +262,10 @@ def draw_matrix(
         look: dict[str, Any] = {"fontsize": 6, "color": INK, "parse_math": False}
         axes.set_xticks(places, names, rotation=90, **look)
         axes.set_yticks(places, names, **look)
-        _explain_colours(page, gaps)
+        for place in [i - 0.5 for i in range(1, len(groups)) if groups[i] != groups[i - 1]]:
+            axes.axhline(place, color=INK, linewidth=0.6)
+            axes.axvline(place, color=INK, linewidth=0.6)
+        _explain_colours(page, gaps, cannot=bool(groups))
 
 
 def _colours(frames: NDArray[np.int64], gaps: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -265,7 +280,7 @@ def _colours(frames: NDArray[np.int64], gaps: NDArray[np.bool_]) -> NDArray[np.f
     return image
 
 
-def _explain_colours(page: Page, gaps: NDArray[np.bool_]) -> None:
+def _explain_colours(page: Page, gaps: NDArray[np.bool_], *, cannot: bool) -> None:
     """Explain the colours below the matrix."""
     from matplotlib.patches import Patch
 
@@ -275,11 +290,13 @@ def _explain_colours(page: Page, gaps: NDArray[np.bool_]) -> None:
         "few": "#edf1f6",
         f"a gap: no frame has both ({many} pairs)": _GAP,
     }
+    entries |= {"does not count": _CANNOT} if cannot else {}
     handles = [
         Patch(facecolor=colour, edgecolor=JUNCTION, linewidth=0.4, label=text)
         for text, colour in entries.items()
     ]
-    page.legend(handles, (8, 4), "lower left", fontsize=6.5, handlelength=1.2, handleheight=1.2)
+    look: dict[str, Any] = {"fontsize": 6.5, "handlelength": 1.2, "handleheight": 1.2}
+    page.legend(handles, (8, 4), "lower left", ncols=len(handles), **look)
 
 
 def draw_curve(
