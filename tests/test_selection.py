@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from recordings import Recorder, car, person
 
 import sgstore
 from sgstore.coverage import ChosenFrames, classed, expected_classes, selection_of
@@ -513,8 +514,9 @@ def test_traces_are_ordered_by_the_margin_of_a_check(open_town: Store) -> None:
     margin = {v.trace: v.robustness.value for v in open_town.check(check) if v.robustness}
     rows = [(row[0].partition("#")[0], row[2]) for row in listed(found).rows]
     assert rows == sorted(margin.items(), key=lambda one: one[1])
+    once = by("CHECK EVENTUALLY ego.speed < 4 ROBUSTNESS", SelectionUnit.clip)
     with pytest.raises(ConfigError, match="one margin for a whole trace, and these are clips"):
-        by(check, SelectionUnit.clip)
+        select(whole(open_town), once)
     for text, said in (
         ("CHECK ALWAYS ego.speed < 4", "write CHECK … ROBUSTNESS"),
         ("CHECK a: ALWAYS ego.speed < 4 ROBUSTNESS; CHECK b: ALWAYS ego.speed < 5", "one of them"),
@@ -522,3 +524,60 @@ def test_traces_are_ordered_by_the_margin_of_a_check(open_town: Store) -> None:
     ):
         with pytest.raises(ConfigError, match=said):
             select(whole(open_town), by(text))
+
+
+@pytest.fixture(scope="module")
+def meeting(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """A car comes near from the 10th frame on; in the 5th somebody is there on foot."""
+    folder = tmp_path_factory.mktemp("met")
+    with Recorder(folder / "run.mcap") as recorder:
+        for number in range(20):
+            others = [car(2, 60 - 2 * number, v=(-20, 0))] if number >= 10 else []
+            others += [car(3, 100, v=(0, 0))] if number >= 15 else []
+            others += [person(4, 50)] if number == 5 else []
+            recorder.ground_truth(number / 10, [car(7, 0, v=(5, 0)), *others], host=7)
+    ingest(folder / "x.sgstore", [folder / "run.mcap"])
+    return Store(folder / "x.sgstore")
+
+
+def weakest(store: Store, text: str, unit: str = "frame") -> Selection:
+    return select(whole(store), SelectionSpec(Strategy.weakest, SelectionUnit(unit), 1.0, by=text))
+
+
+@pytest.mark.parametrize("form", ["{}", "robustness({})", "CHECK ALWAYS ({}) ROBUSTNESS"])
+def test_what_is_broken_comes_first_and_what_is_not_known_last(meeting: Store, form: str) -> None:
+    rule = "MIN {(v:Car) | dist(ego, v)} > 30 AND NOT EXISTS {(:Person)}"
+
+    found = weakest(meeting, form.format(rule))
+
+    assert found.values is not None
+    assert found.picked[:11].tolist() == [5, *range(19, 9, -1)]
+    known = [*(10.0 - 2 * i for i in range(10))]
+    np.testing.assert_allclose(found.values[10:], known, rtol=1e-5)
+    assert found.values[5] == -np.inf
+    assert found.result["unknown"] == np.isnan(found.values).sum() == 9
+    assert "not known: 9" in found.said[0]
+
+
+@pytest.mark.parametrize(
+    ("unit", "wanted"),
+    [
+        ("frame", [*range(19, 9, -1)]),
+        ("clip", [1, 0]),
+        ("trace", [0]),
+    ],
+)
+def test_units_are_ordered_by_a_check_of_everybody(
+    meeting: Store, unit: str, wanted: list[int]
+) -> None:
+    check = (
+        "FORALL (v:Car ABSENT AS TRUE) ALWAYS dist(ego, v) > 30 AND ALWAYS v.speed < 100 ROBUSTNESS"
+    )
+
+    found = weakest(meeting, f"CHECK {check}", unit)
+
+    (verdict,) = meeting.check(f"CHECK {check}")
+    assert verdict.robustness is not None
+    assert found.values is not None
+    assert found.values.min() == verdict.robustness.value
+    assert found.picked[: len(wanted)].tolist() == wanted

@@ -148,7 +148,7 @@ class SelectionSpec:
         In how many units each class is to be; of each stratum how many are taken, 0: as the budget allows.
     by : str
         Expression whose value is the stratum of a frame. Of the weakest: a number whose least value counts, a
-        condition, whose robustness is one, or, of whole traces, a ``CHECK`` with ``ROBUSTNESS``.
+        condition, whose robustness is one, or a ``CHECK`` with ``ROBUSTNESS``.
     alpha : float
         A stratum gets a share of the budget as the power of its size: 1 as it is, 0 the same for all.
     budget : Budget or None
@@ -202,11 +202,6 @@ class SelectionSpec:
         if (self.manoeuvres or self.within_s != WITHIN_S) and not self.sequences:
             raise ConfigError(
                 "manoeuvres, and a time within which they happen, belong to --sequences"
-            )
-        if self.strategy is Strategy.weakest and is_check(self.by) and self.unit != "trace":
-            raise ConfigError(
-                f"a CHECK has one margin for a whole trace, and these are {self.unit}s: take --unit trace,"
-                " or give its formula: --weakest 'robustness(…)'"
             )
         if not 0 <= self.alpha <= 10:
             raise ConfigError(

@@ -21,7 +21,9 @@ from sgstore.coverage import (
     run_begins,
     sequences_in,
 )
-from sgstore.errors import ConfigError
+from sgstore.errors import ConfigError, QueryError
+from sgstore.lang import parse
+from sgstore.lang.syntax import Call, MatchClause
 from sgstore.selection._sets import SetFamily, distinct, spread
 from sgstore.store import lengths_of_messages, trace_of
 
@@ -561,22 +563,47 @@ def numbers_of_frames(units: Units, text: str) -> tuple[Ints, Floats]:
         labels = Labels.asked(units.chosen.store, {"measure": expression}, units.frame_id[rows])
         return labels.of(units.frame_id[rows])["measure"]
 
-    found = asked(text)
+    found, condition = asked(text), _condition_in(text)
     if any(isinstance(one, bool) for one in found):
-        found = asked(f"robustness({text})")
+        found, condition = asked(f"robustness({text})"), text
     wrong = next((v for v in found if not isinstance(v, int | float | None)), None)
     if wrong is not None:
         raise ConfigError(f"the measure {text} is {wrong!r}; expected a number, or a condition")
-    return rows, np.array([np.nan if one is None else float(one) for one in found], np.float64)
+    value = np.array([np.nan if one is None else float(one) for one in found], np.float64)
+    if condition is not None and np.isinf(value).any():
+        # What is not known fails infinitely, too, and should not come first.
+        margin = _margins(units, f"CHECK ALWAYS ({condition}) ROBUSTNESS")[rows]
+        value[np.isinf(value) & np.isnan(margin)] = np.nan
+    return rows, value
+
+
+def _condition_in(text: str) -> str | None:
+    """The condition of which an expression is the robustness, and nothing more."""
+    begun = "MATCH () RETURN "
+    try:
+        match = parse(begun + text)[-1]
+    except QueryError:
+        return None  # a whole query
+    items = match.returns.items if isinstance(match, MatchClause) and match.returns else ()
+    call = items[0].value if len(items) == 1 else None
+    if not isinstance(call, Call) or call.name.lower() != "robustness" or not call.arguments:
+        return None
+    span = call.arguments[0].span
+    return (begun + text)[span.start : span.end]
 
 
 def least_values(units: Units, text: str) -> Floats:
     """(U,) the least value of :func:`numbers_of_frames` in each unit; NaN where none is known."""
     rows, value = numbers_of_frames(units, text)
-    frames = np.full(len(units.frame_id) + 1, np.nan)
+    frames = np.full(len(units.frame_id), np.nan)
     frames[rows] = value
+    return _least(units, frames)
+
+
+def _least(units: Units, frames: Floats) -> Floats:
+    """(U,) the least of a value of each frame of the units; NaN where none is known."""
     ranges = np.stack([units.begin, units.end], axis=1).ravel()
-    return np.fmin.reduceat(frames, ranges)[::2]
+    return np.fmin.reduceat(np.append(frames, np.nan), ranges)[::2]
 
 
 _CHECK: Final = re.compile(r"\s*(DEFINE|USING|CHECK)\b", re.IGNORECASE)
@@ -588,22 +615,34 @@ def is_check(text: str) -> bool:
 
 
 def least_of_check(units: Units, text: str) -> Floats:
-    """(U,) margin by which each trace meets a check; NaN where it cannot be told.
+    """(U,) the least margin by which each unit meets a check; NaN where it is not known.
 
     Raises
     ------
     ConfigError
-        It is several checks, or does not ask for a margin.
+        It is several checks, asks for no margin, or has one for a whole trace only and the units are others.
     QueryError
         It is none.
     """
-    verdicts = list(units.chosen.store.check(text))
-    if len({verdict.check for verdict in verdicts}) > 1:
+    return _least(units, _margins(units, text))
+
+
+def _margins(units: Units, text: str) -> Floats:
+    """(N,) margins of a check in the frames of the units; NaN where they are not known, or not asked for."""
+    run = units.chosen.store.check(text)
+    if len(run.names) > 1:
         raise ConfigError("several checks have no order together: give one of them")
-    known = [verdict for verdict in verdicts if verdict.robustness is not None]
-    if verdicts and not known:
+    if not run.quantitative:
         raise ConfigError("the check asks for no margin: write CHECK … ROBUSTNESS")
-    margin = {v.trace: v.robustness.value for v in known if v.robustness is not None}
-    names = {one.trace_id: one.name for one in units.chosen.store.info()}
-    traces = trace_of(units.first).tolist()
-    return np.array([margin.get(names[trace], np.nan) for trace in traces], np.float64)
+    if not run.lasting and units.unit is not SelectionUnit.trace:
+        raise ConfigError(
+            f"this CHECK has one margin for a whole trace, and these are {units.unit}s: take --unit trace,"
+            " or a check that says what is true in each frame: CHECK [FORALL (…)] ALWAYS … ROBUSTNESS"
+        )
+    frames = np.full(len(units.frame_id), np.nan)
+    for frame_id, margins in run.margins():
+        place = np.searchsorted(units.frame_id, frame_id)
+        there = np.append(units.frame_id, -1)[place] == frame_id
+        frames[place[there]] = np.broadcast_to(margins, len(frame_id))[there]
+    frames[~units.asked] = np.nan
+    return frames

@@ -27,7 +27,13 @@ from sgstore.temporal._formula import Formula, Proposition, formula_text, tolera
 from sgstore.temporal._match_values import AT_FRAME, ReturnedValues, Stretches
 from sgstore.temporal._matches import lacking
 from sgstore.temporal._offline import PlanValues, TraceReader, refuse_many, traces
-from sgstore.temporal._plan import needs_text, plan_of_check, plan_of_returned, plan_text
+from sgstore.temporal._plan import (
+    kept_throughout,
+    needs_text,
+    plan_of_check,
+    plan_of_returned,
+    plan_text,
+)
 from sgstore.temporal._robustness import (
     MARGIN_CELLS,
     MarginTable,
@@ -480,6 +486,11 @@ class CheckRun:
         return any(one.check.robustness for one in self._checks)
 
     @property
+    def lasting(self) -> bool:
+        """Tell whether each check says what is always true, of everybody: then frames have margins, too."""
+        return all(kept_throughout(one.check) is not None for one in self._checks)
+
+    @property
     def returned(self) -> dict[str, tuple[str, ...]]:
         """Names of the values that each check returns of its violations."""
         return returned_by(one.check for one in self._checks)
@@ -503,6 +514,22 @@ class CheckRun:
         with self._file.snapshot():
             for one in compile_checks(self._text, self._catalog(), self._parameters):
                 yield from StoreCheck(self._file, one, compat=False, status=False).unknown()
+
+    def margins(self) -> Iterator[tuple[Ints, Floats]]:
+        """Margins by which traces meet the one check, as :meth:`StoreCheck.margins` tells them.
+
+        Yields
+        ------
+        frame_ids : (F,) int64
+            Of a trace that can answer.
+        margins : (F,) or (1,) float64
+        """
+        with self._file.snapshot():
+            (one,) = compile_checks(self._text, self._catalog(), self._parameters)
+            check = StoreCheck(self._file, one, compat=False, status=False)
+            for trace in check.readers():
+                if len(trace):
+                    yield trace.frame_ids, check.margins(trace)
 
     def explain(self) -> str:
         """Explain the checks: formulas over atoms, and each atom."""
@@ -541,6 +568,8 @@ class StoreCheck:
             if part.at is not None:
                 self._values.test(part.at)
         self._quantity = self._plan.quantity(check.formula) if check.robustness else None
+        lasting = kept_throughout(check) if check.robustness else None
+        self._lasting = None if lasting is None else self._plan.quantity(lasting)
         self._people: dict[int, dict[str, dict[int, str]]] = {}
 
     @cached_property
@@ -673,11 +702,41 @@ class StoreCheck:
         when = int(trace.numbers[at]), int(trace.times[at]), trace.seconds(at)
         return Robustness(value, condition_text(self._plan, name), *when, nodes, called)
 
-    def _margins(self, quantity: Formula, trace: TraceReader, bindings: Keys) -> MarginTable:
+    def margins(self, trace: TraceReader) -> Floats:
+        """Margins by which a trace meets the check; NaN where only numbers that are not known decide.
+
+        Of a check that says what is ``ALWAYS`` true, of everybody: (F,), that of each frame. What is not known
+        of somebody, or in some frame, does not count. Of any other check: (1,), that of the whole trace.
+        """
+        each = self._lasting is not None
+        quantity = self._lasting if self._lasting is not None else self._quantity
+        assert quantity is not None  # noqa: S101 - who asks has asked for margins
+        levels = self._levels(trace)
+        kinds, members = self._alike(trace, innermost(levels))
+        least = np.full(len(trace), np.nan if len(kinds) else np.inf)
+        size, parts = max(trace.together // MARGIN_CELLS, 1), [np.zeros(0)]
+        for low in range(0, len(kinds), size):
+            some = kinds[low : low + size]
+            value, other = (
+                self._margins(quantity, trace, some, unknown).value(quantity)
+                for unknown in (-np.inf, np.inf)
+            )
+            value = np.where(np.isinf(value) & (value != other), np.nan, value)
+            if each:
+                least = np.fmin(least, np.fmin.reduce(value, axis=0))
+            else:
+                parts.append(np.broadcast_to(value[:, 0], len(some)))
+        if each:
+            return least
+        return np.array([folded_margins(levels, np.concatenate(parts)[members])[0]])
+
+    def _margins(
+        self, quantity: Formula, trace: TraceReader, bindings: Keys, unknown: float = -np.inf
+    ) -> MarginTable:
         values = PlanValues(self._plan, trace, self._variables, bindings)
-        tolerance = trace.clock.tolerance
-        columns = margin_columns(self._plan, quantity, values.test, values.proposition, tolerance)
-        return MarginTable(columns, trace.clock.times, tolerance)
+        about = values.test, values.proposition, trace.clock.tolerance, unknown
+        columns = margin_columns(self._plan, quantity, *about)
+        return MarginTable(columns, trace.clock.times, trace.clock.tolerance)
 
     def _bounds(self, trace: TraceReader, bindings: Keys) -> tuple[Bools, Bools]:
         """The verdict of some bindings, at least and at most, whatever happened in the gaps."""

@@ -379,6 +379,23 @@ PlannedCheck = tuple[Plan, f.Formula, "f.Formula | None", dict[int, f.Formula]]
 """The plan of a check, its formula, what resets it, and what restricts quantifiers, by their numbers."""
 
 
+def kept_throughout(check: b.BoundCheck) -> b.Bound | None:
+    """The condition that a check wants in every frame, of everybody; ``None``: it is of another form."""
+
+    def lasting(formula: b.Bound) -> b.Bound | None:
+        match formula:
+            case b.Tense(word="ALWAYS", operands=(inner,), low=0, high=None):
+                return inner
+            case b.Operation(word="AND", operands=operands):
+                found = tuple(one for one in map(lasting, operands) if one is not None)
+                return replace(formula, operands=found) if len(found) == len(operands) else None
+            case _:
+                return None
+
+    every = all(one.word == "FORALL" for one in check.quantifiers)
+    return lasting(check.formula) if every else None
+
+
 def plan_of_check(check: BoundCheck, *, reset: bool = True) -> PlannedCheck:
     """Return a check with the formulas that it is made of; ``reset``: whether what resets it matters."""
     plan = _empty_plan(check)

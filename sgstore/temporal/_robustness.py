@@ -82,7 +82,7 @@ class Robustness:
 # Margins of propositions --------------------------------------------------------------------------
 
 
-def margin_of(test: Test, column: Column, tolerance: int) -> Floats:
+def margin_of(test: Test, column: Column, tolerance: int, unknown: float = -np.inf) -> Floats:
     """(B, F) the margin of a comparison; unknown is false.
 
     Parameters
@@ -93,12 +93,14 @@ def margin_of(test: Test, column: Column, tolerance: int) -> Floats:
         The values of that.
     tolerance : int
         Times that differ by no more are the same; ns.
+    unknown : float
+        The margin where it is not known.
     """
     values = np.asarray(column.values, np.float64)
     if lasts(test.expression):
         values = np.where(np.abs(values) <= tolerance / NS, 0.0, values)
     known = column.known & ~np.isnan(values)
-    return np.where(known, values, -np.inf)
+    return np.where(known, values, unknown)
 
 
 def margin_of_flags(flags: Bools) -> Floats:
@@ -124,6 +126,7 @@ def margin_columns(
     tests: Callable[[Test], Column],
     flags: Callable[[str], Bools],
     tolerance: int,
+    unknown: float = -np.inf,
 ) -> dict[str, Floats]:
     """The margins of the propositions of a formula.
 
@@ -137,11 +140,14 @@ def margin_columns(
         Where an atom, or a test that is a condition, of some name is true.
     tolerance : int
         Of times; ns.
+    unknown : float
+        The margin of a comparison where it is not known.
     """
     found: dict[str, Floats] = {}
     for name in sorted(propositions(formula)):
         if name in plan.margins:
-            found[name] = margin_of(plan.tests[name], tests(plan.tests[name]), tolerance)
+            column = tests(plan.tests[name])
+            found[name] = margin_of(plan.tests[name], column, tolerance, unknown)
         else:
             found[name] = margin_of_flags(flags(name))
     return found
