@@ -173,24 +173,23 @@ def deepscenario(folder: Path) -> Iterator[str]:
 def crime() -> Iterator[str]:
     """Measures beside those of CommonRoad-CriMe."""
     yield (
-        "Where its number is another one, it is made here again from the same states by its own definition and"
-        " these causes, which tests/test_crime.py explains; no value is left over.\n"
+        "Where its number is another one, it is made here again from the same states: by our function, given"
+        " what theirs takes (`as taken`), or by its own definition and these causes, which tests/test_crime.py"
+        " explains. 0 where there is nothing to avoid is NULL here. No value is left over.\n"
     )
     rows: list[tuple[object, ...]] = []
-    for measure, judge in test_crime.COMPARED.items():
+    for measure, (ours, judge) in test_crime.COMPARED.items():
         counts = Counter(map(judge, test_crime.cases(measure)))
-        rest = ", ".join(
-            f"{cause} {many}" for cause, many in counts.most_common() if cause != "equal"
-        )
+        told = [counts.pop("equal", 0)]
+        same = [cause for cause in counts if cause.startswith(("as taken", "last step"))]
+        told += [sum(counts.pop(cause) for cause in same)]
+        told += [counts.pop("NULL here", 0)]
+        rest = ", ".join(f"{cause} {many}" for cause, many in counts.most_common())
         rows.append(
-            (
-                measure,
-                f"{counts.total():,}",
-                f"{counts['equal'] / counts.total():.1%}",
-                rest or "none",
-            )
+            (measure, f"`{ours}`", f"{counts.total() + sum(told):,}", *told, rest or "none")
         )
-    yield from table(("measure", "finite values", "equal to 0.01", "the others, by cause"), rows)
+    head = ("there", "here", "finite values", "equal to 0.01", "equal as taken", "NULL here")
+    yield from table((*head, "the others, by cause"), rows)
 
 
 def digests() -> Iterator[str]:
