@@ -1,7 +1,7 @@
 // @ts-check
 // Scenes on a canvas, from columns: the road map, what stands and what moves, what is matched.
 import { kindOf, lightOf, mapOf, stillOf } from "./data.js";
-import { traces } from "./state.js";
+import { paints, traces } from "./state.js";
 
 /** @typedef {{x: number, y: number, turn: number, scale: number, width: number, height: number}} Look */
 /** @typedef {{src: number, dst: number, label: string, both: boolean, holds: boolean | null}} DrawnEdge */
@@ -31,8 +31,18 @@ const DARK_KINDS = { ...KINDS, building: "#3d434c", vegetation: "#33432f", prop:
 const LIGHTS = { red: "#e5383b", red_yellow: "#ff8c1a", yellow: "#ffb703", green: "#2ec4a0", flashing: "#ffe08a", off: "#5a626f" };
 export const SCENERY = new Set(["building", "vegetation", "prop", "pole", "barrier"]);
 
-/** Colours of the page now, light or dark. */
+/** @type {{at: number, ink: ReturnType<typeof inksNow> | null}} */
+const known = { at: -1, ink: null };
+
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { paints.value++; });
+
+/** Colours of the page, light or dark; looked for again when they change. */
 export function inks() {
+  if (known.at !== paints.peek() || !known.ink) { known.at = paints.peek(); known.ink = inksNow(); }
+  return known.ink;
+}
+
+function inksNow() {
   const style = getComputedStyle(document.documentElement);
   const of = (/** @type {string} */ name) => style.getPropertyValue(name).trim();
   const dark = matchMedia("(prefers-color-scheme: dark)").matches;

@@ -42,16 +42,18 @@ function Tile({ match, x, y, wide, high }) {
     const thumb = thumbOf(match.trace, match.first), about = traces.value.get(match.trace);
     const map = mapOf(match.trace), still = stillOf(match.trace);
     // What stands and moves first, the map when it has come.
-    const key = `${keyOf(match)} ${!!thumb} ${!!map} ${!!still} ${wide} ${look}`;
-    if (!canvas.current || !thumb?.columns || !about || painted.current === key) return;
+    const key = `${keyOf(match)} ${!!thumb} ${!!map} ${!!still} ${wide} ${look}`, ctx = canvas.current?.getContext("2d");
+    if (!canvas.current || !ctx || painted.current === key) return;
     painted.current = key;
-    const { width, height, ratio } = fitted(canvas.current), ctx = canvas.current.getContext("2d");
-    const nodes = Object.values(match.binding);
-    if (ctx) {
-      paintScene(ctx, match.trace, thumb, lookAt(match.trace, thumb, nodes, width, height, 45), ratio,
-        { marked: new Set(nodes), lit: new Set(), small: true });
-      canvas.current.dataset.painted = "1";
+    if (!thumb?.columns || !about) { // what it showed was another match
+      ctx.reset();
+      delete canvas.current.dataset.painted;
+      return;
     }
+    const { width, height, ratio } = fitted(canvas.current), nodes = Object.values(match.binding);
+    paintScene(ctx, match.trace, thumb, lookAt(match.trace, thumb, nodes, width, height, 45), ratio,
+      { marked: new Set(nodes), lit: new Set(), small: true });
+    canvas.current.dataset.painted = "1";
   }, [match, wide, waits, look]);
   const isOpen = open.value?.match && keyOf(open.value.match) === keyOf(match), on = ticked.value.has(keyOf(match));
   const tags = notes.value.filter((n) => n[0] === match.trace && n[1] >= match.first && n[1] <= match.last);
@@ -89,11 +91,20 @@ export function Gallery({ found, none, word = ["match", "matches"] }) {
     const middle = (low + end) >> 1, row = /** @type {any} */ (rows[middle]);
     if (row.top + row.height < box.top - 200) low = middle + 1; else end = middle;
   }
-  const seen = /** @type {any[]} */ ([]);
-  for (let i = low; i < rows.length && /** @type {any} */ (rows[i]).top < box.top + box.height + 200; i++) seen.push(/** @type {any} */ (rows[i]));
+  // As many rows each time: what leaves the sight lends its elements to what comes, for to make new ones takes most of the time.
+  const most = useRef(0), was = useRef(0), seen = /** @type {any[]} */ ([]);
+  for (let i = low; i < rows.length && (seen.length < most.current || /** @type {any} */ (rows[i]).top < box.top + box.height + 200); i++) seen.push(/** @type {any} */ (rows[i]));
+  most.current = Math.max(most.current, seen.length);
+  const flies = Math.abs(box.top - was.current) > high;
   useEffect(() => {
-    wantThumbs(seen.flatMap((row) => found.slice(row.first, row.last).map((m) => /** @type {[string, number]} */ ([m.trace, m.first]))));
+    was.current = box.top;
+    wantThumbs(seen.flatMap((row) => found.slice(row.first, row.last).map((m) => /** @type {[string, number]} */ ([m.trace, m.first]))), flies);
+    if (!flies) return undefined;
+    const rest = setTimeout(() => setBox((one) => ({ ...one })), 150); // then all of it stands in its order
+    return () => clearTimeout(rest);
   });
+  const drawn = seen.map((row, at) => ({ row, slot: (low + at) % most.current }));
+  if (flies) drawn.sort((a, b) => a.slot - b.slot);
   const now = open.value?.match;
   useEffect(() => { // what is open comes into sight
     if (!now || !place.current) return;
@@ -102,9 +113,9 @@ export function Gallery({ found, none, word = ["match", "matches"] }) {
   }, [now]);
   return html`<section class="gallery" ref=${place} aria-label="Matches"><div class="inner" style=${{ height: `${height}px` }}>
     ${found.length || !none ? null : html`<p class="faint none">${none}</p>`}
-    ${seen.map((row) => (row.group
-      ? html`<div class="group" key=${`g ${row.group} ${row.first}`} style=${{ top: `${row.top}px` }}>${row.group} <span>${row.many} ${row.many === 1 ? word[0] : word[1]}</span></div>`
-      : found.slice(row.first, row.last).map((match, i) => html`<${Tile} key=${`${keyOf(match)} ${match.index}`} match=${match} wide=${wide} high=${high}
+    ${drawn.map(({ row, slot }) => (row.group
+      ? html`<div class="group" key=${`g ${slot}`} style=${{ top: `${row.top}px` }}>${row.group} <span>${row.many} ${row.many === 1 ? word[0] : word[1]}</span></div>`
+      : found.slice(row.first, row.last).map((match, i) => html`<${Tile} key=${`${slot} ${i}`} match=${match} wide=${wide} high=${high}
           x=${GAP + i * (wide + GAP)} y=${row.top} />`)))}
   </div></section>`;
 }

@@ -142,7 +142,6 @@ effect(() => {
   keep("theme", theme.value);
   untracked(() => { paints.value++; });
 });
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { paints.value++; });
 
 async function begin() {
   const place = /** @type {HTMLElement} */ (document.getElementById("app"));
