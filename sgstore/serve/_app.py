@@ -166,15 +166,23 @@ class Explorer:
         self._pools = {"a": self._pool(path, tables=self._tables())}
         if other is not None:
             self._pools["b"] = self._pool(other)
-        self._threads = ThreadPoolExecutor(MOST_QUESTIONS + 2, "sgstore question")
+        self._threads = ThreadPoolExecutor(MOST_QUESTIONS + 4, "sgstore question")
         self._counting = threading.Lock()
+        self._ended = threading.Event()
         self.busy = 0
 
+    def warm(self) -> None:
+        """Read maps in a thread of its own, before somebody asks for them."""
+        for reads in self.reads.values():
+            self._threads.submit(reads.warm, self._ended)
+
     def close(self) -> None:
-        """End the sandboxes, and give the stores back."""
+        """End the sandboxes, wait for what is read, and give the stores back."""
+        self._ended.set()
         for pool in self._pools.values():
             pool.close()
-        self._threads.shutdown(wait=False, cancel_futures=True)
+        # The process must not end while a thread is within the database.
+        self._threads.shutdown(cancel_futures=True)
         self._folder.cleanup()
         self.store.close()
         if self.other is not None:
@@ -352,7 +360,7 @@ class Explorer:
         tell = partial(loop.call_soon_threadsafe, events.put_nowait)
 
         def progress(done: int, of: int) -> None:
-            if gone.is_set():
+            if gone.is_set() or self._ended.is_set():
                 raise RequestError("nobody waits for it any more")
             tell(("progress", [done, of]))
 

@@ -22,7 +22,7 @@ from sgstore.serve._wire import packed
 from sgstore.serve._words import words
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from sgstore.lang import Catalog
     from sgstore.query import Store
@@ -56,16 +56,17 @@ class Reads:
         self._store = store
         self._known: tuple[Catalog, dict[str, StoredTrace], dict[str, Any]] | None = None
         self._maps: dict[str, bytes] = {}
-        self._reading = threading.Lock()
+        self._reading, self._looking = threading.Lock(), threading.Lock()
 
     def _traces(self) -> tuple[dict[str, StoredTrace], dict[str, Any]]:
         """The traces by name, and what the page is told of the store; remembered while the file stays."""
-        catalog = self._store.catalog()
-        if self._known is None or self._known[0] is not catalog:
-            with self._store.file.snapshot():
-                traces = {one.name: one for one in self._store.traces()}
-                self._known = catalog, traces, self._told(traces)
-        return self._known[1], self._known[2]
+        with self._looking:  # after a change one looks, and the others wait for what it finds
+            catalog = self._store.catalog()
+            if self._known is None or self._known[0] is not catalog:
+                with self._store.file.snapshot():
+                    traces = {one.name: one for one in self._store.traces()}
+                    self._known = catalog, traces, self._told(traces)
+            return self._known[1], self._known[2]
 
     def _told(self, traces: dict[str, StoredTrace]) -> dict[str, Any]:
         file, places = self._store.file, self._store.file.places()
@@ -103,10 +104,7 @@ class Reads:
 
     def _trace(self, name: str) -> StoredTrace:
         """A trace by its whole name."""
-        found = self._traces()[0].get(name)
-        if found is None:
-            raise StoreError(f"no trace {name!r} in the store")
-        return found
+        return _among(self._traces()[0], name)
 
     # Columns -------------------------------------------------------------------------------------
 
@@ -117,7 +115,8 @@ class Reads:
             raise RequestError(f"frames: expected at most {MOST_THUMBS}")
 
         def read() -> bytes:
-            of = [(self._trace(trace).trace_id, seq) for trace, seq in frames]
+            traces = self._traces()[0]  # asked for once: the store may change all the time
+            of = [(_among(traces, trace).trace_id, seq) for trace, seq in frames]
             return packed({}, self._store.file.states_at(of))
 
         return read
@@ -169,10 +168,12 @@ class Reads:
         found = self._store.file.road_map_text(trace)
         return drawn_map(None if found is None else read_map(found[1], found[0]))
 
-    def warm(self) -> None:
-        """Read the maps before they are asked for."""
-        for trace in self._traces()[0]:
-            with suppress(SgstoreError):
+    def warm(self, ended: threading.Event) -> None:
+        """Read the maps before they are asked for, until somebody has had enough."""
+        with suppress(SgstoreError):
+            for trace in self._traces()[0]:
+                if ended.is_set():
+                    return
                 self.outlines(trace)
 
     def series(self, fields: Fields) -> Read:
@@ -250,6 +251,13 @@ class Reads:
             ]
 
         return read
+
+
+def _among(traces: Mapping[str, StoredTrace], name: str) -> StoredTrace:
+    """A trace by its whole name."""
+    if name not in traces:
+        raise StoreError(f"no trace {name!r} in the store")
+    return traces[name]
 
 
 def drawn_map(road_map: RoadMap | None) -> bytes:

@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from sgstore.errors import ConfigError, MissingExtraError, SgstoreError
+from sgstore.errors import ConfigError, MissingExtraError
 
 try:
     import uvicorn
@@ -70,7 +70,7 @@ def serve(
         unless_begun.callback(explorer.close)
         make = partial(application, explorer)
         with _page_of(make, host, port) as (server, listening, address):
-            threading.Thread(target=_warm, args=(explorer,), daemon=True).start()
+            explorer.warm()
             on_start(address)
             if browse:
                 webbrowser.open(address)
@@ -128,13 +128,6 @@ def _page_of(
             timeout_graceful_shutdown=1,  # a question under way does not keep the server
         )
         yield uvicorn.Server(config), listening, f"http://{hosts[0]}/?token={token}"
-
-
-def _warm(explorer: Explorer) -> None:
-    """Read maps before somebody asks for them."""
-    for reads in explorer.reads.values():
-        with suppress(SgstoreError):
-            reads.warm()
 
 
 def _listening(host: str, port: int) -> socket.socket:
