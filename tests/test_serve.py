@@ -46,7 +46,8 @@ class Page:
     async def send(self, method: str, path: str, **how: Any) -> httpx.Response:
         headers = {"cookie": f"sgstore-8123={TOKEN}", "host": HOST} | how.pop("headers", {})
         transport = httpx.ASGITransport(app=self.app, raise_app_exceptions=False)
-        async with httpx.AsyncClient(transport=transport, base_url=f"http://{HOST}") as client:
+        at = f"http://{how.pop('at', HOST)}"  # the address that the connection comes to
+        async with httpx.AsyncClient(transport=transport, base_url=at) as client:
             return await client.request(method, path, headers=headers, **how)
 
     async def leave(self, path: str, body: dict[str, Any], after: float) -> None:
@@ -143,6 +144,13 @@ def test_strangers_are_refused(page: Page, path: str, headers: dict[str, str]) -
     raw = {name: value.encode("latin-1") for name, value in headers.items()}
 
     assert page.ask(method, path, headers=raw).status_code == 403
+
+
+def test_the_address_that_was_asked_is_a_name_of_the_server(page: Page) -> None:
+    other = {"host": "192.0.2.7:8123"}
+
+    assert page.ask("GET", "/api/store", headers=other, at="192.0.2.7:8123").status_code == 200
+    assert page.ask("GET", "/api/store", headers=other).status_code == 403
 
 
 @pytest.mark.parametrize("site", ["cross-site", "same-site", "none"])

@@ -2,7 +2,9 @@
 
 A page of somebody else's could send requests to this machine: by its name for it (DNS rebinding), as a form,
 as a picture. So the host, the origin and what the browser says of the request's site are compared before
-anything else, and everything but the first address needs a cookie that scripts cannot read.
+anything else, and everything but the first address needs a cookie that scripts cannot read. The host is one of
+the names of this machine that are known, or the very address that a connection came to: no name of somebody
+else's leads there.
 """
 
 from __future__ import annotations
@@ -74,10 +76,10 @@ class Guard:
     def _refusal(self, scope: Scope) -> Response | None:
         """Answer that refuses a request, or lets it in; ``None``: it may pass."""
         headers = Headers(scope=scope)
-        if headers.get("host", "") not in self._hosts:
+        host = headers.get("host", "")
+        if host not in {*self._hosts, host_of(*(scope.get("server") or ("", 0)))}:
             return PlainTextResponse("wrong host", 403)
-        origin = headers.get("origin")
-        if origin is not None and origin not in {f"http://{host}" for host in self._hosts}:
+        if headers.get("origin", f"http://{host}") != f"http://{host}":
             return PlainTextResponse("wrong origin", 403)
         plain = scope["method"] == "GET" and scope["path"] == "/"
         site = headers.get("sec-fetch-site")
@@ -104,6 +106,11 @@ class Guard:
             self._cookie, self._token, max_age=_DAY_S * 30, httponly=True, samesite="strict"
         )
         return response
+
+
+def host_of(name: str, port: int | None) -> str:
+    """A name, or an address, with a port, as a browser tells it."""
+    return f"[{name}]:{port}" if ":" in name else f"{name}:{port}"
 
 
 def _no_token() -> Response:

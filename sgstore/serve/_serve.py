@@ -16,6 +16,7 @@ try:
     import uvicorn
 
     from sgstore.serve._app import Explorer, application
+    from sgstore.serve._guard import host_of
     from sgstore.serve._live import live_application
 except ImportError as error:
     raise MissingExtraError("the explorer", "ui") from error
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from sgstore.serve._live import LiveRun
 
 HOST: Final = "127.0.0.1"
+EVERYWHERE: Final = {"0.0.0.0", "::", ""}  # noqa: S104 - only where somebody asks for it
+"""Addresses that stand for all of this machine's; then it is called by its names, too."""
 
 
 def serve(
@@ -46,7 +49,8 @@ def serve(
     ----------
     store : Path
     host : str
-        Address to listen on. Others than this machine's see whatever the token lets them see.
+        Address to listen on. Others than this machine's see whatever the token lets them see. ``0.0.0.0`` are
+        all of this machine's: it answers to each of them, and to the name of the machine.
     port : int
         0: any that is free.
     other : Path, optional
@@ -117,8 +121,8 @@ def _page_of(
     with _listening(host, port) as listening:
         number = listening.getsockname()[1]
         token = secrets.token_urlsafe(24)
-        names = dict.fromkeys((f"[{host}]" if ":" in host else host, HOST, "localhost"))
-        hosts = tuple(f"{name}:{number}" for name in names)
+        mine = (socket.gethostname(), socket.getfqdn()) if host in EVERYWHERE else (host,)
+        hosts = tuple(host_of(name, number) for name in (*mine, HOST, "localhost"))
         config = uvicorn.Config(
             make(token, hosts, f"sgstore-{number}"),
             log_level="warning",
