@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise, starmap
-from operator import eq
+from operator import eq, itemgetter
 from typing import TYPE_CHECKING, Any, Final, overload
 
 import numpy as np
@@ -265,6 +266,9 @@ class LaneDistances:
         ``lane``; m.
     parts : iterable of (int, str, int, float, float)
         Parts of the map, what each is, lanes on which it lies, and from where to where along these; m.
+    courses : iterable of (int, float, float, float)
+        Stretches of lanes, up to the next one: the lane, from where on along it, m, its curvature, 1/m, and its
+        slope, which is NaN or ``None`` where it is not known.
     """
 
     FARTHEST: Final = 200.0
@@ -276,8 +280,10 @@ class LaneDistances:
         other: Ints,
         start: Floats,
         parts: Iterable[tuple[int, str, int, float, float]] = (),
+        courses: Iterable[tuple[int, float, float, float | None]] = (),
     ) -> None:
         self._columns, self._parts = (lane, other, start), tuple(parts)
+        self._courses = tuple(courses)
 
     @cached_property
     def _starts(self) -> dict[tuple[int, int], list[float]]:
@@ -308,6 +314,35 @@ class LaneDistances:
         for _, what, lane, start, end in self._parts:
             found.setdefault((what, lane), []).append((start, end))
         return found
+
+    @cached_property
+    def _of_lanes(self) -> dict[int, list[tuple[float, float, float | None]]]:
+        """Lane → starts of its stretches, which ascend, curvatures and slopes."""
+        found: dict[int, list[tuple[float, float, float | None]]] = {}
+        for lane, start, curvature, slope in self._courses:
+            known = None if slope is None or math.isnan(slope) else slope
+            found.setdefault(lane, []).append((start, curvature, known))
+        for stretches in found.values():
+            stretches.sort(key=itemgetter(0))
+        return found
+
+    def tells(self, what: str) -> bool:
+        """Whether anything is known of lanes: of ``ways`` along them, their ``curvature``, their ``slope``."""
+        return what in self._told
+
+    @cached_property
+    def _told(self) -> frozenset[str]:
+        ways, curved = len(self._columns[0]) > 0, bool(self._of_lanes)
+        sloped = any(slope is not None for of in self._of_lanes.values() for *_, slope in of)
+        known = {"ways": ways, "curvature": curved, "slope": sloped}
+        return frozenset(what for what, is_known in known.items() if is_known)
+
+    def course(self, lane: int, along: float) -> tuple[float | None, float | None]:
+        """Curvature, 1/m, and slope of a lane at a place along it; ``None``: not known."""
+        stretches = self._of_lanes.get(lane, ())
+        if not stretches:
+            return None, None
+        return stretches[bisect_right(stretches, max(along, 0.0), key=itemgetter(0)) - 1][1:]
 
     def stretches(self, node: int) -> Stretches:
         """Lanes on which a part of the map lies, and from where to where along them; m."""
@@ -506,6 +541,34 @@ class SceneGraph:
         there is none within 200 m.
         """
         return None if self.reach is None else self.reach.next(self.stretches().get(node, ()), what)
+
+    def curvature(self, node: int) -> float | None:
+        """Curvature of the lane that an entity is in above all, where it is; 1/m.
+
+        A mean over about a metre of its centre line, positive where it turns to the left for its traffic.
+        ``None``: the entity is in no lane, or the map is not known.
+        """
+        return self._course(node)[0]
+
+    def slope(self, node: int) -> float | None:
+        """Slope of the lane that an entity is in above all, where it is: rise over run, 0.05 for 5 %.
+
+        A mean over about a metre, positive where its own traffic drives uphill. ``None``: the entity is in no
+        lane, the map is not known, or has no heights.
+        """
+        return self._course(node)[1]
+
+    def _course(self, node: int) -> tuple[float | None, float | None]:
+        place = self.primary_places().get(node)
+        return (None, None) if self.reach is None or place is None else self.reach.course(*place)
+
+    def primary_places(self) -> dict[int, tuple[int, float]]:
+        """The lane that each entity is in above all, and the way from its start; m."""
+        return {
+            src: (dst, about["along"])
+            for src, relation, dst, about in self.edges
+            if relation == "isIn" and about.get("is_primary") and "along" in about
+        }
 
     def to_networkx(self) -> nx.MultiDiGraph[int]:
         """The graph as a ``networkx.MultiDiGraph``.

@@ -17,7 +17,7 @@
 -- state of lights, or can answer a relation, that the type does not have, it is added behind the others, in place.
 --
 -- Changes
---   * Version 4: map_place. recordings, with a row for each however many egos were seen in it; maps and settings by their digests; gear and hand brake.
+--   * Version 4: map_place, map_course. recordings, with a row for each however many egos were seen in it; maps and settings by their digests; gear and hand brake.
 --     Tables are in a schema of their own. Kinds and states of lights are open, as relations are; attributes of a client's own. The kind 'vehicle'. pairs.ttc: first contact; pairs.closing_time: what it was. What stands for ever has velocity 0.
 --     The view criticality. Columns that are always known are NOT NULL; store_info holds a digest of these statements.
 --     Places in lanes and gaps that are the same in frames of a bucket that follow one another are kept once: lane_single, lane_repeated,
@@ -209,6 +209,11 @@ CREATE TABLE map_place (                                       -- where parts of
   map_id BIGINT NOT NULL, node_id INTEGER NOT NULL, what VARCHAR NOT NULL, -- what: the kind of the part, or stop_line
   lane INTEGER NOT NULL, start DOUBLE NOT NULL, "end" DOUBLE NOT NULL); -- m from the start of the lane; a light, a sign: where one waits
 
+CREATE TABLE map_course (                                      -- how lanes run, metre by metre
+  map_id BIGINT NOT NULL, lane INTEGER NOT NULL,
+  start DOUBLE NOT NULL, "end" DOUBLE,                         -- m from the start of the lane; end: NULL of its last stretch
+  curvature DOUBLE NOT NULL, slope DOUBLE);                    -- 1/m, to the left; rise over run, NULL where the map has no heights
+
 -- For sgstore verify ------------------------------------------------------------------------------------------------
 
 CREATE TABLE manifest (                                        -- what was published: rows of a trace, a recording, a map, or settings
@@ -302,6 +307,15 @@ SELECT f.frame_id, l.node_id, l.lane, l.kind, l.overlap, l.lane_offset, degrees(
 FROM inside.frame f JOIN inside.lane_repeated l ON l.bucket = f.bucket AND (l.mask & (1::BIGINT << f.bit)) <> 0;
 
 COMMENT ON VIEW main.lane_states IS 'How entities lie in lanes: one row for each edge isIn from an entity (src) to a lane (dst). overlap: share of the footprint in the lane; lane_offset: of the centre, to the left of the lane''s centre line, m; heading_error: heading less the lane''s direction, degrees; is_primary: the one lane that it is in above all; along: of the centre along the lane, from its start in its direction, beyond its ends too, m; is_own: one of the lanes by which lane_dists are told: the primary one and, in a junction, those beside it that the centre is in and, of a vehicle, that run its way.';
+
+CREATE VIEW main.lane_courses AS
+SELECT s.frame_id, s.src AS node_id, s.src_kind AS kind, s.dst AS lane, s.along, c.curvature, c.slope
+FROM main.lane_states s JOIN inside.frame f ON f.frame_id = s.frame_id
+     JOIN inside.map_course c ON c.map_id = f.map_id AND c.lane = s.dst AND greatest(s.along::DOUBLE, 0) >= c.start
+          AND (c."end" IS NULL OR s.along::DOUBLE < c."end")
+WHERE s.is_primary;
+
+COMMENT ON VIEW main.lane_courses IS 'How the lane runs where an entity is: one row a frame and entity that is in a lane, of the one that it is in above all. curvature: positive where the lane turns to the left as its traffic sees it, 1/m; slope: rise over run in the direction of the lane, 0.05 is 5 % uphill, NULL where the map has no heights. Both are means over about a metre of the centre line.';
 
 CREATE VIEW main.lane_gaps AS
 SELECT f.frame_id, g.src, g.dst, g.gap

@@ -436,7 +436,8 @@ class Records:
         if road_map is not None:
             edges = road_map.edges
             about = cache(partial(_map_node, road_map))
-            reach = LaneDistances(*road_map.reach, road_map.places.rows())
+            along = road_map.places.rows(), road_map.courses.rows()
+            reach = LaneDistances(*road_map.reach, *along)
             self._map = MapRecords(about, edges.src, edges.relation, edges.dst, reach)
 
     def stand(self, known: EntityConstants, states: States, row: int) -> None:

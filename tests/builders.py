@@ -18,7 +18,16 @@ import shapely.affinity
 
 from sgstore.config import Config
 from sgstore.geometry import wrapped
-from sgstore.roads import STOREY, LaneHits, MapEdges, MapNodes, MapPlaces, Ribbons, RoadMap
+from sgstore.roads import (
+    STOREY,
+    LaneCourses,
+    LaneHits,
+    MapEdges,
+    MapNodes,
+    MapPlaces,
+    Ribbons,
+    RoadMap,
+)
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.vocabulary import KIND_CODE, RELATION_CODE, RELATIONS
 from sgstore.world import Entities, Floats, FrameBlock, Ints, MessageRefs, States
@@ -219,6 +228,7 @@ class PaperMap(RoadMap):
         lanes = [p for p in patches if p.kind == "lane"]
         self.ribbons = _ribbons(lanes, at)
         self._lanes, self._variant = len(lanes), ""
+        self.courses = LaneCourses.none()
         self.places = MapPlaces.none()  # along its lanes; a map that was read has them
         self.asked = 0
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from sgstore.config import Config
 from sgstore.graph import Edges, GraphBlock, LaneGaps, LaneStates, StaticPresence
-from sgstore.roads import MapEdges, MapNodes, MapPlaces
+from sgstore.roads import LaneCourses, MapEdges, MapNodes, MapPlaces
 from sgstore.vocabulary import KIND_CODE, OWN_ENTITY_KINDS, OWN_RELATIONS, RELATION_CODE
 from sgstore.world import (
     Channel,
@@ -54,6 +54,7 @@ class MapStub:
     edges: MapEdges
     reach: tuple[Any, Any, Any]
     places: MapPlaces
+    courses: LaneCourses
 
 
 def map_stub(seed: int = 0, lanes: int = 30, name: str = "stub") -> Any:
@@ -92,6 +93,18 @@ def map_stub(seed: int = 0, lanes: int = 30, name: str = "stub") -> Any:
         ),
         reach=_reach(lanes, rng),
         places=MapPlaces.none(),
+        courses=_courses(lanes, rng),
+    )
+
+
+def _courses(lanes: int, rng: np.random.Generator) -> LaneCourses:
+    """Two stretches of each lane."""
+    return LaneCourses(
+        np.repeat(np.arange(lanes), 2),
+        np.tile([0.0, 40.0], lanes),
+        np.tile([40.0, np.inf], lanes),
+        rng.uniform(-0.2, 0.2, 2 * lanes),
+        rng.uniform(-0.1, 0.1, 2 * lanes),
     )
 
 

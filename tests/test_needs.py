@@ -244,8 +244,8 @@ def test_traces_come_as_people_count() -> None:
         (
             "CHECK c: EVENTUALLY lane_dist(ego, ego) < 3 OR EXISTS {(ego)-[:isIn]->(:Lane)}",
             {
-                "with": "it knows nothing of isIn",
-                "without": "it knows nothing of isIn; it has no ego",
+                "with": "it knows nothing of isIn; it has no map of lanes",
+                "without": "it knows nothing of isIn; it has no map of lanes; it has no ego",
             },
         ),
     ],

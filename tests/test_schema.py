@@ -21,6 +21,7 @@ VIEWS = {
     " vx vy vz accel ax ay az yaw_rate length width height light_state",
     "edges": "frame_id src relation dst src_kind dst_kind src_is_ego dst_is_ego",
     "lane_states": "frame_id src dst src_kind overlap lane_offset heading_error is_primary along is_own",
+    "lane_courses": "frame_id node_id kind lane along curvature slope",
     "lane_gaps": "frame_id src dst gap",
     "pairs": "frame_id src dst distance gap bearing rel_heading lon lat closing_speed ttc headway"
     " rel_speed src_kind dst_kind src_is_ego dst_is_ego lon_gap lat_gap apparent_heading closing_time",

@@ -64,6 +64,7 @@ def test_what_was_published_is_without_fault(store: Any) -> None:
         "map_edge",
         "map_reach",
         "map_place",
+        "map_course",
     )
     tables += ("frame_class", "lane_role", "recording", "config")
     count = sum(store.rows(f"SELECT count(*) FROM {table}").values[0][0] for table in tables)

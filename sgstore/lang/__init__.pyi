@@ -46,6 +46,7 @@ from ._external import with_places as with_places
 from ._compile import for_people as for_people
 from ._formulas import recorded_events as recorded_events
 from ._formulas import told_events as told_events
+from ._sql_ways import told_lanes as told_lanes
 from ._functions import FUNCTIONS as FUNCTIONS
 from ._needs import MOTION as MOTION
 from ._needs import Need as Need
@@ -171,6 +172,7 @@ __all__ = [
     "looked_up",
     "recorded_events",
     "told_events",
+    "told_lanes",
     "node_of_kind",
     "notes_on",
     "of_check",

@@ -34,6 +34,7 @@ from sgstore.lang._symbols import (
     seen_in,
     text_test,
 )
+from sgstore.pair_numbers import COURSES
 from sgstore.vocabulary import (
     KINDS,
     LANE_TYPES,
@@ -208,7 +209,9 @@ def node_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
         what = " or ".join(sorted(kinds)) if len(kinds) <= 3 else "node of these kinds"
         owners = [kind for kind in KINDS if kind in found.kinds]
         hint = hint_at(name, possible)
-        if "lane" in owners and kinds <= entity_kinds():
+        if found.name in COURSES and kinds <= entity_kinds():
+            hint = f"of the lane where it is, it is a function: {found.name}(x)"
+        elif "lane" in owners and kinds <= entity_kinds():
             hint = f"the lanes that it is in are nodes: (x)-[:isIn]->(l:Lane), l.{found.name}"
         elif hint is None or not hint.startswith("did"):
             hint = f"it belongs to: {', '.join(owners)}"

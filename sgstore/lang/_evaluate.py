@@ -19,7 +19,14 @@ import numpy as np
 from sgstore.lang import ir as b
 from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit, Type
 from sgstore.lang._operators import OPERATORS, Column
-from sgstore.pair_numbers import COLUMNS, LANE_DIST, NEXT_PARTS, PART_DIST, WAYS, PairNumbers
+from sgstore.pair_numbers import (
+    COLUMNS,
+    COURSES,
+    NEXT_PARTS,
+    PART_DIST,
+    WAYS,
+    PairNumbers,
+)
 from sgstore.records import dataclass
 from sgstore.vocabulary import MAP_KINDS, SIGNALS
 
@@ -136,16 +143,8 @@ class FrameView:
 
     def pair(self, name: str, one: int, other: int) -> float | None:
         """A number of a pair of entities; ``None`` where something that it needs is missing."""
-        if name == LANE_DIST:
-            reach = self.graph.reach
-            return None if reach is None else reach.between(self._on(one), self._on(other))
-        if name == PART_DIST:
-            reach = self.graph.reach
-            ends = (self._on(node, parts=True) for node in (one, other))
-            return None if reach is None else reach.between(*ends)
-        if name in NEXT_PARTS:
-            reach = self.graph.reach
-            return None if reach is None else reach.next(self._on(one), NEXT_PARTS[name])
+        if name in WAYS:
+            return self._by_lanes(name, one, other)
         place = self.rows.get(other)
         if place is None or one not in self.rows:
             return None
@@ -154,6 +153,19 @@ class FrameView:
             self._numbers[key] = self.pairs(name, one).tolist()
         value = self._numbers[key][place]
         return None if math.isnan(value) else value
+
+    def _by_lanes(self, name: str, one: int, other: int) -> float | None:
+        """A number that is looked up by lanes."""
+        reach = self.graph.reach
+        if reach is None:
+            return None
+        if name in NEXT_PARTS:
+            return reach.next(self._on(one), NEXT_PARTS[name])
+        if name in COURSES:
+            at = self._primary.get(one)
+            return None if at is None else reach.course(*at)[COURSES.index(name)]
+        ends = (self._on(node, parts=name == PART_DIST) for node in (one, other))
+        return reach.between(*ends)
 
     def pairs(self, name: str, one: int, *, ahead: bool = True) -> Floats:
         """(E,) a number of one entity and each other, by :attr:`rows`; all at once, for most will be asked.
@@ -180,6 +192,10 @@ class FrameView:
     @cached_property
     def _stretches(self) -> Mapping[int, Sequence[tuple[int, float, float]]]:
         return self.graph.stretches()
+
+    @cached_property
+    def _primary(self) -> Mapping[int, tuple[int, float]]:
+        return self.graph.primary_places()
 
     @cached_property
     def _pairs(self) -> dict[tuple[int, bool], PairNumbers]:

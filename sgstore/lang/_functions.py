@@ -16,7 +16,7 @@ from sgstore.lang._needs import in_range
 from sgstore.lang._operators import EXTREMES, NUMERIC, OF_TEXT, OF_TWO
 from sgstore.lang._symbols import CLASSES, Symbol, SymbolTable, abstraction_named, class_count
 from sgstore.lang.library import pattern_named, patterns, predicates
-from sgstore.pair_numbers import LANE_DIST, NEXT_PARTS, PAIR_FUNCTIONS, PART_DIST
+from sgstore.pair_numbers import COURSES, LANE_DIST, NEXT_PARTS, OF_ONE, PAIR_FUNCTIONS, PART_DIST
 from sgstore.vocabulary import EVENT_KINDS, entity_kinds, normalize_name, relation_named
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ _COURSES: Final = (
 _TEMPORAL: Final = frozenset(map(normalize_name, _COURSES))
 FUNCTIONS: Final = frozenset(
     {
-        *(*PAIR_FUNCTIONS, *NEXT_PARTS, *NUMERIC, *EXTREMES, *OF_TWO),
+        *(*PAIR_FUNCTIONS, *OF_ONE, *NUMERIC, *EXTREMES, *OF_TWO),
         *(*_OTHERS, *AGGREGATES, *_COURSES),
     }
 )
@@ -177,28 +177,33 @@ def _refuse_sort(e: s.Call, names: SymbolTable) -> None:
             raise type(error)(error.reason, text=error.text, span=error.span, hint=hint) from None
 
 
-def _next_part(e: s.Call, names: SymbolTable) -> b.PairNumber:
+def _of_one(e: s.Call, names: SymbolTable) -> b.PairNumber:
     _expect(e, 1, 1, names)
     name = normalize_name(e.name)
-    function = next(one for one in NEXT_PARTS if normalize_name(one) == name)
+    function = next(one for one in OF_ONE if normalize_name(one) == name)
     node = _entity(function, e.arguments[0], names)
     return b.PairNumber(function, node, node)
 
 
 def _entity(function: str, argument: s.Expression, names: SymbolTable) -> str:
     found = names.bind(argument)
-    takes = "an entity" if function in NEXT_PARTS else "two entities"
+    takes = "an entity" if function in OF_ONE else "two entities"
     if function == LANE_DIST:
         takes += ", lanes, roads, junctions or crosswalks"
     if not isinstance(found, b.NodeValue):
-        form = f"{function}(a)" if function in NEXT_PARTS else f"{function}(a, b)"
+        form = f"{function}(a)" if function in OF_ONE else f"{function}(a, b)"
         names.session.refuse(f"{function}() takes {takes}", argument.span, f"write {form}")
     kinds = names.scope.kinds(found.node).every
     if not kinds & (on_lanes() if function == LANE_DIST else entity_kinds()):
+        hint = (
+            "how an entity lies in a lane stands on the edge: (e)-[r:isIn]->(l), r.offset, r.along"
+        )
+        if function in COURSES:
+            hint = f"it is told of the lane where an entity is: (e)-[:isIn]->(l), {function}(e)"
         names.session.refuse(
             f"{function}() takes {takes}, and this is a {' or '.join(sorted(kinds))}",
             argument.span,
-            "how an entity lies in a lane stands on the edge: (e)-[r:isIn]->(l), r.offset, r.along",
+            hint,
         )
     return found.node
 
@@ -416,7 +421,7 @@ def _meaning(argument: s.Expression, names: SymbolTable) -> Symbol:
 
 _FUNCTIONS: Final[dict[str, Callable[[s.Call, SymbolTable], b.Bound]]] = {
     **dict.fromkeys(PAIR_NAMES, _pair),
-    **dict.fromkeys(map(normalize_name, NEXT_PARTS), _next_part),
+    **dict.fromkeys(map(normalize_name, OF_ONE), _of_one),
     **dict.fromkeys(NUMERIC, _numeric),
     **dict.fromkeys(EXTREMES, _extreme),
     **dict.fromkeys(OF_TWO, _of_two),

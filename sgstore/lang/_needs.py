@@ -34,7 +34,7 @@ from sgstore.lang.ir import (
     ego_kinds,
     is_one_of,
 )
-from sgstore.pair_numbers import columns_needed
+from sgstore.pair_numbers import COURSES, WAYS, columns_needed
 from sgstore.vocabulary import (
     SIGNALS,
     VEHICLE_LIGHTS,
@@ -229,16 +229,28 @@ class Need:
         That must be known of it in some frame, if there is one; ``None``: that there is one.
     event : str
         The kind of event that it must tell of; else empty.
+    lanes : str
+        What its map must tell of lanes: ``ways``, ``curvature``, ``slope``; else empty.
     """
 
     node: str
     kinds: b.Kinds | None
     attribute: Attribute | None
     event: str = ""
+    lanes: str = ""
+
+    @property
+    def is_ego(self) -> bool:
+        """Whether it is that there is an ego."""
+        return self.attribute is None and not self.event and not self.lanes
 
     @property
     def reason(self) -> str:
         """Message about a trace that does not meet it."""
+        if self.lanes:
+            return (
+                "it has no map with heights" if self.lanes == "slope" else "it has no map of lanes"
+            )
         if self.event:
             return f"it does not record events of the kind {self.event}"
         if self.attribute is None:
@@ -276,15 +288,15 @@ def of_query(query: b.Query) -> tuple[Need, ...]:
     ways = [way.steps for way in query.ways] if query.steps else [every]
     found = set.intersection(*(set[Need]().union(*(needs[n] for n in way)) for way in ways))
     # One ego is as good as another.
-    egos = {need.kinds: need for need in found if need.attribute is None and not need.event}
-    others = {need for need in found if need.attribute is not None or need.event}
+    egos = {need.kinds: need for need in found if need.is_ego}
+    others = {need for need in found if not need.is_ego}
     return _ordered(others | {*egos.values()})
 
 
 def _ordered(needs: set[Need]) -> tuple[Need, ...]:
-    def rank(need: Need) -> tuple[bool, str, str, str]:
+    def rank(need: Need) -> tuple[bool, str, str, str, str]:
         name = need.attribute.name if need.attribute else ""
-        return need.attribute is not None, need.node, name, need.event
+        return need.attribute is not None, need.node, name, need.event, need.lanes
 
     return tuple(sorted(needs, key=rank))
 
@@ -321,9 +333,11 @@ def _needed(  # noqa: C901, PLR0911 - a case each
         case b.NodeAttribute(node=node, attribute=attribute):
             return of_node(node, attribute.name)
         case b.PairNumber(function=function, a=one, b=other):
+            told = function if function in COURSES else "ways"
+            of_map = {Need("", None, None, lanes=told)} if function in WAYS else set[Need]()
             of_two = zip((one, other), columns_needed(function), strict=True)
             # Both parts of a velocity are known, or none, and of an acceleration.
-            return {
+            return of_map | {
                 need
                 for node, parts in of_two
                 for name in parts - {"vy", "ay"}

@@ -1,4 +1,4 @@
-"""SQL of distances along the lanes: between two nodes, and to the next part of the map of one sort.
+"""SQL of what is told by lanes: distances to a node, and to the next part of the map of one sort; courses.
 
 A node is on stretches of lanes: an entity in one place of each of its own lanes, a light or a sign where the
 lanes that it controls are waited on, a part of the map where ``map_place`` has it.
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from sgstore.lang._kinds import kind_conditions
 from sgstore.lang._sql_masks import in_mask
-from sgstore.pair_numbers import LANE_DIST, NEXT_PARTS, PART_DIST
+from sgstore.pair_numbers import COURSES, LANE_DIST, NEXT_PARTS, PART_DIST
 from sgstore.quoting import literal
 from sgstore.vocabulary import SIGNALS, entity_kinds
 
@@ -44,6 +44,8 @@ def way_text(function: str, frame: str, ends: tuple[WayEnd, WayEnd], catalog: Ca
     """
     if function in NEXT_PARTS:
         return _next_text(frame, ends[0], NEXT_PARTS[function], catalog)
+    if function in COURSES:
+        return _course_text(frame, ends[0], function, catalog)
     signals = _SIGNALS & (catalog.moving | catalog.fixed | catalog.mapped)
     if function == LANE_DIST and not any(end.kinds.every & signals for end in ends):
         return _between_entities(frame, ends, catalog)
@@ -107,6 +109,29 @@ def _next_text(frame: str, end: WayEnd, what: str, catalog: Catalog) -> str:
         AND ":p"."map_id" = ":f"."map_id" AND ":p"."lane" = ":r"."dst" AND ":p"."what" = {literal(what)}
     ) AS "ways" WHERE "far" >= 0 AND "near" <= 200
   )"""  # noqa: S608  columns that the compiler named
+
+
+def _course_text(frame: str, end: WayEnd, column: str, catalog: Catalog) -> str:
+    """How the lane runs that an entity is in above all, where it is."""
+    more = "".join(f" AND {one}" for one in _kinds_of(end, ":s", catalog))
+    return f"""(
+    SELECT min(":c"."{column}")
+    FROM "lane_state" AS ":s", "frame" AS ":f", "map_course" AS ":c"
+    WHERE ":s"."frame_id" = {frame} AND ":s"."node_id" = {end.node} AND ":s"."is_primary"{more}
+      AND ":f"."frame_id" = {frame} AND ":c"."map_id" = ":f"."map_id" AND ":c"."lane" = ":s"."lane"
+      AND greatest(CAST(":s"."along" AS DOUBLE), 0) >= ":c"."start"
+      AND (":c"."end" IS NULL OR CAST(":s"."along" AS DOUBLE) < ":c"."end")
+  )"""  # noqa: S608  columns that the compiler named
+
+
+def told_lanes(what: str) -> str:
+    """The statement for the traces whose map tells of lanes: ``ways``, ``curvature``, ``slope``."""
+    known = "" if what == "ways" else f' AND ":c"."{what}" IS NOT NULL'
+    table = "map_reach" if what == "ways" else "map_course"
+    return (
+        'SELECT ":t"."trace_id" FROM "trace" AS ":t" WHERE EXISTS '  # noqa: S608  words of ours
+        f'(SELECT NULL FROM "{table}" AS ":c" WHERE ":c"."map_id" = ":t"."map_id"{known})'
+    )
 
 
 def _stretches(frame: str, end: WayEnd, catalog: Catalog, *, parts: bool) -> str:

@@ -28,6 +28,8 @@ from sgstore.opendrive._document import (
 from sgstore.roads import Ribbons
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from sgstore.opendrive._document import Document
     from sgstore.world import Bools, Codes, Floats, Ints
 
@@ -700,6 +702,35 @@ def surface(document: Document, lanes: LaneTable, plan: PlanView) -> Ribbons:
     document.accuse("road", roads, f"reaches farther than {MAX_COORDINATE:.0e} m from the origin")
     document.settle()
     return ribbons
+
+
+def heights(
+    document: Document, lanes: LaneTable, ribbons: Ribbons
+) -> Callable[[Ints, Floats], Floats] | None:
+    """The function from lanes, and places along them, to heights there; m. ``None``: no road has any.
+
+    Between cross sections a lane is straight, which is good enough for its height, but not for its slope.
+    ``ribbons`` may be of more lanes, which are of no road.
+    """
+    kind = "road/elevation"
+    road, at, cubics = (
+        document[kind].road,
+        document.numbers(kind, "s"),
+        coefficients_of(document, kind),
+    )
+    if not len(road):
+        return None
+
+    def height(lane: Ints, along: Floats) -> Floats:
+        found = ribbons.height(lane, along)
+        rows = np.flatnonzero(lane < len(lanes))
+        s = ribbons.between(lane[rows], along[rows], ribbons.s)
+        record = last_before(road, at, lanes.road[lane[rows]], s)
+        rows, s, record = rows[record >= 0], s[record >= 0], record[record >= 0]
+        found[rows] = cubic(cubics[record], np.maximum(s - at[record], 0.0))
+        return found
+
+    return height
 
 
 def _cross_sections(

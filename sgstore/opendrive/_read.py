@@ -27,7 +27,7 @@ from sgstore.columns import chained
 from sgstore.config import Signs
 from sgstore.errors import MapError
 from sgstore.opendrive._document import Document, Record, Spoiled, read_document
-from sgstore.opendrive._lanes import odd_sections, read_lanes, read_plan_view, surface
+from sgstore.opendrive._lanes import heights, odd_sections, read_lanes, read_plan_view, surface
 from sgstore.opendrive._network import (
     FIRST_LANE,
     Network,
@@ -48,6 +48,7 @@ from sgstore.roads import (
     RoadMap,
     edges_of,
     is_lane_text,
+    lane_courses,
     plain_nodes,
     read_lane_text,
     ribbons_of,
@@ -168,12 +169,13 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
     shapes[len(nodes) - len(beside) :] = beside
     document.settle()
     signal, lane, s = signals.places(first_signal)
+    every = ribbons.followed_by(spaces)
     return RoadMap(
         name=name or _header_name(document) or _short_digest(text),
         text=text,
         nodes=nodes,
         edges=edges_of(edges),
-        ribbons=ribbons.followed_by(spaces),
+        ribbons=every,
         shapes=shapes,
         lane_changes=lane_changes,
         road_types=road_types(document),
@@ -182,6 +184,7 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
         warnings=[*odd_sections(document), *network.warnings],
         stops=(signal, lane, ribbons.along_at(lane, s)),
         stop_lines=signals.stop_lines(first_signal),
+        courses=lane_courses(every, heights(document, lanes, every)),
         variant=signals.told,
     )
 

@@ -11,16 +11,20 @@ from ._table import pair_sql as pair_sql
 from ._table import pairs_view as pairs_view
 from ._table import parts_of as parts_of
 from ._table import stage_of as stage_of
+from ._ways import COURSES as COURSES
 from ._ways import LANE_DIST as LANE_DIST
 from ._ways import NEXT_PARTS as NEXT_PARTS
+from ._ways import OF_ONE as OF_ONE
 from ._ways import PART_DIST as PART_DIST
 from ._ways import WAYS as WAYS
 from ._ways import as_written as as_written
 
 __all__ = [
     "COLUMNS",
+    "COURSES",
     "LANE_DIST",
     "NEXT_PARTS",
+    "OF_ONE",
     "PAIR_FUNCTIONS",
     "PART_DIST",
     "PairFunction",

@@ -1,4 +1,4 @@
-"""Distances along the lanes, which are no expressions: they are looked up, by lanes and ways between them."""
+"""What is told by lanes, and is no expression but looked up: distances along them, and how they run."""
 
 from __future__ import annotations
 
@@ -23,11 +23,16 @@ NEXT_PARTS: Final[Mapping[str, str]] = {
 }
 """Functions of one entity → the sort of the part of the map that comes next along the lanes."""
 
-WAYS: Final = frozenset({LANE_DIST, PART_DIST, *NEXT_PARTS})
+COURSES: Final = ("curvature", "slope")
+"""Functions of one entity that tell how the lane runs where it is: columns of ``map_course``."""
+
+WAYS: Final = frozenset({LANE_DIST, PART_DIST, *NEXT_PARTS, *COURSES})
+OF_ONE: Final = (*NEXT_PARTS, *COURSES)
+"""Those of one entity, which stands for both of a pair."""
 
 
 def as_written(name: str, a: str, b: str) -> str:
     """A number of a pair as the language has it, given the names of both entities."""
-    if name in NEXT_PARTS:
+    if name in OF_ONE:
         return f"{name}({a})"
     return f"{LANE_DIST if name == PART_DIST else name}({a}, {b})"

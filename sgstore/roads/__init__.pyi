@@ -1,5 +1,7 @@
 # The face of this package: what others may import from it.
 
+from ._courses import LaneCourses as LaneCourses
+from ._courses import lane_courses as lane_courses
 from ._drawn import DrawnOutlines as DrawnOutlines
 from ._drawn import drawn_outlines as drawn_outlines
 from ._lanes import Sections as Sections
@@ -60,6 +62,7 @@ __all__ = [
     "Edge",
     "Joint",
     "LaneChanges",
+    "LaneCourses",
     "LaneHits",
     "LaneLine",
     "LanePoints",
@@ -85,6 +88,7 @@ __all__ = [
     "edges_of",
     "first_sections",
     "is_lane_text",
+    "lane_courses",
     "lane_text",
     "lanes_ref",
     "mean_widths",

@@ -14,6 +14,7 @@ import numpy as np
 import shapely
 
 from sgstore.columns import chained
+from sgstore.roads._courses import lane_courses
 from sgstore.roads._map import STOREY, LaneChanges, MapEdges, MapNodes, RoadMap, turn_words
 from sgstore.roads._ribbons import Ribbons, conflicts, mean_widths, turned, wrapped
 from sgstore.vocabulary import DRIVING, RELATION_CODE
@@ -164,6 +165,8 @@ def road_map_of(
         warnings=warnings,
         stops=_stops(signals, first),
         stop_lines=np.array([first + r for r, s in enumerate(signals) if s.is_stop_line], np.int64),
+        # Formats of lanes as lines have 0 where a point has no height.
+        courses=lane_courses(ribbons, ribbons.height if ribbons.z.any() else None),
     )
 
 

@@ -15,6 +15,7 @@ import shapely
 from numpy.typing import NDArray
 
 from sgstore.columns import taken
+from sgstore.roads._courses import LaneCourses
 from sgstore.roads._footprints import LaneIndex
 from sgstore.roads._places import (
     STOP_LINE,
@@ -286,6 +287,7 @@ class RoadMap:
         Signals, as columns among the nodes, lanes that they apply to, counted from 0, and where along these; m.
     stop_lines : (n,) int64, optional
         Columns of the signals that are painted stop lines.
+    courses : LaneCourses, optional
     variant : str, optional
         In what it differs from the map that the text alone describes.
 
@@ -305,6 +307,8 @@ class RoadMap:
         The surface of the lanes. Lane i of it, and wherever lanes are counted from 0, has node id -2 - i.
     lane_changes : LaneChanges
         Where along their lanes the ``laneChange`` edges hold.
+    courses : LaneCourses
+        Curvature and slope of the lanes, metre by metre. Of a map without sections there are none.
     road_types : mapping of str to tuple of (float, str)
         Id of a road → what it is (``town``, ``motorway``, …) from which place along its reference line on; m.
     junction_types : mapping of str to str
@@ -334,6 +338,7 @@ class RoadMap:
         warnings: Iterable[str] = (),
         stops: tuple[Ints, Ints, Floats] | None = None,
         stop_lines: Ints | None = None,
+        courses: LaneCourses | None = None,
         variant: str = "",
     ) -> None:
         self.name = name
@@ -351,6 +356,7 @@ class RoadMap:
         nothing = np.zeros(0, np.int64)
         self._stops = stops or (nothing, nothing, np.zeros(0))
         self._stop_lines = nothing if stop_lines is None else stop_lines
+        self.courses = courses or LaneCourses.none()
         self._variant = variant
         self._lanes = len(ribbons.offsets) - 1
 

@@ -72,6 +72,31 @@ class Ribbons:
         """(S,) int64: the lane that each cross section belongs to."""
         return np.repeat(np.arange(len(self)), np.diff(self.offsets))
 
+    @property
+    def bends(self) -> Floats:
+        """(S,) float64: by how much the centre line turns up to the next cross section; rad.
+
+        0 where the lane jumps, and at its end.
+        """
+        before = np.arange(len(self.along) - 1)
+        first, last, _ = self._turns(before)
+        bend = np.where(_is_smooth(first, last), wrapped(np.diff(self.heading)), 0.0)
+        bend = np.append(bend, 0.0)
+        bend[self.offsets[1:] - 1] = 0.0
+        return bend
+
+    def between(self, lane: Ints, along: Floats, column: Floats) -> Floats:
+        """Values at places on lanes of what is known at the cross sections, in between in proportion.
+
+        ``lane`` and ``along`` as :meth:`at` takes them.
+        """
+        before, share = self._place(self.along, np.ones(len(self)), lane, along)
+        return column[before] + share * (column[before + 1] - column[before])
+
+    def height(self, lane: Ints, along: Floats) -> Floats:
+        """Heights at places on lanes; m."""
+        return self.between(lane, along, self.z)
+
     def at(self, lane: Ints, along: Floats) -> LanePoints:
         """Points of centre lines.
 
@@ -90,11 +115,9 @@ class Ribbons:
         before, share = self._place(self.along, np.ones(len(self)), lane, along)
         after = before + 1
         x, y = (self.left_x + self.right_x) / 2, (self.left_y + self.right_y) / 2
-        run_x, run_y = x[after] - x[before], y[after] - y[before]
-        chord = np.arctan2(run_y, run_x)
-        first, last = wrapped(self.heading[before] - chord), wrapped(self.heading[after] - chord)
+        first, last, (run_x, run_y) = self._turns(before)
         # A step across, where the lane jumps, has no bulge.
-        smooth = (np.abs(first) < 1) & (np.abs(last) < 1)
+        smooth = _is_smooth(first, last)
         aside = np.where(smooth, share * (1 - share) * (first * (1 - share) - last * share), 0.0)
         width = np.hypot(self.left_x - self.right_x, self.left_y - self.right_y)
         bend = wrapped(self.heading[after] - self.heading[before])
@@ -110,6 +133,15 @@ class Ribbons:
             width=width[before] + share * (width[after] - width[before]),
             curvature=np.where(smooth & (length > 0), bend / np.where(length > 0, length, 1), 0.0),
         )
+
+    def _turns(self, before: Ints) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
+        """Headings at cross sections and at those behind them less the direction between; the way there."""
+        after = before + 1
+        x, y = (self.left_x + self.right_x) / 2, (self.left_y + self.right_y) / 2
+        way = x[after] - x[before], y[after] - y[before]
+        chord = np.arctan2(way[1], way[0])
+        first, last = (wrapped(self.heading[rows] - chord) for rows in (before, after))
+        return first, last, way
 
     def along_at(self, lane: Ints, s: Floats) -> Floats:
         """(N,) float64: lengths of the centre lines up to places ``s`` of their roads; m."""
@@ -166,6 +198,11 @@ class LanePoints:
 
     def __len__(self) -> int:
         return len(self.lane)
+
+
+def _is_smooth(first: Floats, last: Floats) -> Bools:
+    """Where a lane does not jump: its headings are about those of the way between two cross sections."""
+    return (np.abs(first) < 1) & (np.abs(last) < 1)
 
 
 def wrapped(angle: Floats) -> Floats:

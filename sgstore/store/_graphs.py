@@ -121,6 +121,7 @@ _MAP_REACH: Final = "SELECT src, dst, start FROM map_reach WHERE map_id = $map_i
 _MAP_PLACES: Final = (
     'SELECT node_id, what, lane, start, "end" FROM map_place WHERE map_id = $map_id'
 )
+_MAP_COURSES: Final = "SELECT lane, start, curvature, slope FROM map_course WHERE map_id = $map_id"
 
 FIRST: Final = 2_000
 """Frames of any traces that are read first; then as many as have about so many edges together:"""
@@ -364,7 +365,8 @@ def _map_records(connection: DuckDBPyConnection, map_id: int) -> MapRecords:
     )
     relation = codes_of(connection, "relation")[edges["relation"]]
     parts = connection.execute(_MAP_PLACES, where).fetchall()
-    starts = LaneDistances(along, other, reach["start"].astype(np.float64), parts)
+    courses = connection.execute(_MAP_COURSES, where).fetchall()
+    starts = LaneDistances(along, other, reach["start"].astype(np.float64), parts, courses)
     return MapRecords(nodes.__getitem__, src, relation, dst, starts)
 
 

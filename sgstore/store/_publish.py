@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 SHARED: Final = {
     "recording": ("recording",),
     "config": ("config",),
-    "map": ("map", "map_node", "map_edge", "map_reach", "map_place"),
+    "map": ("map", "map_node", "map_edge", "map_reach", "map_place", "map_course"),
 }
 """Tables of what many traces may have: it comes into a store once, and is known there by its digest."""
 

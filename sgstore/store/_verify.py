@@ -240,6 +240,14 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
         LEFT JOIN map_node b ON b.map_id = p.map_id AND b.node_id = p.lane
         WHERE a.kind IS NULL OR b.kind IS DISTINCT FROM 'lane'""",
     ),
+    (
+        "map",
+        "a course of a lane of a map is of what is no lane",
+        """
+        SELECT NULL FROM map_course c
+        LEFT JOIN map_node n ON n.map_id = c.map_id AND n.node_id = c.lane
+        WHERE n.kind IS DISTINCT FROM 'lane'""",
+    ),
 )
 """What is looked at, what is wrong where a statement gives rows, and that statement: ids of traces at fault."""
 

@@ -391,7 +391,7 @@ def _map_tables(road_map: RoadMap) -> dict[str, Columns]:
     columns |= {"node_id": -1 - np.arange(count), "kind": nodes.kind}
     edges, kind = road_map.edges, road_map.nodes.kind
     src, dst, start = road_map.reach
-    places = road_map.places
+    places, courses = road_map.places, road_map.courses
     return {
         "map": {name: texts([getattr(road_map, name)]) for name in ("digest", "name", "text")},
         "map_node": columns,
@@ -409,5 +409,12 @@ def _map_tables(road_map: RoadMap) -> dict[str, Columns]:
             "lane": -2 - places.lane,
             "start": places.start,
             "end": places.end,
+        },
+        "map_course": {
+            "lane": -2 - courses.lane,
+            "start": courses.start,
+            "end": courses.end,
+            "curvature": courses.curvature,
+            "slope": courses.slope,
         },
     }

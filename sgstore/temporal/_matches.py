@@ -6,7 +6,15 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from sgstore.lang import MOTION, TOLD_WEATHER, of_query, told_events, traces_with, with_places
+from sgstore.lang import (
+    MOTION,
+    TOLD_WEATHER,
+    of_query,
+    told_events,
+    told_lanes,
+    traces_with,
+    with_places,
+)
 from sgstore.lang.ir import BlockValue, OverMatch, walk
 from sgstore.matches import Matches
 
@@ -31,7 +39,7 @@ def lacking(file: StoreFile, catalog: Catalog, needs: Iterable[Need]) -> dict[in
     found: dict[int, list[str]] = {}
     every = frozenset(trace.trace_id for trace in catalog.traces)
     for need in needs:
-        key = catalog.name, need.kinds, need.attribute, need.event
+        key = catalog.name, need.kinds, need.attribute, need.event, need.lanes
         if key not in catalog.lacks:
             catalog.lacks[key] = every - _knowing(file, every, need)
         for trace in catalog.lacks[key]:
@@ -43,6 +51,8 @@ def _knowing(file: StoreFile, every: frozenset[int], need: Need) -> frozenset[in
     """The traces that know it, or have nothing of which it could be known."""
     if need.event:
         return frozenset(trace for (trace,) in file.rows(told_events(need.event)).values)
+    if need.lanes:
+        return frozenset(trace for (trace,) in file.rows(told_lanes(need.lanes)).values)
     if need.kinds is None:
         assert need.attribute is not None  # noqa: S101 - of a frame something is known
         (word,) = need.attribute.columns.values()

@@ -434,6 +434,8 @@ class _PendingEvents:
     def _told(self, need: Need, people: NodeNames) -> bool:
         if need.event:
             return people.records(need.event)
+        if need.lanes:
+            return people.has_lanes(need.lanes)
         if need.kinds is None:
             return False  # nobody tells it while a trace goes on
         present = people.of(need.kinds)

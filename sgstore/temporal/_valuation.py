@@ -242,6 +242,11 @@ class NodeNames:
         """Tell whether the trace says of events of a kind that they happen, or do not."""
         return kind in self._view.graph.events
 
+    def has_lanes(self, what: str) -> bool:
+        """Tell whether the map tells of lanes: ``ways``, ``curvature``, ``slope``."""
+        reach = self._view.graph.reach
+        return reach is not None and reach.tells(what)
+
     def name(self, node: int) -> str:
         """Return the name of a node."""
         return str(self._view.nodes[node].get("name", node))
