@@ -24,20 +24,23 @@ from oracle import (
     difference,
     free_names,
     named_nodes,
+    relations_of,
     shown,
     try_each,
 )
 from oracle_after import is_counted, rounded, said
+from oracle_over_time import graph_of
 from oracle_patterns import Writer
 
-from sgstore.lang import parse
+from sgstore.lang import FrameView, StageSearch, bind_query, parse
 from sgstore.lang import syntax as s
+from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from oracle import Binding, Compared
-    from oracle_worlds import World
+    from oracle_worlds import Frame, World
 
 
 class Row(Search):
@@ -487,16 +490,94 @@ def disagreement_of_matches(text: str, world: World) -> tuple[str, int]:
     return ("" if many == frames else f"{many} frames, wanted {frames}"), frames
 
 
+def in_memory(text: str, world: World) -> tuple[str, int]:
+    """The same of what is returned of each match, by the search of one graph after another."""
+    query = bind_query(text, parse(text), world.catalog, {})
+    if query.result.aggregated or not query.stages:
+        return "", 0
+    search, found = StageSearch(query), Counter[tuple[Any, ...]]()
+    values = [search.value(column.value) for column in query.result.columns]
+    match = parse(text)[-1]
+    for frame in answering(match, world):
+        about = {"seq": frame.seq, "id": frame.frame_id}
+        view = FrameView(graph_of(frame), about, {"name": frame.trace.name})
+        told = (tuple(map(hashed, (value(row) for value in values))) for row in search.rows(view))
+        found.update(map(rounded, told))
+    wanted = returned(text, world)
+    if query.result.distinct:
+        found, wanted = (Counter(dict.fromkeys(rows, 1)) for rows in (found, wanted))
+    return ("" if found == wanted else difference("in memory", found, wanted)), len(wanted)
+
+
+def online(text: str, world: World) -> tuple[str, int]:
+    """The same of the frames in which matches begin, frame by frame."""
+    start, using, rest = text.partition("USING ")
+    text = f"USING UNKNOWN false, {rest}" if using else f"USING UNKNOWN false {start}"
+    if "EGO '" in text:
+        return "", 0
+    match, many = parse(text)[-1], 0
+    assert isinstance(match, s.MatchClause)
+    for trace in world.traces:
+        frames = [replace(frame, seq=n) for n, frame in enumerate(trace.frames)]
+        rows: dict[int, dict[Any, list[Any]]] = {n: {} for n in range(-1, len(frames))}
+        for row in rows_of(match, replace(world, traces=[replace(trace, frames=frames)]), text):
+            told = tuple(sorted((n, shown_node(v)) for n, v in row.binding.items() if n[:1] != "#"))
+            rows[row.frame.seq].setdefault(told, []).append(rounded(tuple(row.passed.values())))
+        wanted = Counter(begun_in(frames, rows))
+        monitor, found = Monitor(text, trace=trace.name, period_s=0.1), Counter[tuple[Any, ...]]()
+        for n, frame in enumerate(frames):
+            for event in monitor.look([graph_of(frame)]):
+                found[event.start.seq, tuple(sorted(event.nodes.items()))] += 1
+                known = [values for some in rows[n].values() for values in some]
+                passed = rounded(tuple(event.values.values()))
+                if sorted(map(str, passed)) not in [sorted(map(str, one)) for one in known]:
+                    return f"frame {n}: {event.values}, wanted one of {known}", 0
+        if found != wanted:
+            return difference(f"online {trace.name}", found, wanted), 0
+        many += sum(wanted.values())
+    return "", many
+
+
+def begun_in(frames: list[Frame], rows: dict[int, dict[Any, Any]]) -> Iterator[tuple[Any, ...]]:
+    """The first frame of each run in which something is bound, and its nodes."""
+    for n, frame in enumerate(frames):
+        gap = n == 0 or frame.time_ns - frames[n - 1].time_ns > 250_000_000
+        for told in rows[n]:
+            if gap or told not in rows[n - 1]:
+                yield n, tuple((k, v) for k, v in told if isinstance(v, int) and k != "ego")
+
+
+def all_agree(compared: list[Compared], world: World) -> tuple[str, int]:
+    """The first difference that some comparisons tell; how much the first of them found."""
+    found = [one(world) for one in compared]
+    return next((problem for problem, _ in found if problem), ""), found[0][1]
+
+
+def shown_node(value: Any) -> Any:
+    """What a name is bound to: a node, the relation of an edge in brackets, or nothing."""
+    return f"[{value.relation}]" if isinstance(value, Edge) else "" if value is None else value
+
+
+def answering(match: Any, world: World) -> Iterator[Frame]:
+    """The frames of the traces that can answer a query."""
+    needed = {name.lower() for name in relations_of(match)}
+    for frame in world.frames:
+        if needed <= {name.lower() for name in frame.trace.answers}:
+            yield frame
+
+
 def try_many_parts(first: int, count: int) -> Counter[str]:
-    """Random queries on random worlds."""
+    """Random queries on random worlds, by SQL, in memory, and frame by frame."""
 
     def made(number: int) -> tuple[str, Compared]:
         writer = PartsWriter(number)
         text = writer.whole()
-        if number % 3:
-            text += writer.told()
-            return text, partial(disagreement_of_parts, text)
-        return text, partial(disagreement_of_matches, text)
+        bare = [partial(online, text)]
+        if number % 3 == 0:
+            return text, partial(all_agree, [partial(disagreement_of_matches, text), *bare])
+        text += writer.told()
+        told = [partial(one, text) for one in (disagreement_of_parts, in_memory)]
+        return text, partial(all_agree, told + bare)
 
     return try_each(first, count, made)
 

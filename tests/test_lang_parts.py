@@ -12,9 +12,9 @@ from recordings import Recorder, car
 from thorough import LONG
 
 from sgstore.cli import run as run_verb
-from sgstore.errors import QueryError
 from sgstore.ingest import ingest
 from sgstore.query import Store
+from sgstore.step import Frame
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
 
 
 def test_what_is_absent_is_null_in_every_form(store: Store, tmp_path: Path) -> None:
-    text = "MATCH (e:Ego) OPTIONAL MATCH (v:Car) WHERE v.x - e.x > 30"
+    text = "MATCH (e:Ego) OPTIONAL MATCH (v:Car) WHERE v.x - e.x > 20"
     matches = store.find(text)
 
     assert matches.count() == len(matches.rows()) == 20
@@ -145,7 +145,25 @@ def test_why_not_and_explain_speak_of_the_parts(store: Store) -> None:
     assert "with each e, count(v) AS n\n  where (n > 1)" in explained
 
 
-def test_a_monitor_refuses_parts() -> None:
-    for text in ("MATCH (e:Ego) OPTIONAL MATCH (v:Car)", "MATCH p = (e:Ego)-[:near]->(v)"):
-        with pytest.raises(QueryError, match="a monitor tells when a pattern is there"):
-            Monitor(text)
+def test_a_monitor_tells_when_rows_of_parts_begin() -> None:
+    """Three cars stand behind one another; in the third frame one is gone, and another far away."""
+    monitor = Monitor(
+        "MATCH (e:Ego) OPTIONAL MATCH (v:Car) WHERE v.x - e.x > 20;"
+        "MATCH (e:Ego), (v:Car) WITH e, COUNT(v) AS many WHERE many > 1;"
+        "MATCH p = (e:Ego)-[:super_near*1..2]->(v:Car) RETURN length(p) AS edges, nodes(p) AS ids"
+    )
+    told = list[tuple[int, str, dict[str, str], dict[str, object]]]()
+    for number, places in enumerate(((0, 7, 14), (0, 7, 14), (0, 50))):
+        frame = Frame(time_ns=number * 100_000_000, ego="c0")
+        for who, x in enumerate(places):
+            frame.add(f"c{who}", "car", float(x), 0.0, 0.0, heading=0.0, length=4.5, vx=1.0)
+        for event in monitor.step(frame):
+            told.append((number, event.name[-1], dict(event.names), dict(event.values)))
+
+    assert told == [
+        (0, "1", {"e": "car 0"}, {}),
+        (0, "2", {"e": "car 0"}, {"many": 2}),
+        (0, "3", {"e": "car 0", "v": "car 1"}, {"edges": 1, "ids": [0, 1]}),
+        (0, "3", {"e": "car 0", "v": "car 2"}, {"edges": 2, "ids": [0, 1, 2]}),
+        (2, "1", {"e": "car 0", "v": "car 1"}, {}),
+    ]

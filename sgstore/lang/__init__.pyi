@@ -82,6 +82,7 @@ from ._results import about_frame as about_frame
 from ._rewrite import rewritten as rewritten
 from ._search import ScopeSearch as ScopeSearch
 from ._search import expression as expression
+from ._stage_search import StageSearch as StageSearch
 from ._table_function import PatternTable as PatternTable
 from ._table_function import pattern_tables as pattern_tables
 from ._union import UnionParts as UnionParts
@@ -138,6 +139,7 @@ __all__ = [
     "Pruning",
     "RelationScope",
     "ScopeSearch",
+    "StageSearch",
     "SqlStatement",
     "TOLD_WEATHER",
     "TRACES",

@@ -234,6 +234,8 @@ class Binding:
     nodes : dict of str to int
         Node ids by key; only those of the keys that the search has come to mean something.
     edges : dict of str to (relation, attributes)
+    passed : dict of str to value
+        What ``WITH`` passed on, and paths, by the names of what stands for them.
     """
 
     view: FrameView
@@ -241,6 +243,7 @@ class Binding:
     edges: dict[str, tuple[str, Attributes]] = field(
         default_factory=dict[str, "tuple[str, Attributes]"]
     )
+    passed: dict[str, Any] = field(default_factory=dict[str, Any])
 
 
 Evaluate = Callable[[Binding], Any]
@@ -288,6 +291,8 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
             return lambda at: at.view.class_in(name)
         case b.FrameAttribute(attribute=attribute):
             name = attribute.name
+            if b.is_passed_on(expression):
+                return lambda at: at.passed[name]
             return lambda at: at.view.frame.get(name)
         case b.TraceAttribute(attribute=attribute):
             name = attribute.name

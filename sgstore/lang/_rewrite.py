@@ -114,7 +114,7 @@ def _staged(query: Query, catalog: Catalog) -> Query:
     for stage in query.stages:
         if isinstance(stage, MatchStage):
             ways: list[PathWay] = []
-            for way in _ways(stage, injective=query.injective):
+            for way in path_ways(stage, injective=query.injective):
                 alone = replace(query, scope=way.scope, result=Result(), stages=())
                 ways.append(replace(way, scope=_ruled(alone, catalog).scope))
             own = _kinds_in([way.scope for way in ways])
@@ -142,7 +142,7 @@ def _staged(query: Query, catalog: Catalog) -> Query:
     return replace(query, scope=scope, result=values(query.result), stages=tuple(stages))
 
 
-def _ways(stage: MatchStage, *, injective: bool) -> Iterator[PathWay]:
+def path_ways(stage: MatchStage, *, injective: bool) -> Iterator[PathWay]:
     """The pattern of a stage, once for all the lengths that its paths with names may have."""
     edges = {edge.key: edge for edge in stage.scope.edges}
     repeated = [edges[key] for path in stage.paths for key, _ in path.edges if edges[key].high > 1]

@@ -488,14 +488,6 @@ def _bound(
             defined.append(one)
         elif isinstance(one, MatchClause):
             query = bind_query(text, [*defined, one], catalog, given([*defined, one]))
-            if query.stages:
-                raise QueryError(
-                    "a monitor tells when a pattern is there; OPTIONAL MATCH, WITH and paths with names"
-                    " are about its rows",
-                    text=text,
-                    span=one.later[0].span if one.later else one.block.span,
-                    hint="they are asked of a store, by find; EXISTS {…} and COUNT {…} can be watched",
-                )
             queries.append(query)
     return checks, queries
 

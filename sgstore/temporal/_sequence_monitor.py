@@ -306,12 +306,18 @@ class SequenceMonitor:
         nodes, edges = tied_in_steps(query)
         self._tied = frozenset({*self._named, *nodes})
         self._edges = frozenset({*(e.key for e in query.scope.edges if e.named), *edges})
-        asks = asks_of_steps(query, self._steps, self._tied)
-        self._asks = [(questions.add(ask), ask.columns) for ask in asks]
+        if query.stages:
+            bound = (*self._named, *sorted(self._edges))
+            self._asks = [(questions.add_parts(query, bound), bound)]
+        else:
+            asks = asks_of_steps(query, self._steps, self._tied)
+            self._asks = [(questions.add(ask), ask.columns) for ask in asks]
         self._conditions = _Conditions(query, self._steps, questions, pulse)
         self._columns = [self._projected(number) for number in range(len(self._steps))]
         self._held: list[dict[Key, StepState]] = [{} for _ in self._steps]
-        self._apart = self._tied if query.injective else frozenset[str]()
+        # Parts have seen to it which nodes differ; several may be absent.
+        differ = query.injective and not query.stages
+        self._apart = self._tied if differ else frozenset[str]()
         self._told: dict[tuple[int, ...], int] = {}
         self._over: set[tuple[int, ...]] = set()
         self._names: dict[int, str] = {}
@@ -546,7 +552,9 @@ class SequenceMonitor:
         way, binding, places = found
         happen = self._happen[way]
         steps = tuple(self._moment(place) for place in places)
-        nodes = {name: node for name, node in binding.items() if name in self._named}
+        bound: dict[str, Any] = binding  # of parts, some may be absent
+        known = {name: node for name, node in bound.items() if node is not None}
+        nodes = {name: node for name, node in known.items() if name in self._named}
         names = {name: self._names.get(node, str(node)) for name, node in nodes.items()}
 
         def part(value: OverMatch) -> Any:
@@ -558,6 +566,9 @@ class SequenceMonitor:
             return steps[happen.index(step)].t if step in happen else None
 
         values = self._returned.told(part, seconds)
+        if self.query.stages:
+            question, keys = self._asks[0]
+            values = self._questions.answers[question][tuple(binding[name] for name in keys)]
         about = here, steps[0], steps[-1], nodes, names, steps
         return MonitorEvent("found", self.name, *about, values=values)
 

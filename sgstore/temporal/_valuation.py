@@ -24,6 +24,7 @@ from sgstore.lang import (
     Binding,
     Column,
     ScopeSearch,
+    StageSearch,
     expression,
     unnumbered_text,
     value_text,
@@ -283,6 +284,28 @@ class QueryCache:
             self._all.append(answerer(ask))
         return self._known[key]
 
+    def add_parts(self, query: b.Query, keys: tuple[str, ...]) -> int:
+        """The number of the question for the rows of a query in several parts.
+
+        The bindings of the named nodes and edges are told, each with what its first row returns.
+        """
+        search = StageSearch(query)
+        returned = (
+            {} if query.result.aggregated else {c.name: c.value for c in query.result.columns}
+        )
+        values = [(name, search.value(value)) for name, value in returned.items()]
+
+        def found(view: FrameView, _: NodeNames) -> Mapping[Key, Any]:
+            told = dict[Key, Any]()
+            for row in search.rows(view):
+                key = tuple(_place(row, name) for name in keys)
+                if key not in told:
+                    told[key] = {name: value(row) for name, value in values}
+            return told
+
+        self._all.append(found)
+        return len(self._all) - 1
+
     def ask(self, view: FrameView, people: NodeNames) -> None:
         """Ask them all of a graph."""
         self.fresh.clear()
@@ -292,6 +315,13 @@ class QueryCache:
                 known.update((node, people.name(node)) for node in present - known.keys())
                 self.fresh.add(kinds)
         self.answers = [answers(view, people) for answers in self._all]
+
+
+def _place(row: Binding, name: str) -> Any:
+    """The node, or the place of the relation, that a name is bound to; ``None``: it is absent."""
+    if name in row.nodes:
+        return row.nodes[name]
+    return row.edges[name] and RELATIONS.index(row.edges[name][0])
 
 
 def _told(query: b.Query) -> tuple[Any, ...]:
