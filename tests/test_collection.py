@@ -371,6 +371,20 @@ def test_sql_is_asked_of_each_bundle_or_refused(whole: Collection, path: Path) -
     assert {row[0] for row in rows} == set(whole.bundles())
 
 
+def test_a_statement_of_a_users_sees_no_other_bundle(whole: Collection, place: Path) -> None:
+    list(whole.find("MATCH (a:Car)"))  # all bundles are open in this process
+    other = whole.bundles()[1]
+
+    seen = "SELECT database_name FROM duckdb_databases() WHERE NOT internal"
+    assert sorted(whole.sql(seen, each=True)) == sorted((b, b) for b in whole.bundles())
+    for table in (
+        f'"file {other}.sgstore".inside.trace',
+        f"read_blob('{place / 'bundles' / other}.sgstore')",
+    ):
+        with pytest.raises(PartialAnswerError):
+            list(whole.sql(f"SELECT count(*) FROM {table}", each=True))
+
+
 RULES = {
     "Result": parts.MERGED,
     "Query": {

@@ -165,14 +165,14 @@ _catalogs: Final[dict[tuple[Path, str], tuple[Catalog, Catalog]]] = {}
 
 @contextmanager
 def _opened(task: dict[str, Any], held: Path) -> Generator[StoreFile]:
-    """The bundle, open, with the tables beside it."""
+    """The bundle, open, with the tables beside it; alone, if a statement of a user's is to see it."""
     if task["bundle"] == EMPTY:
         path = held / "empty.sgstore"
         StoreFile.create(path).close()
     else:
         path = bundle_path(place_at(task["url"]), task["bundle"])
     given = _tables_of(task, held)
-    if given or task["bundle"] == EMPTY:
+    if given or task["kind"] == "sql" or task["bundle"] == EMPTY:
         file = StoreFile(path, tables=UserTables(given) if given else None)
         with file.snapshot():
             yield file

@@ -311,7 +311,8 @@ class Access:
     ----------
     together : bool
         Whether the file is attached to an instance of the database that this process has for all files of its
-        folder: that takes a quarter of the time. Users' statements may then read the other files of the folder.
+        folder: that takes a quarter of the time. It is for statements of ours: one of a user's could read the
+        other files.
     root : str, Path or None
         Where the recordings of the data set are now; see :func:`sgstore.store._traces.located`.
     """
@@ -425,10 +426,11 @@ class Access:
             _pass_gate(self.path, deadline)
         with file.changed:
             free = file.changed.wait_for(
-                lambda: not file.writing and (file.mine or not file.waiting), deadline.left()
+                lambda: not file.writing and (file.mine or not file.waiting) and self._is_fit(file),
+                deadline.left(),
             )
             if not free:
-                raise StoreError(f"{self.path}: another thread has been writing for too long")
+                raise StoreError(f"{self.path}: another thread has been using it for too long")
             settings = self._memory, self._spill, file.careful, self.together
             file.refresh(settings, None if self._tables is None else tables_folder())
             try:
@@ -456,6 +458,10 @@ class Access:
             file.readers += 1
             file.mine += 1
             return connection
+
+    def _is_fit(self, file: OpenFile) -> bool:
+        """Whether nobody reads the file in an instance that sees other files than this one may."""
+        return not file.readers or self.together == isinstance(file.instance, AttachedFile)
 
     def _leave(self, connection: DuckDBPyConnection, *, failed: bool) -> None:
         file = self._file
