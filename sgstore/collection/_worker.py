@@ -10,8 +10,9 @@ import base64
 import json
 import secrets
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import cache, lru_cache
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -20,6 +21,7 @@ from sgstore.collection._place import place_at
 from sgstore.errors import StoreError
 from sgstore.files import working_folder
 from sgstore.lang import Compiled, Type, parted
+from sgstore.matches import Interval
 from sgstore.query import UserStatement, matches_of
 from sgstore.store import (
     PartFile,
@@ -30,16 +32,16 @@ from sgstore.store import (
     write_part,
     write_rows,
 )
-from sgstore.temporal import CheckRun, TemporalMatches, Verdict
+from sgstore.temporal import CheckRun, Robustness, TemporalMatches, Verdict, Witness
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Mapping
 
     from sgstore.lang import Catalog
-    from sgstore.matches import Interval, Matches
+    from sgstore.matches import Matches
 
-KEPT: Final = 16
-"""Bundles that a process remembers."""
+KEPT: Final = 128
+"""Bundles that a process remembers, and keeps open."""
 
 EMPTY: Final = ""
 """The name of the bundle that has nothing: it is asked where no other one is, to know the columns."""
@@ -184,7 +186,7 @@ def _opened(task: dict[str, Any], held: Path) -> Generator[StoreFile]:
 
 @lru_cache(maxsize=KEPT)
 def _kept(path: Path) -> StoreFile:
-    """A bundle that was asked lately: its file stays open for a second, and what it holds is remembered."""
+    """A bundle that was asked lately: its file stays open, and what it holds is remembered."""
     return StoreFile.together(path)
 
 
@@ -225,45 +227,50 @@ def _check(
     path = to / f"{secrets.token_hex(8)}.ndjson"
     with path.open("w", encoding="utf-8") as lines:
         for verdict in run:
-            lines.write(json.dumps(verdict, default=_plain))
+            lines.write(json.dumps(_values_of(verdict), default=_plain))
             lines.write("\n")
     return {"lines": str(path)}
 
 
 def _plain(value: Any) -> Any:
-    """What JSON is to write of a part of a verdict, whose parts it then asks for."""
-    if is_dataclass(value):
-        return {name: getattr(value, name) for name in _names_of(type(value))}
-    return value.tolist()  # an array
+    """What JSON is to write of numpy."""
+    return value.tolist()
 
 
-@cache
-def _names_of(kind: type) -> tuple[str, ...]:
-    return tuple(one.name for one in fields(kind))
+def _getter(kind: type) -> Callable[[Any], tuple[Any, ...]]:
+    return attrgetter(*(one.name for one in fields(kind)))
 
 
-def as_verdict(values: dict[str, Any]) -> Verdict:
-    """The verdict that plain values describe."""
+_of_interval, _of_robustness = _getter(Interval), _getter(Robustness)
+
+
+def _values_of(verdict: Verdict) -> list[Any]:
+    """The values of a verdict in their order: with the name of each there were thrice as much to write."""
+    margin, witnesses = verdict.robustness, verdict.witnesses
+    return [
+        *(verdict.check, verdict.trace, verdict.verdict),
+        [*map(_of_interval, verdict.violations)],
+        [(w.nodes, w.names, w.holds, [*map(_of_interval, w.violations)]) for w in witnesses],
+        *(verdict.status, verdict.reason),
+        None if margin is None else _of_robustness(margin),
+    ]
+
+
+def as_verdict(values: list[Any]) -> Verdict:
+    """The verdict whose values these are."""
     from sgstore.arrays import np
-    from sgstore.temporal import Robustness, Witness
 
-    def intervals(told: list[dict[str, Any]]) -> tuple[Interval, ...]:
-        from sgstore.matches import Interval
-
-        return tuple(Interval(**one) for one in told)
-
-    witnesses = tuple(
-        Witness(**(one | {"violations": intervals(one["violations"])}))
-        for one in values["witnesses"]
+    check, trace, word, violations, witnesses, status, reason, margin = values
+    return Verdict(
+        check,
+        trace,
+        word,
+        tuple(Interval(*one) for one in violations),
+        tuple(Witness(*of, tuple(Interval(*one) for one in some)) for *of, some in witnesses),
+        None if status is None else np.array(status, np.int8),
+        reason,
+        None if margin is None else Robustness(*margin),
     )
-    status, margin = values["status"], values["robustness"]
-    made: dict[str, Any] = {
-        "violations": intervals(values["violations"]),
-        "witnesses": witnesses,
-        "status": None if status is None else np.array(status, np.int8),
-        "robustness": None if margin is None else Robustness(**margin),
-    }
-    return Verdict(**(values | made))
 
 
 def _classes(
@@ -372,7 +379,7 @@ _KINDS: Final[dict[str, Any]] = {
 def _carry(found: dict[str, Any]) -> None:
     """Put the content of files into a result that is read on another machine."""
     for part in found.get("parts", ()):
-        if not part["rows"]:
+        if not part["path"]:
             continue
         part["data"] = base64.b64encode(Path(part["path"]).read_bytes()).decode()
     if "lines" in found:

@@ -6,7 +6,8 @@ reads a file is kept for a while after a question. It is closed
 * at once, if a writer waits: one of this process says so itself; one of another process closes the *gate*
   beside the file (see :mod:`sgstore.store._locking`), and a thread of this process looks for it
   every :data:`LOOK_S` seconds while an instance is kept;
-* :data:`LEASE_S` seconds after the last question, so that other programs can have the file, too;
+* :data:`LEASE_S` seconds after the last question, so that other programs can have the file, too; but not a
+  bundle of a collection (:class:`AttachedFile`), which nobody ever writes to;
 * with the last object that reads the file, at the end of the process, and before it is forked.
 
 No answer comes from a file of before: an instance is used again only if the file is the same and as it was.
@@ -280,8 +281,9 @@ class _Watch:
         if not file.changed.acquire(blocking=False):
             return  # somebody comes or goes
         try:
-            late = time.monotonic() - file.used > LEASE_S
-            if late or not file.holders or _wanted(file.path):
+            bundle = isinstance(file.instance, AttachedFile)
+            late = not bundle and time.monotonic() - file.used > LEASE_S
+            if late or not file.holders or (not bundle and _wanted(file.path)):
                 file.close()
             if file.instance is None:
                 self.kept.discard(file)

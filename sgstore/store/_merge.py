@@ -1,4 +1,4 @@
-"""Answers of parts of a collection, which wait in Parquet files, as tables of one statement.
+"""Answers of parts of a collection, which wait in Parquet files or are a few rows, as tables of one statement.
 
 The statement is ours (:mod:`sgstore.lang._parts`): it puts rows in order, or groups what the parts have
 grouped. What does not fit into memory spills to disk.
@@ -38,12 +38,23 @@ if TYPE_CHECKING:
     from sgstore.store._file import StoreFile
     from sgstore.store._rows import Given, Parameters
 
+    Written = tuple[Path | None, tuple[str, ...], int, list[tuple[Any, ...]]]
+    """The file of a part, if there is one; types; number of rows; the rows, if they are few."""
+
 
 _EXACT: Final = {"HUGEINT": "DECIMAL(38,0)", "UHUGEINT": "DECIMAL(38,0)"}
 """Types that Parquet has not, and those that hold the same whole numbers."""
 
 _NOTHING: Final = ""
 """The type of a column of which no value is known."""
+
+FEW: Final = 200
+"""Rows that are told as values: to write them to a file, and to read that, takes as long as a question."""
+
+_PLAIN: Final = frozenset(
+    {"BOOLEAN", "TINYINT", "SMALLINT", "INTEGER", "BIGINT", "FLOAT", "DOUBLE", "VARCHAR"}
+)
+"""Types whose values are the same in Python, and in JSON; those of an enumeration are texts there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,34 +64,41 @@ class PartFile:
     Attributes
     ----------
     path : Path
-        There is no file if there are no rows.
+        There is no file if there are no rows, or if they are few.
     columns, types : tuple of str
         Of the rows; types as the database calls them.
     rows : int
+    few : list of tuple
+        The rows, if they are few and of types that are plain; else empty.
     """
 
     path: Path
     columns: tuple[str, ...]
     types: tuple[str, ...]
     rows: int
+    few: Sequence[Sequence[Any]] = ()
+
+    @property
+    def written(self) -> bool:
+        """Whether its rows are in the file."""
+        return bool(self.rows) and not self.few
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values."""
         about = {"columns": list(self.columns), "types": list(self.types), "rows": self.rows}
-        return {"path": str(self.path)} | about
+        return {"path": str(self.path) if self.written else "", "few": self.few} | about
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> PartFile:
         """The part that plain values describe."""
         columns, types = tuple(values["columns"]), tuple(values["types"])
-        return cls(Path(values["path"]), columns, types, values["rows"])
+        return cls(Path(values["path"]), columns, types, values["rows"], values["few"])
 
     def moved(self, folder: Path) -> PartFile:
         """Move it into another folder, where it stays until others have come, too."""
-        to = folder / self.path.name
-        if self.rows:
-            self.path.replace(to)
-        return replace(self, path=to)
+        if not self.written:
+            return self
+        return replace(self, path=self.path.replace(folder / self.path.name))
 
 
 _PART: Final = quoted(":part")
@@ -109,10 +127,10 @@ def write_part(
     sql, values = statement
     made = _making(sql, len(columns))
     table: Any = made, values
-    with file.asked(_written, [*given, table]) as (place, kinds, rows):
-        if rows:
+    with file.asked(_written, [*given, table]) as (place, kinds, rows, few):
+        if place is not None:
             shutil.move(place, to)
-    return PartFile(to, tuple(columns), kinds, rows)
+    return PartFile(to, tuple(columns), kinds, rows, few)
 
 
 def _making(sql: str, columns: int) -> str:
@@ -122,8 +140,8 @@ def _making(sql: str, columns: int) -> str:
     return f"CREATE OR REPLACE TEMP TABLE {_PART} AS SELECT * FROM (\n{sql}\n) AS t({names})"
 
 
-def _written(connection: DuckDBPyConnection) -> tuple[Path, tuple[str, ...], int]:
-    """Write the table of a part to a file in the one folder that the database may see; its types and rows."""
+def _written(connection: DuckDBPyConnection) -> Written:
+    """Write the table of a part to a file in the one folder that the database sees, unless it has few rows."""
     described = connection.execute(f"DESCRIBE {_PART}").fetchall()
     kinds = {str(row[0]): str(row[1]) for row in described}
     # A column of which nothing is known is of no type, and a table has none such.
@@ -132,8 +150,11 @@ def _written(connection: DuckDBPyConnection) -> tuple[Path, tuple[str, ...], int
     rows, *known = connection.execute(f"SELECT {counted} FROM {_PART}").fetchall()[0]
     for name, number in zip(whole, known, strict=True):
         kinds[name] = kinds[name] if number else _NOTHING
-    place = tables_folder() / f"part-{secrets.token_hex(8)}.parquet"
-    if rows:
+    place, few = None, list[tuple[Any, ...]]()
+    if rows and rows <= FEW and all(map(_is_plain, kinds.values())):
+        few = connection.execute(f"SELECT * FROM {_PART}").fetchall()
+    elif rows:
+        place = tables_folder() / f"part-{secrets.token_hex(8)}.parquet"
         tables_folder().mkdir(mode=0o700, parents=True, exist_ok=True)
         listed = [
             f"CAST({n} AS {_EXACT[k]}) AS {n}" if k in _EXACT else n for n, k in kinds.items()
@@ -141,7 +162,11 @@ def _written(connection: DuckDBPyConnection) -> tuple[Path, tuple[str, ...], int
         copied = f"SELECT {', '.join(listed)} FROM {_PART}"
         connection.execute(f"COPY ({copied}) TO {literal(str(place))} (FORMAT parquet)")
     connection.execute(f"DROP TABLE {_PART}")
-    return place, tuple(kinds.values()), rows
+    return place, tuple(kinds.values()), rows, few
+
+
+def _is_plain(kind: str) -> bool:
+    return kind in _PLAIN or kind == _NOTHING or kind.startswith("ENUM")
 
 
 def write_classes(
@@ -229,14 +254,14 @@ def merged_file(
     with _tables(parts, words) as connection:
         made = _making(sql, len(columns))
 
-        def step() -> tuple[Path, tuple[str, ...], int]:
+        def step() -> Written:
             connection.execute(made, _numbered(values) or None)
             return _written(connection)
 
-        place, kinds, rows = interruptible(connection, step)
-    if rows:
+        place, kinds, rows, few = interruptible(connection, step)
+    if place is not None:
         shutil.move(place, to)
-    return PartFile(to, tuple(columns), kinds, rows)
+    return PartFile(to, tuple(columns), kinds, rows, few)
 
 
 def merged_arrays(
@@ -270,8 +295,29 @@ def _tables(parts: Parts, words: Mapping[str, Sequence[str]]) -> Generator[DuckD
         instance = shared_instance(("merging", *kinds.items()), lambda: _merging(kinds))
     with instance.cursor() as connection, translated(Path("collection")):
         for table, files in parts.items():
-            connection.execute(f"CREATE TEMP VIEW {quoted(table)} AS {_rows_of(files)}")
+            told = _told(connection, table, files)
+            connection.execute(f"CREATE TEMP VIEW {quoted(table)} AS {_rows_of(files, told)}")
         yield connection
+
+
+def _told(
+    connection: DuckDBPyConnection, table: str, files: Sequence[PartFile]
+) -> dict[tuple[str, ...], str]:
+    """Types → the table with the rows of those parts that tell them as values."""
+    alike: dict[tuple[str, ...], list[Sequence[Any]]] = {}
+    for one in files:
+        if one.few:
+            alike.setdefault(one.types, []).extend(one.few)
+    made: dict[tuple[str, ...], str] = {}
+    for number, (types, rows) in enumerate(alike.items()):
+        made[types] = quoted(f"{table} few {number}")
+        kinds = [kind if kind in _PLAIN else "VARCHAR" for kind in types]
+        listed = (f"unnest(CAST(${n} AS {k}[])) AS c{n - 1}" for n, k in enumerate(kinds, 1))
+        columns = [list(column) for column in zip(*rows, strict=True)]
+        connection.execute(
+            f"CREATE TEMP TABLE {made[types]} AS SELECT {', '.join(listed)}", columns
+        )
+    return made
 
 
 def _merging(kinds: Mapping[str, Sequence[str]]) -> DuckDBPyConnection:
@@ -282,8 +328,8 @@ def _merging(kinds: Mapping[str, Sequence[str]]) -> DuckDBPyConnection:
     return connection
 
 
-def _rows_of(files: Sequence[PartFile]) -> str:
-    """The statement whose rows are those of some files, with the types that they had."""
+def _rows_of(files: Sequence[PartFile], told: Mapping[tuple[str, ...], str]) -> str:
+    """The statement whose rows are those of some files and tables, with the types that they had."""
     if not files:
         raise StoreError("nothing was answered")
     first = files[0]
@@ -292,20 +338,22 @@ def _rows_of(files: Sequence[PartFile]) -> str:
     common = [_common(set(kinds)) for kinds in zip(*(one.types for one in files), strict=True)]
     alike: dict[tuple[str, ...], list[Path]] = {}
     for one in files:
-        if one.rows:
+        if one.written:
             alike.setdefault(one.types, []).append(one.path)
-    if not alike:
+    sources = [*told.items()]
+    for types, paths in alike.items():
+        sources.append((types, f"read_parquet([{', '.join(literal(str(p)) for p in paths)}])"))
+    if not sources:
         none = (
             f"CAST(NULL AS {k}) AS {quoted(n)}" for k, n in zip(common, first.columns, strict=True)
         )
         return f"SELECT {', '.join(none)} LIMIT 0"
     parts: list[str] = []
-    for types, paths in alike.items():
+    for types, source in sources:
         values = ("NULL" if t == _NOTHING else f"c{n}" for n, t in enumerate(types))
         casts = (f"CAST({value} AS {kind})" for value, kind in zip(values, common, strict=True))
         listed = ", ".join(f"{c} AS {quoted(n)}" for c, n in zip(casts, first.columns, strict=True))
-        places = ", ".join(literal(str(path)) for path in paths)
-        parts.append(f"SELECT {listed} FROM read_parquet([{places}])")
+        parts.append(f"SELECT {listed} FROM {source}")
     return "\nUNION ALL\n".join(parts)
 
 
