@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import random
+import re
 import sys
 import tempfile
 from collections import Counter
@@ -18,7 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from oracle_after import AfterWriter
-from oracle_over_time import random_check, random_sequence
+from oracle_over_time import over_values, random_check, random_expression, random_sequence
+from oracle_parts import PartsWriter
 from oracle_worlds import random_world
 
 from sgstore.collection import Collection, pack
@@ -33,21 +35,41 @@ if TYPE_CHECKING:
 
 TRACES = 20
 BUNDLES = (1, 3, 20)
-QUESTIONS = 50
+QUESTIONS = 100
 """Questions that are asked of one world."""
+
+
+EXPRESSED = (
+    "",
+    " RETURN INTERVALS",
+    " RETURN trace.name, COUNT(*)",
+    " RETURN FRAMES LIMIT 5",
+    " LIMIT 4",
+)
+"""What may end a question whose steps have alternatives or are repeated."""
 
 
 class CollectionWriter(AfterWriter):
     """Writes a question of any form."""
 
     def text(self) -> str:
+        shapes = {
+            0.12: lambda: self.settings(check=True) + self.check(),
+            0.25: lambda: self.settings() + random_sequence(self.rng) + self.ended(),
+            0.30: lambda: self.settings() + self.over_match(),
+            0.33: lambda: (
+                self.settings() + random_expression(self.rng) + self.rng.choice(EXPRESSED)
+            ),
+            0.40: self.union,
+            0.52: self.in_parts,
+            0.57: lambda: self.settings() + self.of_classes(),
+            1.00: self.pattern,
+        }
         roll = self.rng.random()
-        if roll < 0.12:
-            return self.settings(check=True) + random_check(self.rng)
-        if roll < 0.3:
-            return self.settings() + random_sequence(self.rng) + self.ended()
-        if roll < 0.38:
-            return self.union()
+        return next(shape() for below, shape in shapes.items() if roll < below)
+
+    def pattern(self) -> str:
+        """A question about single frames, with values, or in another form."""
         text = self.query()
         if not text.startswith("USING"):
             text = self.settings() + text
@@ -55,6 +77,53 @@ class CollectionWriter(AfterWriter):
         if roll < 0.4:
             return text + self.after()
         return text + (self.values() if roll < 0.75 else self.form())
+
+    def check(self) -> str:
+        """A check, by how much it is met, or with values over its violations."""
+        text, roll = random_check(self.rng), self.rng.random()
+        if roll < 0.35:
+            return f"{text} ROBUSTNESS"
+        if roll < 0.6:
+            return text
+        values = over_values(self.rng, [], pair="(v:Entity)" in text)
+        told = ", ".join(f"{value} AS y{n}" for n, value in enumerate(values))
+        of_ego = re.sub(r"\be\b", "ego", told)
+        return f"{text} RETURN {of_ego}"
+
+    def over_match(self) -> str:
+        """Values over the matches of a sequence, or over the runs of a pattern."""
+        if self.rng.random() < 0.6:
+            text = random_sequence(self.rng)
+            names = re.findall(r" AS (s\d)", text)
+            keys = ["trace.name", "t(s0)"]
+        else:
+            text, names = "MATCH (e:Ego), (v:Entity) WHERE dist(e, v) < 9", []
+            keys = ["trace.name", "frame.seq", "v"]
+        values = over_values(self.rng, names, pair="(v" in text)
+        told = [f"{value} AS y{n}" for n, value in enumerate(values)]
+        order = self.rng.choice(("", "", " ORDER BY y1 DESC", " LIMIT 5", " ORDER BY y0 LIMIT 3"))
+        return f"{text} RETURN {', '.join([*keys, *told])}{order}"
+
+    def in_parts(self) -> str:
+        """A question with ``OPTIONAL MATCH``, ``WITH`` and paths."""
+        writer = PartsWriter(self.seed)
+        text = writer.whole()
+        if self.rng.random() < 0.7:
+            return text + writer.told() + self.rng.choice(("", "", " LIMIT 4", " SKIP 2"))
+        return text + self.rng.choice(("", " RETURN FRAMES", " RETURN INTERVALS", " LIMIT 5"))
+
+    def of_classes(self) -> str:
+        """A question about the classes of frames in all bundles."""
+        known = self.rng.choice(("'trace1*'", "'trace7'", "'trace?'"))
+        tests = [
+            "class_count() > 1",
+            "class_count() <= 2",
+            f"frame.class IN dataset_classes({known})",
+        ]
+        tests += [f"NOT frame.class IN dataset_classes({known})", "frame.class IS NOT NULL"]
+        told = ["frame.class, class_count() ORDER BY class_count() DESC LIMIT 5", "FRAMES"]
+        told += ["class_count() AS n, COUNT(*) AS m", "trace.name, MAX(class_count())", "INTERVALS"]
+        return f"MATCH (e:Ego) WHERE {self.rng.choice(tests)} RETURN {self.rng.choice(told)}"
 
     def union(self) -> str:
         """The answers of two patterns as one."""
