@@ -87,7 +87,7 @@ test: $(VENV)/.dev
 EDGES := commonroad coverage coverage_docs crime criticality_recorded derive derive_using like locks selection selection_docs selection_overlapping prioritize \
   draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap export_scenarios export_rerun export_viewers exports exports_docs timeline \
   assistant notebook carla_live collection collection_landing collection_ray collection_remote collection_spark importing junit lang_sgl pytest_plugin record sample \
-  docs_house docs_queries lang_docs packaging views_page library cookbook textmate tck \
+  cli_people docs_house docs_queries lang_docs packaging views_page library cookbook textmate tck \
   lanelet2 autoware sumo lane_courses fuzz mutants serve live report parts sandbox_pool sequences shrink
 tests-of = $(foreach name,$(1),tests/test_$(name).py)
 

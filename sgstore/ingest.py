@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 from sgstore.config import Config
 from sgstore.errors import SgstoreError, StoreError, TraceError, url_named
+from sgstore.logs import logger
 from sgstore.map_files import Maps
 from sgstore.mcap import METADATA, bag_folder, mark_of, parts_of, remote_names
 from sgstore.processes import command
@@ -29,6 +30,8 @@ from sgstore.segments import Job, Progress, SegmentReader, TraceOutcome
 from sgstore.store import Folder, PresentError, Sealed, StoreFile
 from sgstore.trace_parts import TracePart
 from sgstore.world import BUCKET_FRAMES
+
+_log = logger("ingest")
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -378,6 +381,10 @@ def ingest(  # noqa: PLR0913  as many options as there are ways to read
         for number, views in enumerate(read):
             file, outcomes = _published(job, file, views)
             found += outcomes
+            for one in outcomes:
+                _log.info(
+                    "%s: %s, %d frames, %.1f s", one.path, one.status, one.frames, one.seconds
+                )
             shutil.rmtree(folder / str(number), ignore_errors=True)
             meter.finish(number)
     return found

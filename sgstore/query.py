@@ -83,9 +83,7 @@ class StoreFrame:
 
     def graph(self, abstraction: str | None = None) -> nx.MultiDiGraph[Any]:
         """Its scene graph, or what an abstraction makes of it; see :meth:`Store.graph`."""
-        return (
-            self._store.graph(self.ref, abstraction) if abstraction else self._store.graph(self.ref)
-        )
+        return self._store.graph(self.ref, *filter(None, [abstraction]))
 
     def picture(self, channel: str | None = None) -> Image:
         """Picture of a camera, by default the first one; see :meth:`Store.picture`."""
@@ -446,6 +444,7 @@ class Store:
         abstraction: str = "RSV",
         ignore: Sequence[str] = (),
         limit: int = 10,
+        each_trace: bool = False,
     ) -> list[SimilarFrames]:
         """Frames like one that is given: first those of the same class, then the most like, in runs.
 
@@ -461,8 +460,9 @@ class Store:
             As :meth:`classes` takes it.
         ignore : sequence of str
             Labels, kinds, words for several kinds, and relations that do not count.
-        limit : int
-            How many runs of consecutive frames to give.
+        limit, each_trace : int, bool
+            How many runs of consecutive frames to give; and whether only the best of each trace, with
+            frames less than 5 s from the example left out.
 
         Raises
         ------
@@ -471,7 +471,7 @@ class Store:
         AbstractionError
             There is no such abstraction, or nothing is called as what is to be ignored.
         """
-        return self.file.like(_ref(frame), abstraction, ignore, limit)
+        return self.file.like(_ref(frame), abstraction, ignore, limit, each_trace=each_trace)
 
     def pattern(self, frame: int | str | FrameRef, *, ignore: Sequence[str] = ()) -> str:
         """The text of a pattern that describes a frame around its ego, and matches it.

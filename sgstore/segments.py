@@ -27,6 +27,7 @@ import numpy as np
 from sgstore import errors
 from sgstore.config import ALL_EGOS, Config, from_dict
 from sgstore.errors import SgstoreError, TraceError, place_named
+from sgstore.logs import logger
 from sgstore.map_files import Maps, lost_lanes
 from sgstore.mcap import Loss, check_name, near
 from sgstore.readers import on_map, open_trace
@@ -36,6 +37,8 @@ from sgstore.store import Identity, OnMap, Segment, StoreFile
 from sgstore.trace_parts import TracePart
 from sgstore.vocabulary import KIND_CODE, KINDS, kinds_labelled
 from sgstore.world import longest_step_ns
+
+_log = logger("segments")
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -345,6 +348,7 @@ class SegmentReader:
         store = None if job.force else self._file
         digest = store.known_digest(path) if store else ""  # then it need not be hashed
         with open_trace(path, ego=config.ego, digest=digest, mapping=config.mapping) as trace:
+            _log.debug("%s: a recording of flavour %s", path, trace.info.flavour)
             road_map, odd = self._maps.of(trace.info)
             lost = lost_lanes(trace.info, road_map)
             on_map(trace, road_map)

@@ -25,7 +25,7 @@ PACKAGE = Path(__file__).parents[1] / "sgstore"
 # From the ground up. An import may only point to a lower layer; rooms of one layer are strangers to
 # one another, except that the files of one folder know each other.
 LAYERS: tuple[frozenset[str], ...] = (
-    frozenset({"arrays", "records"}),
+    frozenset({"arrays", "logs", "records"}),
     frozenset(
         {
             "columns",

@@ -575,7 +575,7 @@ def test_a_late_value_in_the_last_column_may_use_the_room_that_is_left(
 def test_a_narrow_table_keeps_the_frames_that_one_will_type(
     store: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    said = shown(capsys, monkeypatch, "like", store, "town@20s", "--limit", "3")
+    said = shown(capsys, monkeypatch, "like", store, "town@20s", "--limit", "3", "--all")
     lines = said.splitlines()
 
     assert all(len(line) <= 70 for line in lines)

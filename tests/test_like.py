@@ -182,11 +182,23 @@ def test_a_pattern_without_what_nothing_is_called_is_refused(store: Store) -> No
         store.pattern("town#3", ignore=["buss"])
 
 
+def test_of_each_trace_its_best_run_that_is_not_beside_the_example(store: Store) -> None:
+    (alone,) = store.like("town#300", each_trace=True)
+    (at,) = store.sql("SELECT t FROM frames WHERE seq = 300").values[0]
+    far = {seq for seq, t in store.sql("SELECT seq, t FROM frames").values if abs(t - at) >= 5}
+    best = next(run for run in store.like("town#300", limit=ALL) if run.frame.seq in far)
+
+    assert {*range(alone.frame.seq, alone.frame.seq + alone.frames)} <= far
+    assert alone.similarity == best.similarity
+    assert alone.frame.seq == best.frame.seq
+    assert store.like("town#300", each_trace=True, limit=0) == []
+
+
 # The command line
 
 
 def test_the_command_line_gives_runs_and_what_differs(path: Path) -> None:
-    arguments = ["like", str(path), "town#300", "--limit", "3"]
+    arguments = ["like", str(path), "town#300", "--limit", "3", "--all"]
 
     table = CliRunner().invoke(application(), arguments).stdout
     rows = json.loads(CliRunner().invoke(application(), [*arguments, "--json"]).stdout)
@@ -195,6 +207,8 @@ def test_the_command_line_gives_runs_and_what_differs(path: Path) -> None:
         (r["similarity"] for r in rows), reverse=True
     )
     assert rows[0]["same"] is True
+    (alone,) = json.loads(CliRunner().invoke(application(), [*arguments[:3], "--json"]).stdout)
+    assert alone["similarity"] < rows[2]["similarity"]
     assert rows[1]["missing"] != rows[1]["extra"]
     assert table.splitlines()[0].split() == [
         "frame", "t", "frames", "similarity", "same", "missing", "extra",

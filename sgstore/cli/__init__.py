@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING, Final
 import typer
 
 import sgstore.cli._process as ending
+from sgstore.cli._completion import words_before
 from sgstore.cli._help import spare_packages
 from sgstore.cli._options import ERROR, USAGE, Verbs, app
-from sgstore.cli._output import say, write_error
+from sgstore.cli._output import complain, talk_as_usual, write_error
 from sgstore.cli._process import take_streams
 from sgstore.errors import ConfigError, QueryError, SgstoreError, SqlError
 from sgstore.files import ReaderGoneError
@@ -47,7 +48,7 @@ A verb is known once its module is imported and its options are worked out: :fun
 what is asked, because for all of them it takes longer than many an answer.
 """
 
-_OF_ALL: Final = ("--help", "-h", "--version")
+_OF_ALL: Final = ("--help", "-h", "--version", "--show-completion", "--install-completion")
 """Orders that are about the application itself, of whose verbs no more is told than what they do."""
 
 
@@ -58,9 +59,11 @@ def application(arguments: Sequence[str] = ()) -> typer.Typer:
     -------
     typer.Typer
         It knows the verb that is asked for; where none is, or one that there is not, it knows all of them. For
-        help on itself it knows them without their options.
+        help on itself, and where a verb is being typed, it knows them without their options.
     """
-    first = {*arguments[:1]}
+    if (typed := words_before()) is not None:
+        arguments = typed or ("--help",)
+    first = {*_verb_in(arguments)}
     asked = [module for module, verbs in VERBS.items() if first & {*verbs}]
     for module in asked or VERBS:
         import_module(f"{__name__}._{module}")
@@ -73,6 +76,11 @@ def application(arguments: Sequence[str] = ()) -> typer.Typer:
     return app
 
 
+def _verb_in(arguments: Sequence[str]) -> Sequence[str]:
+    """The verb of a command line, which words on all verbs may stand before; at most one."""
+    return [one for one in arguments if one not in {"--quiet", "--verbose"}][:1]
+
+
 _PUBLISHING: Final = ("ingest", "import", "derive")
 """Verbs that do their work in parts, each of which is in the store when it is done."""
 
@@ -80,7 +88,7 @@ _PUBLISHING: Final = ("ingest", "import", "derive")
 def main() -> None:
     """Run the command line of this process and end it with the right exit code."""
     # Numpy starts a thread for each core when it is imported; only what multiplies large tables needs them.
-    if not {*sys.argv[1:2]} & {*VERBS["coverage"]}:
+    if not {*_verb_in(sys.argv[1:])} & {*VERBS["coverage"]}:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Nothing of what is imported is ever garbage: to look for some while it comes takes a tenth of a short run.
     gc.set_threshold(50_000)
@@ -92,7 +100,7 @@ def main() -> None:
         ending.ignore_signals()
     except KeyboardInterrupt:  # it came before the run began, or once it was over
         ending.ignore_signals()
-        say(ending.word())
+        complain(ending.word())
         code = ending.exit_code()
     sys.exit(code)
 
@@ -129,9 +137,12 @@ def run(arguments: list[str]) -> int:
         return USAGE
     finally:
         ending.clear_deadline()
+        talk_as_usual()
     if code == ending.INTERRUPTED:  # which typer, too, makes of Ctrl-C
-        more = "; what was finished is in the store" if {*arguments[:1]} & {*_PUBLISHING} else ""
-        say(f"{ending.word()}{more}")
+        more = (
+            "; what was finished is in the store" if {*_verb_in(arguments)} & {*_PUBLISHING} else ""
+        )
+        complain(f"{ending.word()}{more}")
         return ending.exit_code()
     return code
 
@@ -160,5 +171,5 @@ def _refused(error: SgstoreError, arguments: list[str]) -> int:
     if _wants_json(arguments):
         write_error(error.as_dict())
     else:
-        say(str(error))
+        complain(str(error))
     return USAGE if isinstance(error, QueryError | SqlError | ConfigError) else ERROR

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 from typer import Argument, Option
 
+from sgstore.cli import _completion as completion
 from sgstore.cli._options import (
     ERROR,
     NO_MATCH,
@@ -790,7 +791,13 @@ def diff(
     b: Annotated[str, Argument(metavar="B", help="After, as A.")],
     name: Annotated[
         str | None,
-        Option("--pattern", "-p", metavar="NAME", help="Compare by a pattern of the library."),
+        Option(
+            "--pattern",
+            "-p",
+            metavar="NAME",
+            help="Compare by a pattern of the library.",
+            autocompletion=completion.patterns,
+        ),
     ] = None,
     query: Annotated[
         str | None,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 from typer import Argument, Option
 
+from sgstore.cli import _completion as completion
 from sgstore.cli._options import (
     LOSS,
     AsJson,
@@ -139,7 +140,14 @@ def export(
             "--lock", metavar="FILE", help="Instead of a query: each case of a lock, a clip each."
         ),
     ] = None,
-    form: Annotated[str, Option("--format", help=f"{_formats()}, or of a package.")] = "mcap",
+    form: Annotated[
+        str,
+        Option(
+            "--format",
+            help=f"{_formats()}, or of a package.",
+            autocompletion=completion.formats,
+        ),
+    ] = "mcap",
     as_json: AsJson = False,
     *,
     clip: ClipOptions,
@@ -331,7 +339,9 @@ def show(
     frame: Annotated[
         str,
         Argument(
-            metavar="FRAME", help="A frame_id, TRACE#SEQ, or TRACE@12.3s; a clip: TRACE@12s..18s."
+            metavar="FRAME",
+            help="A frame_id, TRACE#SEQ, or TRACE@12.3s; a clip: TRACE@12s..18s.",
+            autocompletion=completion.frames,
         ),
     ],
     question: Question,

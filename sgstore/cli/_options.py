@@ -16,13 +16,15 @@ import typer
 from typer import Argument, Option
 from typer.core import TyperCommand, TyperGroup
 
-from sgstore.cli._output import Format, say, write_rows
+from sgstore.cli import _completion as completion
+from sgstore.cli._completion import STORE
+from sgstore.cli._output import LONG_TABLE, Format, say, talk, write_rows
 from sgstore.cli._process import set_deadline
-from sgstore.errors import ConfigError
+from sgstore.errors import ConfigError, url_named
 from sgstore.records import dataclass
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
     from sgstore.collection import PartedMatches, PartedRows
     from sgstore.config import Config
@@ -38,8 +40,10 @@ class Verb(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read a command line; what follows of it is none of the verb's."""
         if ctx.resilient_parsing:  # which completes a command line that is not whole yet
-            return super().parse_args(ctx, args)
+            whole = args[:-1] if args and args[-1].startswith("-") else args  # its value comes now
+            return super().parse_args(ctx, _with_store(self, ctx, whole))
         try:
+            args = _with_store(self, ctx, args)
             _, _, order = self.make_parser(ctx).parse_args(args=list(args))
             given: Counter[Any] = Counter(order)
             for parameter, times in given.items():
@@ -54,6 +58,50 @@ class Verb(TyperCommand):
             raise
         _refuse_late_store(self, ctx)
         return rest
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write help, and examples below it."""
+        super().format_help(ctx, formatter)
+        _write_examples(ctx)
+
+
+def _write_examples(ctx: Any) -> None:
+    from sgstore.cli._examples import examples_of
+
+    typer.echo(examples_of(ctx.command_path.partition(" ")[2]), nl=False)
+
+
+def _with_store(verb: Verb, ctx: Any, args: list[str]) -> list[str]:
+    """A command line with the store of ``SGSTORE_STORE`` before it, where it names none itself.
+
+    What stands first is a store if it looks like one, or if there are as many arguments as the verb takes.
+    """
+    named = os.environ.get(STORE)
+    arguments = [one for one in verb.params if one.param_type_name == "argument"]
+    if not named or not arguments or arguments[0].envvar != STORE:
+        return args
+    values, _, _ = verb.make_parser(ctx).parse_args(args=list(args))
+    given = [text for one in arguments for text in _texts(values.get(one.name))]
+    places = [one.nargs for one in arguments]
+    if not given or _looks_like_store(given[0]) or (-1 not in places and len(given) == sum(places)):
+        return args
+    needed = sum(one.required for one in arguments[1:])
+    whole = url_named(given[0]) is not None and len(given) > needed
+    return args if whole else [named, *args]
+
+
+def _texts(value: Any) -> list[str]:
+    several = value if isinstance(value, list | tuple) else [value]
+    return [one for one in several if isinstance(one, str)]
+
+
+def _looks_like_store(place: str) -> bool:
+    path = Path(place)
+    try:
+        whole = (path / COLLECTION_FILE).is_file()
+    except (OSError, ValueError):  # a query is no name of a file
+        return False
+    return whole or path.suffix in completion.STORE_ENDINGS or _is_database(path)
 
 
 _LIMITED: Final = {"find": "the query", "sql": "the SQL"}
@@ -107,6 +155,11 @@ class Application(TyperGroup):
         """Read a command line up to the verb."""
         _spare(self.get_params(ctx))
         return super().parse_args(ctx, args)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write help, and examples below it."""
+        super().format_help(ctx, formatter)
+        _write_examples(ctx)
 
 
 def _spare(parameters: Iterable[Any]) -> None:
@@ -166,7 +219,7 @@ class Verbs(typer.Typer):
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(**options)
+        super().__init__(cls=Application, **options)
         self._verbs: dict[str, tuple[dict[str, Any], Callable[..., Any]]] = {}
         self._built: set[str] = set()
 
@@ -216,8 +269,14 @@ def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
             option = inspect.Parameter(field.name, one.KEYWORD_ONLY, default=field.default)
             parameters.append(option.replace(annotation=own[field.name]))
 
+    parameters += (
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=about)
+        for name, about in _TALK.items()
+    )
+
     @wraps(function)
     def verb(**values: Any) -> Any:
+        talk(**{name: values.pop(name) for name in _TALK})
         for name, bundle in bundles.items():
             values[name] = bundle(**{one.name: values.pop(one.name) for one in fields(bundle)})
         return function(**values)
@@ -230,7 +289,6 @@ def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
 # The application, the arguments that verbs share, and how their texts become values -------------
 
 app = Verbs(
-    cls=Application,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -242,9 +300,26 @@ ERROR, USAGE, LOSS, NO_MATCH = 1, 2, 3, 4
 IN_TABLE: Final = 40
 """Rows of a report on a terminal, unless more are asked for."""
 
-StorePath = Annotated[Path, Argument(metavar="STORE", help="The store: one DuckDB file.")]
+COLLECTION_FILE: Final = "COLLECTION.json"
+"""The file by which a folder is known as a collection."""
+
+StorePath = Annotated[
+    Path,
+    Argument(
+        metavar="STORE",
+        envvar=STORE,
+        help="The store: one DuckDB file.",
+        autocompletion=completion.stores,
+    ),
+]
 AskedPath = Annotated[
-    Path, Argument(metavar="STORE", help="The store: one DuckDB file; or a collection of them.")
+    Path,
+    Argument(
+        metavar="STORE",
+        envvar=STORE,
+        help="The store: one DuckDB file; or a collection of them.",
+        autocompletion=completion.stores,
+    ),
 ]
 COLLECTIONS: Final = "Collections"
 EngineName = Annotated[
@@ -264,7 +339,14 @@ Partial = Annotated[
         rich_help_panel=COLLECTIONS,
     ),
 ]
-FrameName = Annotated[str, Argument(metavar="FRAME", help="A frame_id, TRACE#SEQ, or TRACE@12.3s.")]
+FrameName = Annotated[
+    str,
+    Argument(
+        metavar="FRAME",
+        help="A frame_id, TRACE#SEQ, or TRACE@12.3s.",
+        autocompletion=completion.frames,
+    ),
+]
 Parameters = Annotated[
     list[str] | None,
     Option(
@@ -288,7 +370,13 @@ QueryFile = Annotated[
 ]
 PatternNames = Annotated[
     list[str] | None,
-    Option("--pattern", "-p", metavar="NAME", help="One of the library; repeatable."),
+    Option(
+        "--pattern",
+        "-p",
+        metavar="NAME",
+        help="One of the library; repeatable.",
+        autocompletion=completion.patterns,
+    ),
 ]
 Budget = Annotated[str, Option("--budget", help="At most 600s, 10min, 5GB, 1000frames or 40units.")]
 CaseUnit = Annotated[
@@ -296,17 +384,37 @@ CaseUnit = Annotated[
 ]
 LongestClip = Annotated[str, Option("--clip", metavar="TIME", help="Longest clip of --unit clip.")]
 Abstraction = Annotated[
-    str, Option("--abstraction", metavar="NAME", help="Abstraction: E, EL, ER, RSV, …")
+    str,
+    Option(
+        "--abstraction",
+        metavar="NAME",
+        help="Abstraction: E, EL, ER, RSV, …",
+        autocompletion=completion.abstractions,
+    ),
 ]
 Picture = Annotated[
     Path | None, Option("--picture", metavar="FILE", help="Also draw it: .png or .svg.")
 ]
-Traces = Annotated[list[str] | None, Option("--trace", help="Only this trace; repeatable.")]
+Traces = Annotated[
+    list[str] | None,
+    Option("--trace", help="Only this trace; repeatable.", autocompletion=completion.traces),
+]
 Jobs = Annotated[
     int, Option("--jobs", "-j", min=0, help="Recordings read at a time; 0: one for each core.")
 ]
 ROWS: Final = "Rows"
 LIMITS: Final = "Limits"
+MESSAGES: Final = "Messages"
+Quiet = Annotated[
+    bool,
+    Option("--quiet", help="Only results and errors, no remarks.", rich_help_panel=MESSAGES),
+]
+Verbose = Annotated[
+    bool,
+    Option("--verbose", help="Also what is done, and when, on stderr.", rich_help_panel=MESSAGES),
+]
+_TALK: Final = {"quiet": Quiet, "verbose": Verbose}
+"""What every verb takes beside its own options."""
 AsJson = Annotated[bool, Option("--json", help="Short for --format json.", rich_help_panel=ROWS)]
 Output = Annotated[
     Path | None,
@@ -346,9 +454,29 @@ class PrintedRows:
         columns: Sequence[str],
         rows: Iterable[Sequence[Any]],
         types: Sequence[str] | None = None,
+        totals: Mapping[str, str] | None = None,
     ) -> int:
-        """Write rows, and return how many; see :func:`sgstore.cli._output.write_rows`."""
-        return write_rows(columns, rows, self.chosen, self.file, types)
+        """Write rows, and return how many; see :func:`sgstore.cli._output.write_rows`.
+
+        Below a long table on a terminal stands the number of its rows, and the sum of columns: ``totals`` has
+        these by name, with their units.
+        """
+        if not on_terminal(self):
+            return write_rows(columns, rows, self.chosen, self.file, types)
+        sums = dict.fromkeys(totals or (), 0)
+        places = [(name, columns.index(name)) for name in sums]
+
+        def counted() -> Iterator[Sequence[Any]]:
+            for row in rows:
+                for name, place in places:
+                    sums[name] += row[place] or 0
+                yield row
+
+        number = write_rows(columns, counted(), self.chosen, self.file, types)
+        if number >= LONG_TABLE:
+            said = [f"{round(sums[name], 3):,} {unit}" for name, unit in (totals or {}).items()]
+            say(", ".join([f"{number:,} rows", *said]))
+        return number
 
     def report(self, table: ReportTable, limit: int | None = 0) -> None:
         """Write a table and the remarks on it; with ``limit`` 0 all rows, with ``None`` some for people."""
@@ -360,6 +488,11 @@ class PrintedRows:
             say(f"{len(table.rows) - len(rows)} more rows; --limit 0 shows all")
         for text in table.said:
             say(text)
+
+
+def on_terminal(out: PrintedRows) -> bool:
+    """Tell whether a person sees the rows as they come."""
+    return out.for_people and out.file is None and sys.stdout.isatty()
 
 
 @dataclass(frozen=True)
@@ -435,7 +568,11 @@ class Question:
     name: Annotated[
         str | None,
         Option(
-            "--pattern", "-p", metavar="NAME", help="A pattern of the library, in place of a query."
+            "--pattern",
+            "-p",
+            metavar="NAME",
+            help="A pattern of the library, in place of a query.",
+            autocompletion=completion.patterns,
         ),
     ] = None
     parameters: Parameters = None
@@ -502,7 +639,12 @@ class GraphOptions:
     ] = None
     preset: Annotated[
         str | None,
-        Option("--preset", metavar="NAME", help="Settings with a name: see config --list."),
+        Option(
+            "--preset",
+            metavar="NAME",
+            help="Settings with a name: see config --list.",
+            autocompletion=completion.presets,
+        ),
     ] = None
 
     def settings(self) -> Config | None:
@@ -534,12 +676,15 @@ class ReadingOptions(GraphOptions):
 def sgstore(
     context: typer.Context,
     version: Annotated[bool, Option("--version", help="Print the version.")] = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Find the driving scenes that matter.
 
-    Recordings go in (ingest), frames are found by what happens in them (find,
-    sql), looked at (show), and exported as clips (export). First steps: demo.
+    Recordings go in (ingest), frames are found by what happens in them (find, sql), looked at (show), and
+    exported as clips (export). SGSTORE_STORE names the store of verbs that are given none.
     """
+    talk(quiet=quiet, verbose=verbose)
     if version:
         from importlib.metadata import version as version_of
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import ExportError
 from sgstore.files import without_controls, working_folder, written_text
+from sgstore.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 @contextmanager
 def ingest_bar() -> Generator[Callable[[Progress], None] | None]:
     """A function that shows the progress of an ingest on stderr; ``None`` where that is no terminal."""
-    if not sys.stderr.isatty():
+    if quiet() or not sys.stderr.isatty():
         yield None
         return
     from rich.console import Console
@@ -67,7 +68,7 @@ def ingest_bar() -> Generator[Callable[[Progress], None] | None]:
 @contextmanager
 def count_bar(what: str, things: str) -> Generator[Callable[[int, int], None] | None]:
     """A function that shows how many of how many things are done; ``None`` where stderr is no terminal."""
-    if not sys.stderr.isatty():
+    if quiet() or not sys.stderr.isatty():
         yield None
         return
     from rich.console import Console
@@ -105,8 +106,12 @@ class Format(StrEnum):
 
 _KEYS: Final = frozenset({"frame", "from", "trace"})
 """Columns by which a row is found again."""
+_PATHS: Final = frozenset({"file", "path", "uri"})
+"""Columns whose texts are told apart by their ends."""
 _LEAST: Final = 8
 """Letters that a column keeps."""
+LONG_TABLE: Final = 20
+"""Rows from which on a table on a terminal has its total below."""
 BINARY: Final = frozenset({Format.parquet, Format.arrow})
 _WITHOUT_NESTING: Final = frozenset({Format.csv, *BINARY})
 
@@ -168,9 +173,62 @@ def write_document(values: dict[str, Any], form: Format) -> None:
     sys.stdout.write(f"{json_text(_json_object(values), 2)}\n")
 
 
+@dataclass(slots=True)
+class _Manner:
+    """Whether remarks are told, and how many places asked for less or for more."""
+
+    quiet: bool = False
+    handler: Any = None
+
+
+_manner = _Manner()
+
+
+def talk(*, quiet: bool, verbose: bool) -> None:
+    """Tell less, or more, from here on: what the words before and behind a verb say holds together.
+
+    Parameters
+    ----------
+    quiet : bool
+        :func:`say` and bars of progress tell nothing; results and errors stay.
+    verbose : bool
+        What the library logs is told on stderr, with the seconds since the process began.
+    """
+    _manner.quiet |= quiet
+    if verbose and _manner.handler is None:
+        import logging
+
+        _manner.handler = logging.StreamHandler()
+        form = "sgstore: %(relativeCreated)6d ms  %(name)s: %(message)s"
+        _manner.handler.setFormatter(logging.Formatter(form))
+        logging.getLogger("sgstore").addHandler(_manner.handler)
+        logging.getLogger("sgstore").setLevel(logging.DEBUG)
+
+
+def talk_as_usual() -> None:
+    """End what :func:`talk` began."""
+    handler, _manner.handler, _manner.quiet = _manner.handler, None, False
+    if handler is not None:
+        import logging
+
+        logging.getLogger("sgstore").removeHandler(handler)
+        logging.getLogger("sgstore").setLevel(logging.NOTSET)
+
+
 def say(message: str) -> None:
-    """Tell something that is not a result, on stderr."""
+    """Tell something that is neither a result nor an error, on stderr."""
+    if not _manner.quiet:
+        complain(message)
+
+
+def complain(message: str) -> None:
+    """Tell an error, on stderr."""
     sys.stderr.write(f"sgstore: {without_controls(message)}\n")
+
+
+def quiet() -> bool:
+    """Return true if nothing but results and errors is told."""
+    return _manner.quiet
 
 
 def write_error(about: dict[str, Any]) -> None:
@@ -313,18 +371,27 @@ def _write_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], stream: 
         return 0
     numeric = [all(_is_number(row[i]) for row in first) for i in range(len(columns))]
     widths = [max(len(name), *(len(row[i]) for row in first)) for i, name in enumerate(columns)]
-    room = _room(stream)
-    widths = _fitted(columns, widths, room)
-    most = None if room is None else [*widths[:-1], max(widths[-1], room - _before_last(widths))]
-    stream.write(_line(columns, widths, numeric, most))
-    stream.write(_line(["─" * width for width in widths], widths, numeric, most))
     rest = ([_cell(value) for value in row] for row in rows)
-    return _count(stream.write(_line(row, widths, numeric, most)) for row in chain(first, rest))
-
-
-def _before_last(widths: Sequence[int]) -> int:
-    """Letters of a row that stand before its last cell."""
-    return sum(widths[:-1]) + len(GAP) * (len(widths) - 1)
+    room = _room(stream)
+    if room is None:
+        lines = (_line(row, widths, numeric) for row in chain(first, rest))
+        stream.write(_line(columns, widths, numeric))
+        stream.write(_line(["─" * width for width in widths], widths, numeric))
+        return _count(stream.write(line) for line in lines)
+    kept, fitted = _fitted(columns, widths, numeric, room)
+    layout = [
+        _TerminalColumn(i, name, fitted[i], numeric[i], name in _KEYS and fitted[i] == widths[i])
+        for i in kept
+        for name in (columns[i],)
+    ]
+    before_last = sum(one.width + len(GAP) for one in layout[:-1])
+    layout[-1].most = max(layout[-1].width, room - before_last)
+    stream.write(_terminal_line(columns, layout))
+    stream.write(_terminal_line(["─" * width for width in fitted], layout))
+    number = _count(stream.write(_terminal_line(row, layout)) for row in chain(first, rest))
+    if left_out := [name for i, name in enumerate(columns) if i not in kept]:
+        say(f"no room for the columns {', '.join(left_out)}; --json has them")
+    return number
 
 
 def _room(stream: TextIO) -> int | None:
@@ -332,33 +399,66 @@ def _room(stream: TextIO) -> int | None:
     return shutil.get_terminal_size().columns if stream.isatty() else None
 
 
-def _fitted(columns: Sequence[str], widths: list[int], room: int | None) -> list[int]:
-    """Widths that fit: the widest columns give way first, what a row is found by last; none below 8 letters."""
-    if room is None:
-        return widths
-    widths = list(widths)
-    others = [i for i, name in enumerate(columns) if name not in _KEYS]
-    for giving in (others, list(range(len(columns)))):
-        while giving and _before_last(widths) + widths[-1] > room:
+@dataclass(slots=True)
+class _TerminalColumn:
+    """Column of a table on a terminal: its place in a row, its width, and how much of a cell is shown."""
+
+    place: int
+    name: str
+    width: int
+    right: bool
+    whole: bool
+    most: int = 0
+
+    def text(self, cell: str) -> str:
+        """A cell as it is shown: of a path both ends, of other texts the beginning; numbers whole."""
+        room = self.most or self.width
+        if len(cell) > room and not (self.right or self.whole):
+            end = (room - 1) * 2 // 3 if self.name in _PATHS else 0
+            cell = f"{cell[: room - 1 - end]}…{cell[len(cell) - end :]}"
+        return cell.rjust(self.width) if self.right else cell.ljust(self.width)
+
+
+def _terminal_line(cells: Sequence[str], layout: Sequence[_TerminalColumn]) -> str:
+    return f"{GAP.join(one.text(cells[one.place]) for one in layout).rstrip()}\n"
+
+
+def _fitted(
+    columns: Sequence[str], widths: Sequence[int], numeric: Sequence[bool], room: int
+) -> tuple[list[int], list[int]]:
+    """The columns that are shown, and widths of all.
+
+    Texts give way first, the widest of them, to 8 letters; then columns are left out, the last ones first; then
+    what a row is found by gives way. Numbers are whole: one that is cut is another number.
+    """
+    widths, kept = list(widths), list(range(len(columns)))
+    keys = {i for i, name in enumerate(columns) if name in _KEYS} or {0}
+
+    def too_wide() -> bool:
+        return sum(widths[i] for i in kept) + len(GAP) * (len(kept) - 1) > room
+
+    def narrow(giving: list[int]) -> None:
+        while giving and too_wide():
             widest = max(giving, key=widths.__getitem__)
             if widths[widest] <= _LEAST:
                 break
             widths[widest] -= 1
-    return widths
+
+    narrow([i for i in kept if i not in keys and not numeric[i]])
+    for i in reversed(range(len(columns))):
+        if too_wide() and i not in keys:
+            kept.remove(i)
+    narrow([i for i in kept if i in keys])
+    return kept, widths
 
 
-def _line(
-    cells: Sequence[str],
-    widths: Sequence[int],
-    numeric: Sequence[bool],
-    most: Sequence[int] | None,
-) -> str:
-    """A row as text; cells are cut to so many letters, and whole in a file or a pipe (``None``)."""
-    parts: list[str] = []
-    for cell, width, right, room in zip(cells, widths, numeric, most or widths, strict=True):
-        text = f"{cell[: room - 1]}…" if most and len(cell) > room else cell
-        parts.append(text.rjust(width) if right else text.ljust(width))
-    return f"{GAP.join(parts).rstrip()}\n"
+def _line(cells: Sequence[str], widths: Sequence[int], numeric: Sequence[bool]) -> str:
+    """A row as text, with cells that are whole: in a file or a pipe."""
+    texts = (
+        cell.rjust(width) if right else cell.ljust(width)
+        for cell, width, right in zip(cells, widths, numeric, strict=True)
+    )
+    return f"{GAP.join(texts).rstrip()}\n"
 
 
 def _cell(value: Any) -> str:

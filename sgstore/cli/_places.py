@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import typer
 
-from sgstore.cli._options import LOSS, QueryLimits, tables_of
+from sgstore.cli._options import COLLECTION_FILE, LOSS, QueryLimits, tables_of
 from sgstore.cli._output import say
 from sgstore.errors import url_named
 
@@ -17,16 +17,13 @@ if TYPE_CHECKING:
 
     from sgstore.collection import Collection
 
-ABOUT: Final = "COLLECTION.json"
-"""The file by which a folder is known as a collection."""
-
 
 def url_of(store: Path) -> str | None:
     """The place of a collection, if what is named as a store is one; else ``None``."""
     if (url := url_named(store)) is not None:
         return url
     with suppress(OSError, ValueError):  # what cannot be looked at is refused as a store
-        return str(store) if (store / ABOUT).is_file() else None
+        return str(store) if (store / COLLECTION_FILE).is_file() else None
     return None
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from enum import StrEnum
 from itertools import chain
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 from typer import Argument, Option
 
+from sgstore.cli import _completion as completion
 from sgstore.cli._options import (
     COLLECTIONS,
     NO_MATCH,
@@ -31,6 +31,7 @@ from sgstore.cli._options import (
     Verbs,
     With,
     app,
+    on_terminal,
     parameters_of,
     query_of,
     say_left_out,
@@ -115,16 +116,11 @@ def find(
             return NO_MATCH if require and not number else 0
         if ask.chosen in BINARY and not matches.graphs:
             number = write_binary(matches.parquet, ask.chosen, ask.output)
-        elif not each_frame and _on_terminal(ask) and _returns_nothing(text):
+        elif not each_frame and on_terminal(ask) and _returns_nothing(text):
             number = _write_stretches(matches.intervals(), ask)
         else:
             number = ask.write(*_as_shown(matches, matches, ask.chosen))
     return _ended(number, ask, require=require)
-
-
-def _on_terminal(ask: AskOptions) -> bool:
-    """Tell whether a person sees the rows as they come."""
-    return ask.for_people and ask.file is None and sys.stdout.isatty()
 
 
 def _returns_nothing(text: str) -> bool:
@@ -245,6 +241,12 @@ def like(
     ] = None,
     abstraction: Abstraction = "RSV",
     limit: Annotated[int, Option("--limit", min=1, help="Number of runs of frames.")] = 10,
+    every: Annotated[
+        bool,
+        Option(
+            "--all", help="All runs of a trace, and frames beside this one, not the best of each."
+        ),
+    ] = False,
     pattern: Annotated[
         bool, Option("--pattern", help="Print a pattern that describes the frame instead.")
     ] = False,
@@ -254,14 +256,17 @@ def like(
 ) -> int:
     """Find frames like another: of the same class, or the most like by what they have in common.
 
-    One row for consecutive frames that are as like as each other: the first one, how many, how like, whether
-    the graphs are the same, and what the example has that they have not, and they that it has not.
+    One row for each trace: its best run of consecutive frames that are as like as each other. It says how
+    many, how like, whether the graphs are the same, and what only the example has, or only they.
+    Frames less than 5 s from the example are left out; --all takes them, and every run, too.
     """
     opened = bounds.opened(store)
     if pattern:
         write_text(f"{opened.pattern(frame, ignore=ignore or ())}\n", out.output)
         return 0
-    found = opened.like(frame, abstraction=abstraction, ignore=ignore or (), limit=limit)
+    found = opened.like(
+        frame, abstraction=abstraction, ignore=ignore or (), limit=limit, each_trace=not every
+    )
     if out.for_people:
         columns = ("frame", "t", "frames", "similarity", "same", "missing", "extra")
         rows = (
@@ -271,8 +276,8 @@ def like(
                 one.frames,
                 round(one.similarity, 3),
                 one.same,
-                _counted(one.missing),
-                _counted(one.extra),
+                _differing(one.missing),
+                _differing(one.extra),
             )
             for one in found
         )
@@ -291,9 +296,15 @@ def like(
     return 0
 
 
-def _counted(features: dict[str, int]) -> str:
-    """Features with how often, as one text."""
-    return ", ".join(f"{n} x {text}" if n > 1 else text for text, n in features.items())
+_FEATURES_SHOWN: Final = 3
+"""Features of a row for people; the others are counted, and in the rows for programs."""
+
+
+def _differing(features: dict[str, int]) -> str:
+    """Features with how often, as one text: the first, and how many more."""
+    shown = [f"{n} x {text}" if n > 1 else text for text, n in features.items()]
+    more = shown[_FEATURES_SHOWN:]
+    return ", ".join([*shown[:_FEATURES_SHOWN], *([f"… {len(more)} more"] if more else [])])
 
 
 @app.command(rich_help_panel=PANEL)
@@ -401,7 +412,12 @@ app.add_typer(
 )
 
 LibraryName = Annotated[
-    str, Argument(metavar="NAME", help="Of a pattern, such as cut_in or ParkingExit.")
+    str,
+    Argument(
+        metavar="NAME",
+        help="Of a pattern, such as cut_in or ParkingExit.",
+        autocompletion=completion.patterns,
+    ),
 ]
 
 

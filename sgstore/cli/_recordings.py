@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 from typer import Argument, Option
 
+from sgstore.cli import _completion as completion
 from sgstore.cli._options import (
     ERROR,
     LOSS,
@@ -26,7 +27,7 @@ from sgstore.cli._options import (
     lines_of,
     seconds_of,
 )
-from sgstore.cli._output import Format, say, write_document, write_report
+from sgstore.cli._output import Format, complain, quiet, say, write_document, write_report
 from sgstore.cli._places import url_of
 from sgstore.errors import StoreError, place_named
 
@@ -120,7 +121,7 @@ def _told(outcomes: list[TraceOutcome], out: PrintedRows) -> int:
     for outcome in outcomes:
         _say_what_was_odd(outcome)
     columns = ("trace", "status", "ego", "frames", "entities", "seconds", "losses", "file")
-    out.write(columns, map(_outcome_row, outcomes))
+    out.write(columns, map(_outcome_row, outcomes), totals={"frames": "frames", "losses": "losses"})
     if any(outcome.error for outcome in outcomes):
         return ERROR
     return LOSS if any(outcome.losses for outcome in outcomes) else 0
@@ -147,7 +148,7 @@ def _names(traces: list[str]) -> list[str]:
 
 def _say_what_was_odd(outcome: TraceOutcome) -> None:
     if outcome.error:
-        say(str(outcome.error))
+        complain(str(outcome.error))
     for name, number in outcome.unknown_types.items():
         say(f"{place_named(outcome.path)}: {number} entities of type {name!r}, {_no_kind(name)}")
     for warning in outcome.warnings:
@@ -183,7 +184,11 @@ def info(
     store: AskedPath,
     traces: Annotated[
         list[str] | None,
-        Option("--trace", help="A trace in full: a name, id, or beginning of one; repeatable."),
+        Option(
+            "--trace",
+            help="A trace in full: a name, id, or beginning of one; repeatable.",
+            autocompletion=completion.traces,
+        ),
     ] = None,
     *,
     out: PrintedRows,
@@ -215,6 +220,7 @@ def info(
             )
             for one in file.traces()
         ),
+        totals={"frames": "frames", "seconds": "s", "losses": "losses"},
     )
     return 0
 
@@ -237,7 +243,7 @@ def _tell_of_collection(url: str, names: list[str], out: PrintedRows) -> None:
         for row in found
         if not names or row["name"] in names
     )
-    out.write(columns, rows)
+    out.write(columns, rows, totals={"frames": "frames", "seconds": "s"})
 
 
 def _tell_all_of(file: StoreFile, names: list[str], out: PrintedRows) -> None:
@@ -349,7 +355,7 @@ def record(
 @contextmanager
 def _counter() -> Generator[Callable[[int, float], None] | None]:
     """A line that counts frames on stderr; ``None`` where that is no terminal."""
-    if not sys.stderr.isatty():
+    if quiet() or not sys.stderr.isatty():
         yield None
         return
     from rich.console import Console
@@ -446,7 +452,7 @@ def import_(
     )
     for one in done:
         if one.error is not None:
-            say(str(one.error))
+            complain(str(one.error))
         for what, often in sorted(one.lost.items()):
             say(f"{one.path.name}: {what}: {often} times, cannot be kept")
     columns = ("file", "status", "trace", "frames", "entities", "edges")

@@ -9,14 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 from typer import Argument, Option
 
+from sgstore.cli import _completion as completion
 from sgstore.cli._options import (
     ERROR,
     LOSS,
+    FrameName,
     GraphOptions,
     Jobs,
     Output,
     PrintedRows,
     StorePath,
+    Traces,
     app,
     jobs_of,
 )
@@ -57,7 +60,12 @@ def verify(
 def remove(
     store: StorePath,
     traces: Annotated[
-        list[str] | None, Argument(metavar="TRACE…", help="Names, ids, or beginnings of names.")
+        list[str] | None,
+        Argument(
+            metavar="TRACE…",
+            help="Names, ids, or beginnings of names.",
+            autocompletion=completion.traces,
+        ),
     ] = None,
     compact: Annotated[
         bool, Option("--compact", help="Rewrite the file to free its space; also without a TRACE.")
@@ -98,6 +106,7 @@ def rebuild(
             "--leave-out",
             metavar="TRACE",
             help="Leave out a trace that cannot be rebuilt; repeatable.",
+            autocompletion=completion.traces,
         ),
     ] = None,
     jobs: Jobs = 1,
@@ -137,9 +146,7 @@ def derive(
             help="Keep what this makes of the graphs: roadscene2vec.",
         ),
     ] = None,
-    trace: Annotated[
-        list[str] | None, Option("--trace", help="Only of this trace; repeatable.")
-    ] = None,
+    trace: Traces = None,
     force: Annotated[
         bool, Option("--force", help="Replace a set of this name with other settings.")
     ] = False,
@@ -254,9 +261,14 @@ def _road_map(file: Path) -> RoadMap:
 @app.command(rich_help_panel=PANEL)
 def payload(
     store: StorePath,
-    frame: Annotated[str, Argument(metavar="FRAME", help="frame_id, TRACE#SEQ or TRACE@12.3s.")],
+    frame: FrameName,
     channel: Annotated[
-        str | None, Argument(metavar="CHANNEL", help="Topic; without it, list those there are.")
+        str | None,
+        Argument(
+            metavar="CHANNEL",
+            help="Topic; without it, list those there are.",
+            autocompletion=completion.channels,
+        ),
     ] = None,
     output: Output = None,
     message: Annotated[
@@ -311,7 +323,13 @@ def config(
         Path | None, Argument(metavar="FILE", help="A TOML file: check it, and print it whole.")
     ] = None,
     preset: Annotated[
-        str | None, Option("--preset", metavar="NAME", help="Settings of this preset.")
+        str | None,
+        Option(
+            "--preset",
+            metavar="NAME",
+            help="Settings of this preset.",
+            autocompletion=completion.presets,
+        ),
     ] = None,
     every: Annotated[bool, Option("--list", help="List the presets.")] = False,
     page: Annotated[

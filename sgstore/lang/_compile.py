@@ -70,9 +70,12 @@ from sgstore.lang.ir import (
     is_passed_on,
 )
 from sgstore.lang.syntax import CheckClause, MatchClause
+from sgstore.logs import logger
 from sgstore.pair_numbers import as_written
 from sgstore.records import dataclass
 from sgstore.vocabulary import KINDS, RELATIONS, asking, entity_kinds, normalize_name
+
+_log = logger("lang")
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -765,6 +768,7 @@ def compile_query(
     QueryError
         Its types do not fit together.
     """
+    _log.debug("compiled for %d traces: %s", len(catalog.traces), text)
     with asking(catalog.names):
         statements = parse(text)
         seen = _seen(statements, catalog, parameters or {})

@@ -813,13 +813,13 @@ class StoreFile:
         return self._abstracted
 
     def like(
-        self, ref: int | str, abstraction: str, ignored: Sequence[str], limit: int
+        self, ref: int | str, abstraction: str, ignored: Sequence[str], limit: int, **how: bool
     ) -> list[SimilarFrames]:
         """Frames like another; see :func:`sgstore.store._similarity.frames_like`."""
         from sgstore.store._similarity import frames_like
 
         with translated(self.path):
-            return frames_like(self.access, ref, abstraction, ignored, limit)
+            return frames_like(self.access, ref, abstraction, ignored, limit, **how)
 
     @property
     def deriving(self) -> Deriving:

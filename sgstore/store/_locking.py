@@ -22,9 +22,12 @@ import duckdb
 import sgstore.store._schema as shape
 from sgstore.errors import SqlError, StoreError
 from sgstore.files import HeldFolder, new_place, sweep
+from sgstore.logs import logger
 from sgstore.quoting import literal
 from sgstore.store._joins import tables_folder
 from sgstore.store._lease import AttachedFile, OpenFile, files, gate_of, stamp_of
+
+_log = logger("store")
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator
@@ -417,6 +420,7 @@ class Access:
                 if connection is not None:
                     connection.close()
             file.instance = None
+            _log.info("%s: the database failed by a fault of its own", self.path)
             again, file.careful = not file.careful, True
         return again
 
@@ -491,6 +495,7 @@ class Access:
                 break
             instance.close()  # another file has taken its place, and nobody knows which of the two this is
         file.instance, file.opened, file.checked = instance, stamp, False
+        _log.debug("%s: opened to read", self.path)
         return instance
 
     def _opened(self, deadline: _Deadline) -> DuckDBPyConnection | AttachedFile:

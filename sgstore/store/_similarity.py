@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass
 from heapq import heappush, heapreplace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -79,8 +79,18 @@ class _FrameRun:
     features: Counter[str]
 
 
+BESIDE_S: Final = 5.0
+"""Frames of the same trace that are nearer than this are beside an example, and like it for that reason; s."""
+
+
 def frames_like(
-    access: Access, ref: int | str, name: str, ignored: Sequence[str], limit: int
+    access: Access,
+    ref: int | str,
+    name: str,
+    ignored: Sequence[str],
+    limit: int,
+    *,
+    each_trace: bool = False,
 ) -> list[SimilarFrames]:
     """Runs of frames, the most like an example first, then in the order of the store.
 
@@ -97,6 +107,8 @@ def frames_like(
         Labels and relations that do not count; see :func:`sgstore.abstractions._features.without`.
     limit : int
         How many runs to give.
+    each_trace : bool
+        Whether only the best run of each trace counts, and frames beside the example do not.
 
     Raises
     ------
@@ -111,11 +123,13 @@ def frames_like(
         _, seen = graphs.of_frames(connection, frame.frame_id, frame.frame_id)
         whole = abstraction.function(seen)
         _check(ignored, whole)
-        search = _RunSearch(without(whole, ignored), max(limit, 0))
+        search = _RunSearch(without(whole, ignored), max(limit, 0), each_trace=each_trace)
         traces = stored_traces(connection)
+        beside = _beside(connection, frame) if each_trace else range(0)
         for number, trace in enumerate(traces):
+            left_out = beside if trace.trace_id == frame.trace_id else range(0)
             for seq, block in _blocks(connection, graphs, trace, abstraction):
-                search.look(number, seq, without(block, ignored))
+                search.look(number, seq, without(block, ignored), left_out)
         search.close()
         return [_like(connection, run, traces, search.example) for run in search.best()]
 
@@ -127,19 +141,30 @@ def _blocks(
         yield seq, abstraction.function(seen)
 
 
-class _RunSearch:
-    """The best runs so far, in a heap whose first is the worst of them."""
+def _beside(connection: DuckDBPyConnection, frame: FrameRef) -> range:
+    """Numbers of the frames around one, itself among them."""
+    sql = "SELECT min(seq), max(seq) FROM frames WHERE trace_id = ? AND abs(t - ?) < ?"
+    found = connection.execute(sql, [frame.trace_id, frame.t, BESIDE_S]).fetchone()
+    first, last = found or (0, -1)
+    return range(first, last + 1)
 
-    def __init__(self, example: Labelled, limit: int) -> None:
+
+class _RunSearch:
+    """The best runs so far, of all or of each trace, in a heap whose first is the worst of them."""
+
+    def __init__(self, example: Labelled, limit: int, *, each_trace: bool) -> None:
         self.example = GraphFeatures.of(example).counts(0)
         self._classes = Classes()
         (self._class,) = self._classes.of(example)
         self._limit = limit
+        self._each: dict[int, tuple[float, int, int, _FrameRun]] | None = {} if each_trace else None
         self._heap: list[tuple[float, int, int, _FrameRun]] = []
         self._last: _FrameRun | None = None
 
-    def look(self, trace: int, seq: NDArray[np.int64], graphs: Labelled) -> None:
-        """Take up the next frames of a trace."""
+    def look(
+        self, trace: int, seq: NDArray[np.int64], graphs: Labelled, left_out: range = range(0)
+    ) -> None:
+        """Take up the next frames of a trace, but for some."""
         features = GraphFeatures.of(graphs)
         likeness, digest = features.likeness(self.example), features.digests()
         same: list[bool | None] = [False] * graphs.frames
@@ -150,8 +175,13 @@ class _RunSearch:
                 same[i] = classes[i] == self._class if classes[i] and self._class else None
         alike = (digest[1:] == digest[:-1]) & (np.diff(seq) == 1)
         alike &= np.array([a is b for a, b in pairwise(same)], np.bool_)
+        out = (seq >= left_out.start) & (seq < left_out.stop)
+        alike &= out[1:] == out[:-1]
         starts = np.flatnonzero(np.append(True, ~alike))
         for start, end in zip(starts.tolist(), [*starts.tolist()[1:], len(seq)], strict=True):
+            if out[start]:
+                self.close()
+                continue
             key = (trace, int(digest[start]), same[start])
             last = self._last
             if last is not None and last.key == key and last.seq + last.frames == seq[start]:
@@ -159,7 +189,7 @@ class _RunSearch:
                 continue
             self.close()
             counts = Counter[str]()
-            if self._wanted(float(likeness[start])):
+            if self._wanted(trace, float(likeness[start])):
                 counts = features.counts(start)
             self._last = _FrameRun(
                 key,
@@ -174,23 +204,31 @@ class _RunSearch:
     def close(self) -> None:
         """The last run is over."""
         run, self._last = self._last, None
-        if run is None or not self._wanted(run.similarity):
+        if run is None or not self._wanted(run.trace, run.similarity):
             return
         # Those that come later are worse, if they are as like.
         entry = (run.similarity + (run.same is True), -run.trace, -run.seq, run)
-        if len(self._heap) < self._limit:
+        if self._each is not None:
+            if run.trace not in self._each or entry > self._each[run.trace]:
+                self._each[run.trace] = entry
+        elif len(self._heap) < self._limit:
             heappush(self._heap, entry)
         elif entry > self._heap[0]:
             heapreplace(self._heap, entry)
 
-    def _wanted(self, similarity: float) -> bool:
+    def _wanted(self, trace: int, similarity: float) -> bool:
+        if self._each is not None:
+            best = self._each.get(trace)
+            return best is None or similarity + (similarity == 1) > best[0]
         if len(self._heap) < self._limit:
             return True
         return bool(self._limit) and similarity + (similarity == 1) > self._heap[0][0]
 
     def best(self) -> list[_FrameRun]:
         """The best runs, the best one first."""
-        return [entry[-1] for entry in sorted(self._heap, key=lambda e: e[:-1], reverse=True)]
+        every = self._heap if self._each is None else self._each.values()
+        ordered = sorted(every, key=lambda e: e[:-1], reverse=True)
+        return [entry[-1] for entry in ordered[: self._limit]]
 
 
 def _like(

@@ -1,0 +1,48 @@
+"""What the library does, for Python's logging: loggers under ``sgstore``, at no cost where nobody listens.
+
+A program listens as to any other library: ``logging.basicConfig(level="DEBUG")``, or a level and a handler for
+``logging.getLogger("sgstore")``, as ``--verbose`` of the command line has them. There is a handler that does
+nothing from the first word on, so that nothing is printed by itself.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+__all__ = ["logger"]
+
+
+class _Logger:
+    """Logger of a room, made when it says something and somebody may listen.
+
+    Whoever listens has imported ``logging``. Where nobody has, it is not imported for us alone.
+    """
+
+    def __init__(self, room: str) -> None:
+        self._name = f"sgstore.{room}"
+        self._logger: Any = None
+
+    def debug(self, text: str, *values: object) -> None:
+        """Tell a step of the work: for whoever wants to know what takes long, or what was meant."""
+        self._tell("debug", text, values)
+
+    def info(self, text: str, *values: object) -> None:
+        """Tell what has been done."""
+        self._tell("info", text, values)
+
+    def _tell(self, level: str, text: str, values: tuple[object, ...]) -> None:
+        logging = sys.modules.get("logging")
+        if logging is None:
+            return
+        if self._logger is None:
+            ours = logging.getLogger("sgstore")
+            if not ours.handlers:
+                ours.addHandler(logging.NullHandler())
+            self._logger = logging.getLogger(self._name)
+        getattr(self._logger, level)(text, *values, stacklevel=3)
+
+
+def logger(room: str) -> _Logger:
+    """The logger of a room: ``sgstore.store`` for ``store``."""
+    return _Logger(room)
