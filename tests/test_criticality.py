@@ -9,7 +9,7 @@ import re
 import subprocess
 import sys
 from functools import cache
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -147,6 +147,53 @@ def test_no_drive_of_bounded_acceleration_meets_before_the_worst_case() -> None:
 
     assert np.isfinite(met).mean() > 0.5
     assert (worst <= met + 1e-9).all()
+
+
+# Mild case ----------------------------------------------------------------------------------------
+
+
+def grown(boxes: Floats, times: Floats) -> Floats:
+    """Boxes whose sides have moved outward by as much as 2 m/s² moves somebody."""
+    found = boxes.copy()
+    found[:, 4:6] += 2 * times[:, None] ** 2
+    return found
+
+
+@pytest.mark.parametrize("seed", range(20 if LONG else 1))
+def test_the_mild_case_is_when_growing_boxes_first_touch(seed: int) -> None:
+    for pairs in (random_movers(400, seed + 41), random_meetings(400, seed + 42)):
+        a, b = (boxes[:, :8] for boxes in pairs)
+        numbers = PairNumbers(a, b)
+        found = numbers["ttc_mild"]
+        assert np.isfinite(found).all()
+
+        assert distances(grown(a, found), grown(b, found), found).max() < 1e-6
+        for share in np.linspace(0, 1, 200, endpoint=False):
+            when = share * found
+            apart = distances(grown(a, when), grown(b, when), when)
+            assert (apart[found > 0] > 0).all()
+        assert np.array_equal(found == 0, numbers["gap"] == 0)
+        soon = ~np.isnan(numbers["ttc"])
+        assert (found[soon] <= numbers["ttc"][soon] + 1e-9).all()
+        assert (found > 0).mean() > 0.5
+
+
+def test_no_mild_drive_meets_before_the_mild_case_and_some_do_then() -> None:
+    a, b = random_movers(200, 44)
+    mild = PairNumbers(a, b)["ttc_mild"]
+    met = np.full(len(a), np.inf)
+    ways = [complex(lon, lat) for lon in (-2, 0, 2) for lat in (-2, 0, 2)]
+    for pushes in product(ways, repeat=2):
+        for share in (0.999, 1.001):
+            moved = [box.copy() for box in (a, b)]
+            for box, push in zip(moved, pushes, strict=True):
+                off = push * np.exp(1j * box[:, 3]) * (share * mild) ** 2 / 2
+                box[:, :2] += np.stack([off.real, off.imag], axis=1)
+            hit = distances(*moved, share * mild) <= 0
+            met = np.where(hit, np.minimum(met, share), met)
+
+    assert (met[mild > 0] > 1).all()
+    assert (met[mild > 0] < np.inf).mean() > 0.4
 
 
 # One behind the other -----------------------------------------------------------------------------
@@ -427,7 +474,7 @@ def meetings() -> tuple[Floats, Floats]:
 
 
 def test_every_measure_has_a_definition() -> None:
-    assert {*DEFINITIONS, "dce", "dce_3s", "ttce", "wttc"} == {*MEASURES}
+    assert {*DEFINITIONS, "dce", "dce_3s", "ttce", "ttc_mild", "wttc"} == {*MEASURES}
 
 
 @pytest.mark.parametrize("name", DEFINITIONS)

@@ -47,7 +47,7 @@ class OrderOptions:
             "-m",
             metavar="NAME",
             help="Rank by this measure of criticality, or by an expression, least first; may be repeated.",
-            show_default="closing_time, dce_3s",
+            show_default="closing_time, ttc_mild",
         ),
     ] = None
     budget: Budget = ""

@@ -11,6 +11,7 @@ import sgstore.pair_numbers._crossing as crossing
 import sgstore.pair_numbers._encounter as encounter
 import sgstore.pair_numbers._evading as evading
 import sgstore.pair_numbers._following as following
+import sgstore.pair_numbers._mild as mild
 import sgstore.pair_numbers._rss as rss
 from sgstore.pair_numbers._ways import WAYS
 
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
 
     from sgstore.pair_numbers._declared import PairFunction
 
-_FAMILIES: Final = (boxes, encounter, following, crossing, rss, evading)  # new columns come behind
+# New columns come behind.
+_FAMILIES: Final = (boxes, encounter, following, crossing, rss, evading, mild)
 
 PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
     name: one for family in _FAMILIES for name, one in family.NUMBERS.items()
