@@ -147,7 +147,7 @@ soak-explorer: $(VENV)/.dev
 # In an environment of its own, because torch is large.
 pyg: $(VENV)/.base
 	@test -x build/pyg/bin/python || $(BIN)/python -m venv build/pyg || $(BIN)/python -m virtualenv -q build/pyg
-	@build/pyg/bin/python -m pip install -q --disable-pip-version-check -e '.[pyg]'
+	@build/pyg/bin/python -m pip install -q --disable-pip-version-check -e '.[pyg,viz]' ipython
 	build/pyg/bin/python tests/learning.py
 
 # Likewise: Rerun takes 500 MB. Its own reader looks at what is written for it.

@@ -613,7 +613,7 @@ class Store:
         form : {"gif", "mp4", "webm"}
             The last two with the extra ``video``.
         **look
-            ``camera``, ``relations``, ``radius``, ``north_up``, ``diagram``, ``fps``: see
+            ``camera``, ``relations``, ``radius``, ``north_up``, ``diagram``, ``names``, ``fps``: see
             :func:`sgstore.draw.draw_clip`.
 
         Raises
@@ -669,7 +669,7 @@ class Store:
         query : str, Pattern or networkx graph, optional
             As :meth:`find` takes it; what it matches in the frame is marked.
         **look
-            ``camera``, ``relations``, ``radius``, ``north_up``, ``diagram``: see
+            ``camera``, ``relations``, ``radius``, ``north_up``, ``diagram``, ``names``: see
             :func:`sgstore.draw.draw_stored`.
 
         Returns

@@ -407,10 +407,15 @@ class EntityConstants(NamedTuple):
     kind: str
     special: str
     subkind: str
+    type_name: str = ""
 
     def attributes(self, *, is_ego: bool, is_static: bool) -> Attributes:
         """As they stand in a graph."""
-        texts = {"special": self.special, "subkind": self.subkind}
+        texts = {
+            "type_name": self.type_name,
+            "special": self.special,
+            "subkind": self.subkind,
+        }
         return {
             "kind": self.kind,
             "name": f"{self.kind} {self.node}",
@@ -714,9 +719,8 @@ class Stepper:
         if ident in self._moving:
             self._moving.move_to_end(ident)
         elif ident not in self._standing:
-            known = EntityConstants(
-                self._next, ident, KINDS[entity.kind], entity.special, entity.subkind
-            )
+            texts = entity.special, entity.subkind, entity.type_name
+            known = EntityConstants(self._next, ident, KINDS[entity.kind], *texts)
             self._next += 1
             if ident in new:
                 self._standing[ident] = entity, known

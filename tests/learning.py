@@ -5,11 +5,13 @@
 Exports the bundled recording with a label, reads it with ``torch_geometric.loader``, one graph and one sequence
 at a time, homogeneous and heterogeneous, against the arrays of the export; then trains a small network of the
 kind of RoadScene2Vec's (relational convolutions over one-hot types, a recurrent net over the frames of a
-clip) for one epoch each, and looks whether its loss fell.
+clip) for one epoch each, and looks whether its loss fell. Then it runs the notebook examples/learning.ipynb.
 """
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -38,7 +40,10 @@ def exported(folder: Path) -> Path:
     if to.exists():
         return to
     ingest(store_path, [RECORDING])
-    clips = [Clip("town", s * 10**9, (s + CLIP_S) * 10**9 - 1) for s in range(0, 75, CLIP_S)]
+    half = 50_000_000  # of a period: times that jitter belong to one clip
+    clips = [
+        Clip("town", s * 10**9 - half, (s + CLIP_S) * 10**9 - half) for s in range(0, 75, CLIP_S)
+    ]
     export = labelled(Export(sgstore.open(store_path), tuple(clips)), {"people": LABEL})
     write_export(export, to, "pyg")
     return to
@@ -147,6 +152,17 @@ def main(folder: Path) -> None:
         before, after = epoch(network, batches)
         print(f"{name}: loss {before:.3f} before one epoch, {after:.3f} after it")
         assert after < before
+    run_notebook(to.parent)
+
+
+def run_notebook(folder: Path) -> None:
+    """The notebook runs from top to bottom, in a folder of its own."""
+    here = Path(__file__).parent
+    program, notebook = here / "notebooks.py", here.parent / "examples" / "learning.ipynb"
+    with tempfile.TemporaryDirectory(dir=folder) as place:
+        env = os.environ | {"MPLBACKEND": "Agg", "IPYTHONDIR": place}
+        subprocess.run([sys.executable, program, notebook], cwd=place, env=env, check=True)
+    print(f"{notebook.name} runs from top to bottom")
 
 
 if __name__ == "__main__":

@@ -437,6 +437,20 @@ def test_what_a_query_matches_in_a_stored_frame_is_marked(store: Path, tmp_path:
     assert not draw_stored(opened, "town#217", tmp_path / "b.svg", matches=nothing, camera="none")
 
 
+def test_entities_are_called_as_the_simulator_calls_them(store: Path, tmp_path: Path) -> None:
+    opened = Store(store)
+    names = {"number": "bus 3", "ident": "courier", "type": "TYPE_BUS"}
+    for name in names:
+        draw_stored(opened, "town#217", tmp_path / f"{name}.svg", camera="none", names=name)
+    drawn = {name: (tmp_path / f"{name}.svg").read_text(encoding="utf-8") for name in names}
+
+    assert {name: [w for w in names.values() if w in drawn[name]] for name in names} == {
+        name: [word] for name, word in names.items()
+    }
+    clip = draw_clip(opened, ("town@21s", "town@21s"), tmp_path / "a.gif", names="ident")
+    assert clip == 0
+
+
 def test_the_verb_draws_frames_and_clips(
     store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

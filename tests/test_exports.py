@@ -739,6 +739,20 @@ def test_graphs_to_learn_from_are_those_of_the_abstraction(
         }
 
 
+def test_nodes_to_learn_from_have_the_names_of_the_simulator(
+    export: Export, written: Callable[..., Path]
+) -> None:
+    data = GraphData(written("pyg"))
+    sql = "SELECT node_id, ident, type_name FROM entities"
+    known = {node: (ident, kind) for node, ident, kind in export.store.sql(sql)}
+
+    for number in (0, len(data) - 1):
+        nodes = data.arrays(number)["node_id"].tolist()
+        assert data.identities(number) == [known.get(node, ("", "")) for node in nodes]
+    with pytest.raises(IndexError):
+        data.identities(len(data))
+
+
 def _of_node(arrays: dict[str, Any], row: int) -> tuple[str, int]:
     kind, node = ACTORS[arrays["node_type"][row]], int(arrays["node_id"][row])
     return kind, node if node >= 0 and kind != "ego_car" else -1

@@ -338,7 +338,7 @@ def agree(online: SceneGraph, stored: SceneGraph, idents: dict[int, str]) -> Non
 
 
 def same(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
-    assert ours.keys() - {"ident"} == theirs.keys()
+    assert ours.keys() == theirs.keys()
     for name, value in theirs.items():
         if name in {"heading", "accel"}:  # from radians by another library than numpy
             assert ours[name] == pytest.approx(value, rel=1e-12, abs=1e-12)

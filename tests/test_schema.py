@@ -101,10 +101,10 @@ def test_lights_of_vehicles_are_the_vocabulary_bit_by_bit(empty: duckdb.DuckDBPy
     loose = duckdb.connect()  # where nothing has to be known
     loose.execute(re.sub(r"(?<!IS) NOT NULL", "", schema_sql()))
     loose.execute("INSERT INTO inside.trace BY NAME SELECT 0 AS trace_id")
+    loose.execute("INSERT INTO inside.entity BY NAME SELECT 0 AS trace_id, 0 AS node_id")
     for bit in range(len(VEHICLE_LIGHTS)):
-        loose.execute(
-            f"INSERT INTO inside.state BY NAME SELECT {bit} AS frame_id, {1 << bit} AS lights"
-        )
+        row = f"{bit} AS frame_id, 0 AS node_id, {1 << bit} AS lights"
+        loose.execute(f"INSERT INTO inside.state BY NAME SELECT {row}")
     lights = ", ".join(c for c in columns if c.startswith("light_") and c != "light_state")
     rows = loose.execute(f"SELECT {lights} FROM nodes ORDER BY frame_id").fetchall()
 

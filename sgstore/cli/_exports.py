@@ -317,6 +317,10 @@ class DrawOptions:
     graph: Annotated[bool, Option("--graph", help="Beside it the graph as nodes and edges.")] = (
         False
     )
+    names: Annotated[
+        Literal["number", "ident", "type"],
+        Option("--names", help="What entities are called: by number, the simulator's id or type."),
+    ] = "number"
     fps: Annotated[
         float, Option("--fps", min=0.1, max=50.0, help="Pictures a second of an animation.")
     ] = 10.0
@@ -330,6 +334,7 @@ class DrawOptions:
             "radius": self.radius,
             "north_up": self.north_up,
             "diagram": self.graph,
+            "names": self.names,
         }
 
 

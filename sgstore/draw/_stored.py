@@ -29,7 +29,7 @@ from sgstore.draw._picture import (
     title_of,
 )
 from sgstore.draw._scene import DrawnFrame
-from sgstore.draw._view import view_of
+from sgstore.draw._view import called, view_of
 from sgstore.errors import ExportError, StoreError
 from sgstore.opendrive import read_map
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
     from sgstore.draw._legend import Entry
-    from sgstore.draw._view import Relations
+    from sgstore.draw._view import Names, Relations
     from sgstore.graph import SceneGraph
     from sgstore.query import Store
     from sgstore.roads import RoadMap
@@ -177,6 +177,7 @@ def draw_stored(  # noqa: PLR0913  as many options as the picture has
     radius: float | None = None,
     north_up: bool = False,
     diagram: bool = False,
+    names: Names = "number",
 ) -> bool:
     """Draw a frame of a store from above.
 
@@ -193,6 +194,8 @@ def draw_stored(  # noqa: PLR0913  as many options as the picture has
         Channel of the picture to put beside it; by default the first that carries pictures, ``none`` for none.
     relations, radius, north_up, diagram
         See :func:`sgstore.draw.draw_frame`.
+    names : str
+        What entities are called: ``number`` (``car 17``), ``ident`` (the simulator's id), ``type`` (its type).
 
     Returns
     -------
@@ -208,7 +211,7 @@ def draw_stored(  # noqa: PLR0913  as many options as the picture has
         ref = store.file.frame(frame)
         bindings = matches.bindings(ref) if matches is not None else []
         draw_frame(
-            store.file.graph(ref.frame_id),
+            called(store.file.graph(ref.frame_id), names),
             map_of(store, ref.trace),
             to,
             highlight=bindings[0] if bindings else {},
@@ -249,6 +252,7 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
     radius: float | None = None,
     north_up: bool = False,
     diagram: bool = False,
+    names: Names = "number",
     fps: float = FPS,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> int:
@@ -263,7 +267,7 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
         Pictures a second at most; of frames that come faster some are left out.
     on_frame : function, optional
         Called with the number of pictures drawn and of all, after each.
-    store, matches, camera, relations, radius, north_up, diagram
+    store, matches, camera, relations, radius, north_up, diagram, names
         See :func:`draw_stored`.
 
     Returns
@@ -286,7 +290,8 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
         for start in range(0, len(refs), AT_ONCE):
             some = refs[start : start + AT_ONCE]
             with store.file.snapshot():
-                graphs = [*store.file.graphs(np.array([ref.frame_id for ref in some]))]
+                scenes = store.file.graphs(np.array([ref.frame_id for ref in some]))
+                graphs = [called(graph, names) for graph in scenes]
                 found = [matches.bindings(ref) if matches is not None else [] for ref in some]
                 pictures = [
                     _picture(store, ref, camera, usual) if seen and not diagram else None

@@ -7,7 +7,7 @@ middle and heads upwards, unless north is wanted up. Pure functions; no drawing 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -133,8 +133,30 @@ def counted(number: int, thing: str) -> str:
     return f"{number:,} {thing}{'' if number == 1 or thing == 'vegetation' else 's'}"
 
 
+CALLED: Final = "called"
+"""Attribute of a node of a drawn graph that says what it is called there."""
+
+Names = Literal["number", "ident", "type"]
+"""What entities are called in pictures: ``car 17``; as the simulator calls them; by its name of their type."""
+
+
+def called(graph: SceneGraph, names: Names) -> SceneGraph:
+    """A graph whose entities are called otherwise in pictures, where that is known."""
+    if names == "number":
+        return graph
+    key = {"ident": "ident", "type": "type_name"}[names]
+    nodes = {
+        node: {CALLED: about[key], **about} if about.get(key) else about
+        for node, about in graph.nodes.items()
+    }
+    return replace(graph, nodes=nodes)
+
+
 def caption(node: int, attributes: Mapping[str, Any]) -> str:
-    """Name of a node in a picture: ``car 17``, ``lane 12/0/-1``, ``ego (car 0)``."""
+    """Name of a node in a picture: what it is called, ``car 17``, ``lane 12/0/-1``, ``ego (car 0)``."""
+    told = clean(attributes.get(CALLED, ""), 32)
+    if told:
+        return f"ego ({told})" if attributes.get("is_ego") else told
     kind = clean(attributes.get("kind", "node"), 16)
     name = clean(attributes.get("name", ""), 24)
     if node < 0 and name == kind:

@@ -280,7 +280,7 @@ def _add_node(
     entity: Any, node: int, about: dict[str, Any], place: tuple[float, float, float]
 ) -> None:
     entity.metadata.add(key="node_id", value=str(node))
-    for key in ("kind", "special", "speed", "light_state"):
+    for key in ("kind", "ident", "type_name", "special", "speed", "light_state"):
         if key in about:
             entity.metadata.add(key=key, value=str(about[key]))
     solid = is_solid(node, about)

@@ -71,6 +71,8 @@ GRAPH_SCHEMA: Final[dict[str, Any]] = {
                     "id": {"type": "integer"},
                     "kind": {"type": "string"},
                     "name": {"type": "string"},
+                    "ident": {"type": "string", "description": "The simulator's id."},
+                    "type_name": {"type": "string", "description": "The simulator's type."},
                     "is_ego": {"type": "boolean"},
                     "is_static": {"type": "boolean"},
                 },

@@ -24,7 +24,7 @@ import numpy as np
 from sgstore.abstractions import abstraction_named
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import WrittenFile
-from sgstore.exporters.graph_data import ABOUT, FOLDER, FORMAT, VERSION, GraphData
+from sgstore.exporters.graph_data import ABOUT, ENTITIES, FOLDER, FORMAT, VERSION, GraphData
 from sgstore.vocabulary import normalize_name
 
 if TYPE_CHECKING:
@@ -179,12 +179,33 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
     about = _about(export, abstraction, columns)
     text = json.dumps(about, indent=2, ensure_ascii=False) + "\n"
     (folder / ABOUT).write_text(text, encoding="utf-8")
+    entities = _write_entities(export, folder)
     _test(folder, columns)
     graphs = sum(last - first for first, last in columns.clips)
     return [
         WrittenFile.of(folder / ABOUT, "clips", len(columns.clips)),
+        WrittenFile.of(folder / ENTITIES, "entities", entities),
         WrittenFile.of(place, "graphs", graphs),
     ]
+
+
+_IDENTITIES: Final = """
+SELECT node_id, ident, type_name FROM entities
+WHERE trace_id = $trace AND (ident IS NOT NULL OR type_name IS NOT NULL) ORDER BY node_id
+"""
+
+
+def _write_entities(export: Export, folder: Path) -> int:
+    """Write what the simulators call the entities of the traces, a line each; how many there are."""
+    written = 0
+    with (folder / ENTITIES).open("x", encoding="utf-8", newline="\n") as stream:
+        for trace in dict.fromkeys(clip.trace for clip in export.clips):
+            values = {"trace": export.trace(trace).trace_id}
+            for node, ident, type_name in export.store.file.rows(_IDENTITIES, values):
+                told = {"trace": trace, "node_id": node, "ident": ident, "type_name": type_name}
+                stream.write(json.dumps(told, ensure_ascii=False) + "\n")
+                written += 1
+    return written
 
 
 def _about(export: Export, abstraction: str, columns: _TensorColumns) -> dict[str, Any]:

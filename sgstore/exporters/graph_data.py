@@ -15,6 +15,7 @@
 from __future__ import annotations
 
 import json
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
 ABOUT: Final = "graphs.json"
 FOLDER: Final = "graphs"
+ENTITIES: Final = "entities.jsonl"
 FORMAT: Final = "sgstore.derive"
 VERSION: Final = 1
 
@@ -121,6 +123,41 @@ class GraphData:
         found["edge_index"] = found["edge_index"].T
         return found
 
+    def identities(self, number: int) -> list[tuple[str, str]]:
+        """Of each node of a graph the simulator's id, and its name of the type.
+
+        Returns
+        -------
+        list of (str, str)
+            In the order of ``node_id``; empty texts of parts of the road map, and where nothing is known.
+
+        Raises
+        ------
+        IndexError
+            There is no graph of that number.
+        ExportError
+            The file of the entities cannot be read. (Exports before 0.2 have none.)
+        """
+        nodes = self.arrays(number)
+        trace = self.about["clips"][int(nodes["clip"])]["trace"]
+        known = self._entities.get(trace, {})
+        return [known.get(node, ("", "")) for node in nodes["node_id"].tolist()]
+
+    @cached_property
+    def _entities(self) -> dict[str, dict[int, tuple[str, str]]]:
+        """Trace → node → the simulator's id and type."""
+        found: dict[str, dict[int, tuple[str, str]]] = {}
+        file = self.folder / ENTITIES
+        try:
+            with file.open(encoding="utf-8") as stream:
+                for line in stream:
+                    told = json.loads(line)
+                    names = told["ident"] or "", told["type_name"] or ""
+                    found.setdefault(told["trace"], {})[told["node_id"]] = names
+        except (OSError, ValueError, TypeError, LookupError) as error:
+            raise ExportError(f"{file}: cannot be read: {error}") from error
+        return found
+
     def sequences(self) -> Iterator[range]:
         """The graphs of each clip, in order of time."""
         for clip in self.about["clips"]:
@@ -189,6 +226,9 @@ class GraphDataset:
         Which graphs; by default all.
     like : GraphData, optional
         Whose numbers types and relations have: those of what was learned from. Without one, its own.
+    names : bool
+        Whether each graph has ``ident`` and ``type_name``, lists with a text for each node: what the
+        simulator calls it, and its type.
 
     Raises
     ------
@@ -214,6 +254,7 @@ class GraphDataset:
         label: str | None = None,
         rows: Sequence[int] | None = None,
         like: GraphData | None = None,
+        names: bool = False,
     ) -> None:
         try:
             self._torch: Any = import_module("torch")
@@ -226,6 +267,7 @@ class GraphDataset:
             raise ExportError(f"{folder}: no label {label!r}; there are: {known}")
         self._label = label
         self._hetero = hetero
+        self._names = names
         self._rows = range(len(self.data)) if rows is None else rows
         about = (like or self.data).about
         self.node_types: list[str] = about["node_types"]
@@ -246,6 +288,9 @@ class GraphDataset:
         )
         made.frame_id = int(graph["frame_id"])
         made.clip = int(graph["clip"])
+        if self._names:
+            called = self.data.identities(self._rows[number])
+            made.ident, made.type_name = ([one[i] for one in called] for i in (0, 1))
         if self._label is not None:
             value = float(graph[f"label_{self._label}"])
             made.y = self._torch.tensor([value], dtype=self._torch.float32)
