@@ -42,6 +42,7 @@ TESTS = {
     "lang": "lang_* cookbook textmate tck union second_match sql_patterns needs notes library library_data"
     " like tolerance",
     "map_files": "cli_map lanelet2 sumo",
+    "importing": "importing openlabel",
     "markup": "opendrive_document lanelet2",
     "matches": "query query_recordings api rows",
     "mcap": "mcap_* spool ahead",

@@ -416,10 +416,11 @@ def import_(
         Argument(metavar="FILE…", help="Files of graphs, each a trace; .xz, .gz and .bz2 too."),
     ],
     form_of_graphs: Annotated[
-        Literal["s3c", "nodelink", "csv"],
+        Literal["s3c", "nodelink", "csv", "openlabel"],
         Option(
             "--format",
-            help="s3c: its CSV; csv: graph, src, relation, dst; nodelink: JSON of networkx.",
+            help="s3c: its CSV; csv: graph, src, relation, dst; nodelink: JSON of networkx;"
+            " openlabel: ASAM OpenLABEL 1.0.",
         ),
     ],
     force: Force = False,

@@ -4,6 +4,10 @@ An object is an entity, called as the simulator calls it; its boxes stand in the
 never move at the object. Numbers of frames are those of the trace. A relation of two entities is one relation
 with the intervals of frames in which it holds. Parts of the road map are not in it.
 
+What was imported from OpenLABEL has the keys, numbers of frames, metadata and attributes that it had there.
+Places are rounded to 0.1 mm, which a store keeps up to a kilometre from its middle, so that what is imported is
+exported as it was.
+
 Source: ASAM OpenLABEL 1.0.0, its JSON schema.
 """
 
@@ -38,14 +42,27 @@ _STATES: Final = """
 SELECT frame_id, node_id, is_static, is_ego, x::DOUBLE AS x, y::DOUBLE AS y, z::DOUBLE AS z,
        heading::DOUBLE AS heading, pitch::DOUBLE AS pitch, roll::DOUBLE AS roll,
        length::DOUBLE AS length, width::DOUBLE AS width, height::DOUBLE AS height,
-       speed::DOUBLE AS speed, light_state::VARCHAR AS light_state
+       speed::DOUBLE AS speed, vx::DOUBLE AS vx, vy::DOUBLE AS vy, vz::DOUBLE AS vz,
+       light_state::VARCHAR AS light_state
 FROM nodes WHERE frame_id >= $first AND frame_id <= $last AND node_id >= 0 ORDER BY frame_id, node_id
 """
 _EDGES: Final = """
 SELECT frame_id, src, relation::VARCHAR AS relation, dst FROM edges
 WHERE frame_id >= $first AND frame_id <= $last AND src >= 0 AND dst >= 0 ORDER BY frame_id
 """
+_OWN: Final = """
+SELECT frame_id, node_id, name, value::VARCHAR AS value FROM attributes
+WHERE frame_id >= $first AND frame_id <= $last AND node_id >= 0 ORDER BY frame_id, node_id, name
+"""
+_NAMES: Final = """
+SELECT frame_id, graph FROM imports WHERE frame_id >= $first AND frame_id <= $last
+"""
 _SIZE: Final = ("length", "width", "height")
+_PLACE_DIGITS: Final = 4
+_TURN_DIGITS: Final = 9
+_UID: Final = "uid"
+_SECTIONS: Final = {"action": "actions", "event": "events", "context": "contexts", "tag": "tags"}
+"""Kinds of imported elements that are no objects, and where they stand."""
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
@@ -96,10 +113,32 @@ class _Labelling:
 
     def __init__(self, export: Export, frames: ClipFrames) -> None:
         self._export, self._frames = export, frames
+        self._trace = export.trace(frames.clip.trace)
+        self._again = self._trace.flavour == "openlabel"
         self.seen: dict[int, _Spans] = {}
         self._edges: dict[tuple[int, str, int], _Spans] = {}
         self._egos: set[int] = set()
-        self._numbers: list[int] = frames.seq.tolist()
+        self._uids: dict[int, str] = {}
+        self._tags: dict[int, dict[str, Any]] = {}
+        self._kinds: dict[int, str] = {}
+        self._entities = self._known()
+        self._numbers = self._numbered()
+
+    def _known(self) -> list[dict[str, Any]]:
+        """What does not change of the entities of the trace."""
+        rows = self._export.store.file.rows(_OBJECTS, {"trace": self._trace.trace_id})
+        found = [dict(zip(rows.columns, row, strict=True)) for row in rows]
+        self._kinds = {entity["node_id"]: entity["kind"] for entity in found}
+        return found
+
+    def _numbered(self) -> list[int]:
+        """Numbers of the frames."""
+        numbers: list[int] = self._frames.seq.tolist()
+        if not self._again or not numbers:
+            return numbers
+        names = dict(self._export.store.file.rows(_NAMES, self._frames.bounds))
+        told = [str(names.get(frame, "")) for frame in self._frames.frame_id.tolist()]
+        return [int(one) for one in told] if all(one.isdecimal() for one in told) else numbers
 
     def write(self, stream: TextIO) -> None:
         """Write it: frames as they are read, then what is known at their end."""
@@ -119,14 +158,14 @@ class _Labelling:
             spans.add(place)
         tail = {
             "frame_intervals": spans.told(self._numbers),
-            "objects": self._objects(),
+            **self._elements(),
             "relations": self._relations(),
         }
         stream.writelines(f',\n"{key}": {_json(value)}' for key, value in tail.items())
         stream.write("\n}}\n")
 
     def _metadata(self) -> dict[str, Any]:
-        clip, trace = self._frames.clip, self._export.trace(self._frames.clip.trace)
+        clip, trace = self._frames.clip, self._trace
         told: dict[str, Any] = {
             "schema_version": SCHEMA_VERSION,
             "name": clip.trace,
@@ -137,63 +176,108 @@ class _Labelling:
             "end_ns": clip.end_ns,
         }
         query = self._export.provenance.get("query", "")
-        return told | ({"comment": query} if query else {})
+        told |= {"comment": query} if query else {}
+        return told | trace.report.get("metadata", {}) if self._again else told
 
     def _window(self, frames: ClipFrames) -> Iterable[tuple[int, dict[str, Any]]]:
         """Numbers of frames with what is in them."""
         place = {int(one): i for i, one in enumerate(self._frames.frame_id.tolist())}
-        objects: dict[int, dict[str, Any]] = {one: {} for one in frames.frame_id.tolist()}
+        ids: list[int] = frames.frame_id.tolist()
+        own = self._own(frames)
+        within: dict[int, dict[str, dict[str, Any]]] = {one: {"objects": {}} for one in ids}
         rows = self._export.store.file.rows(_STATES, frames.bounds)
         for row in rows:
             state: dict[str, Any] = dict(zip(rows.columns, row, strict=True))
             frame_id, node = state["frame_id"], state["node_id"]
-            if frame_id in objects:
+            if frame_id in within:
                 self.seen.setdefault(node, _Spans()).add(place[frame_id])
                 if state["is_ego"]:
                     self._egos.add(node)
-                data = {} if state["is_static"] else _data(state)
-                objects[frame_id][str(node)] = {"object_data": data} if data else {}
+                kind = self._kinds.get(node, "")
+                data = {} if state["is_static"] or kind in _SECTIONS else _data(state)
+                for key, rest in _typed(own.get((frame_id, node), {})).items():
+                    data[key] = [*data.get(key, []), *rest]
+                section = _SECTIONS.get(kind, "objects")
+                key = f"{kind if kind in _SECTIONS else 'object'}_data"
+                uid = self._uids.get(node, str(node))
+                if kind != "tag":  # a tag is of the whole
+                    within[frame_id].setdefault(section, {})[uid] = {key: data} if data else {}
+                else:
+                    self._tags[node] = data
         for frame_id, src, relation, dst in self._export.store.file.rows(_EDGES, frames.bounds):
-            if frame_id in objects:
+            if frame_id in within:
                 self._edges.setdefault((src, relation, dst), _Spans()).add(place[frame_id])
         labels = self._export.label_columns(frames.frame_id) if self._export.labels else {}
-        for row, frame_id in enumerate(frames.frame_id.tolist()):
-            properties: dict[str, Any] = {"timestamp": round(float(frames.t[row]), 9)}
-            properties |= {"time_ns": int(frames.time_ns[row])}
+        for row, frame_id in enumerate(ids):
+            time_ns = int(frames.time_ns[row])
+            properties: dict[str, Any] = {"timestamp": round(time_ns / 1e9, 9), "time_ns": time_ns}
             told = {name: _value(values[row]) for name, values in labels.items()}
             properties |= {"labels": told} if told else {}
-            frame = {"frame_properties": properties, "objects": objects[frame_id]}
-            yield int(frames.seq[row]), frame
+            number = self._numbers[place[frame_id]]
+            yield number, {"frame_properties": properties, **within[frame_id]}
 
-    def _objects(self) -> dict[str, Any]:
-        rows = self._export.store.file.rows(
-            _OBJECTS, {"trace": self._export.trace(self._frames.clip.trace).trace_id}
-        )
-        found: dict[str, Any] = {}
-        for row in rows:
-            entity: dict[str, Any] = dict(zip(rows.columns, row, strict=True))
-            node = entity["node_id"]
+    def _own(self, frames: ClipFrames) -> dict[tuple[int, int], dict[str, Any]]:
+        """Attributes that no column has, by frame and node; keys of elements are taken note of."""
+        found: dict[tuple[int, int], dict[str, Any]] = {}
+        if not self._trace.report.get("imported"):
+            return found
+        for frame_id, node, name, value in self._export.store.file.rows(_OWN, frames.bounds):
+            told = json.loads(value)
+            if name == _UID and self._again and isinstance(told, str):
+                self._uids[node] = told
+            else:
+                found.setdefault((frame_id, node), {})[name] = told
+        return found
+
+    def _elements(self) -> dict[str, dict[str, Any]]:
+        """Objects and, where there are any, other elements."""
+        found: dict[str, dict[str, Any]] = {"objects": {}}
+        for entity in self._entities:
+            node, kind = entity["node_id"], entity["kind"]
             if node not in self.seen:
                 continue
+            uid, spans = self._uids.get(node, str(node)), self.seen[node].told(self._numbers)
+            if kind in _SECTIONS:
+                told: dict[str, Any] = {"type": entity["type_name"] or kind}
+                if kind == "tag":
+                    data = self._tags[node]
+                    told |= {"tag_data": data} if data else {}
+                else:
+                    told |= {"name": entity["ident"] or uid, "frame_intervals": spans}
+                found.setdefault(_SECTIONS[kind], {})[uid] = told
+                continue
             texts = ("type_name", "special", "subkind", "map_ref")
-            data: dict[str, Any] = {
+            data = {
                 "text": [{"name": key, "val": entity[key]} for key in texts if entity[key]],
                 "boolean": [{"name": "is_static", "val": bool(entity["is_static"])}],
             }
             data["boolean"] += [{"name": "is_ego", "val": True}] if node in self._egos else []
             if entity["is_static"]:
                 data |= {key: value for key, value in _data(entity).items() if key not in data}
-            found[str(node)] = {
+            found["objects"][uid] = {
                 "name": entity["ident"] or str(node),
-                "type": entity["kind"],
-                "frame_intervals": self.seen[node].told(self._numbers),
+                "type": kind,
+                "frame_intervals": spans,
                 "object_data": {key: value for key, value in data.items() if value},
             }
         return found
 
+    def objects(self) -> set[str]:
+        """Keys of the objects that are in it."""
+        nodes = [node for node in self.seen if self._kinds.get(node) not in _SECTIONS]
+        return {self._uids.get(node, str(node)) for node in nodes}
+
     def _relations(self) -> dict[str, Any]:
         def agent(node: int) -> list[dict[str, str]]:
-            return [{"uid": str(node), "type": "object"}]
+            kind = self._kinds.get(node, "")
+            form = kind if kind in _SECTIONS else "object"
+            return [{"uid": self._uids.get(node, str(node)), "type": form}]
+
+        def order(edge: tuple[tuple[int, str, int], _Spans]) -> tuple[Any, ...]:
+            src, relation, dst = edge[0]
+            ends = (self._uids.get(node, str(node)) for node in (src, dst))
+            first, last = ((len(uid), uid) if uid.isdecimal() else (99, uid) for uid in ends)
+            return first, relation, last
 
         return {
             str(number): {
@@ -204,7 +288,7 @@ class _Labelling:
                 "frame_intervals": spans.told(self._numbers),
             }
             for number, ((src, relation, dst), spans) in enumerate(
-                sorted(self._edges.items(), key=lambda e: e[0])
+                sorted(self._edges.items(), key=order)
             )
         }
 
@@ -217,36 +301,58 @@ def _data(state: Mapping[str, Any]) -> dict[str, Any]:
     place[2] = 0.0 if place[2] is None else place[2]
     told: dict[str, Any] = {}
     size = [state[key] for key in _SIZE]
+    place = _rounded(place, _PLACE_DIGITS)
     if None in size or state["heading"] is None:
-        told["point3d"] = [{"name": "place", "val": _rounded(place), "coordinate_system": AXES}]
+        told["point3d"] = [{"name": "place", "val": place, "coordinate_system": AXES}]
     else:
         turn = _quaternion(
             *(np.radians(state.get(key) or 0.0) for key in ("heading", "pitch", "roll"))
         )
-        val = _rounded([*place, *turn, *size])
+        val = [*place, *_rounded(turn, _TURN_DIGITS), *_rounded(size)]
         told["cuboid"] = [{"name": "box", "val": val, "coordinate_system": AXES}]
-    if state.get("speed") is not None:
-        told["num"] = [{"name": "speed", "val": round(state["speed"], DIGITS)}]
+    velocity = [state.get(key) for key in ("vx", "vy", "vz")]
+    if None not in velocity[:2]:
+        val = _rounded([0.0 if one is None else one for one in velocity])
+        told["vec"] = [{"name": "velocity", "val": val, "coordinate_system": AXES}]
+        told["num"] = [{"name": "speed", "val": round(float(np.hypot.reduce(val)), DIGITS)}]
     if state.get("light_state"):
         told["text"] = [{"name": "light_state", "val": state["light_state"]}]
     return told
 
 
+def _typed(attributes: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
+    """Attributes of a client's own as data of an element: by their form, which their values tell."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for name, value in attributes.items():
+        form, told = "text", value
+        if isinstance(value, bool):
+            form = "boolean"
+        elif isinstance(value, int | float):
+            form = "num"
+        elif isinstance(value, list) and all(type(one) in {int, float, str} for one in value):
+            form = "vec"
+        elif not isinstance(value, str):
+            told = _json(value)
+        found.setdefault(form, []).append({"name": name, "val": told})
+    return found
+
+
 def _quaternion(heading: float, pitch: float, roll: float) -> list[float]:
-    """x, y, z, w of the turn about z, then y, then x; rad."""
+    """x, y, z, w of the turn about z, then y, then x; rad. Of the two that mean it the one with w >= 0."""
     (sy, cy), (sp, cp), (sr, cr) = (
         (float(np.sin(a / 2)), float(np.cos(a / 2))) for a in (heading, pitch, roll)
     )
-    return [
+    turn = [
         sr * cp * cy - cr * sp * sy,
         cr * sp * cy + sr * cp * sy,
         cr * cp * sy - sr * sp * cy,
         cr * cp * cy + sr * sp * sy,
     ]
+    return turn if turn[3] >= 0 else [-one for one in turn]
 
 
-def _rounded(values: Iterable[float]) -> list[float]:
-    return [round(float(value), DIGITS) + 0.0 for value in values]
+def _rounded(values: Iterable[float], digits: int = DIGITS) -> list[float]:
+    return [round(float(value), digits) + 0.0 for value in values]
 
 
 def _value(value: Any) -> Any:
@@ -261,7 +367,7 @@ def _test(file: Path, clip: _Labelling) -> None:
     """Read a file again: its frames and objects are those that were written."""
     try:
         told = json.loads(file.read_text(encoding="utf-8"))["openlabel"]
-        wrong = {*told["objects"]} != {str(node) for node in clip.seen} or not told["frames"]
+        wrong = {*told["objects"]} != clip.objects() or not told["frames"]
     except (ValueError, KeyError, TypeError) as error:
         raise ExportError(f"{file.name}: cannot be read back: {error}") from error
     if wrong:

@@ -52,7 +52,7 @@ _PACKED: Final = {".xz": lzma.open, ".gz": gzip.open, ".bz2": bz2.open}
 def stem_of(path: Path) -> str:
     """The name of a file without what says how it is written: ``graphs.csv.xz`` is ``graphs``."""
     name = path.name
-    for ending in (*_PACKED, ".csv", ".json", ".ndjson", ".jsonl"):
+    for ending in (*_PACKED, ".csv", ".json", ".ndjson", ".jsonl", ".openlabel"):
         if name.lower().endswith(ending) and len(name) > len(ending):
             name = name[: -len(ending)]
     return name

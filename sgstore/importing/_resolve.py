@@ -73,12 +73,15 @@ class GivenNode:
     where : str
         Place in the file, for people: ``row 17, column node1``.
     attributes : dict
+    static : bool
+        Whether it never moves: its pose is told once.
     """
 
     name: str
     label: str
     where: str
     attributes: dict[str, Any] = field(default_factory=dict[str, Any])
+    static: bool = False
 
 
 @dataclass(slots=True)
@@ -429,7 +432,7 @@ _BITS: Final = {
     "derived": ("derived_velocity", "derived_acceleration", "derived_yaw_rate"),
 }
 """Columns of bits, and the attributes that each bit is."""
-_TEXTS: Final = frozenset({"special", "subkind", "type_name", "type"})
+_TEXTS: Final = frozenset({"special", "subkind", "type_name", "type", "map_ref"})
 
 
 Own = dict[str, Any]

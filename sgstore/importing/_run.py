@@ -18,6 +18,7 @@ from sgstore.config import Config
 from sgstore.errors import SgstoreError, TraceError
 from sgstore.graph import Edges, GraphBlock, LaneGaps, LaneStates, StaticPresence
 from sgstore.importing._formats import read_csv, read_nodelink, read_s3c, stem_of
+from sgstore.importing._openlabel import metadata_of, read_openlabel
 from sgstore.importing._resolve import (
     LONGEST,
     OWN,
@@ -60,7 +61,12 @@ if TYPE_CHECKING:
     from sgstore.world import Ints
 
 
-FORMATS: Final = {"s3c": read_s3c, "nodelink": read_nodelink, "csv": read_csv}
+FORMATS: Final = {
+    "s3c": read_s3c,
+    "nodelink": read_nodelink,
+    "csv": read_csv,
+    "openlabel": read_openlabel,
+}
 """What files are written in → what reads their graphs."""
 
 _ANSWERED: Final = {"s3c": ("isIn", *PROXIMITY[1:], *DIRECTIONS, "toLeftOf", "toRightOf")}
@@ -236,6 +242,8 @@ class _ImportRun:
                 "period_s": self.period_ns / 1e9,
             }
             told = {"imported": self._form, "import": how, "entities": dict(kinds)}
+            if self._form == "openlabel":  # an export says them again
+                told["metadata"] = metadata_of(info.path)
             return segment.seal(report, told)
 
     def _append(
@@ -386,7 +394,7 @@ class Blocks:
             [s * self._period if t is None else t for s, t in zip(seq.tolist(), told, strict=True)],
             np.int64,
         )
-        many = [len(meant.entities) for meant in graphs]
+        many = [sum(not node.static for node, _ in meant.entities.values()) for meant in graphs]
         ego = [of[meant.ego] if meant.ego else -1 for of, meant in zip(ids, graphs, strict=True)]
         frames = FrameBlock(
             seq=seq,
@@ -396,13 +404,19 @@ class Blocks:
             states=self._states(graphs, ids),
             ego=np.array(ego, np.int64),
             entities=_entities(first, new),
-            scenery=States.of(node=np.zeros(0, np.int64)),
+            scenery=self._scenery(first, new),
             messages=MessageRefs(*(np.zeros(0, np.int64) for _ in range(5))),
         )
         presence = [
             (frame, self._parts[part])
             for frame, meant in enumerate(graphs)
             for part in meant.parts.values()
+        ]
+        presence += [
+            (frame, of[name])
+            for frame, (meant, of) in enumerate(zip(graphs, ids, strict=True))
+            for name, (node, _) in meant.entities.items()
+            if node.static
         ]
         for frame, meant in enumerate(graphs):
             for name, part in meant.parts.items():
@@ -450,10 +464,20 @@ class Blocks:
                 state, own = state_of(
                     self._path, node.where, node.attributes, lost, any_state=self._any_state
                 )
-                nodes.append(of[name])
-                rows.append(state)
+                if not node.static:
+                    nodes.append(of[name])
+                    rows.append(state)
                 self._keep(lost, (frame, of[name], -1, 0), own)
         return States.of(node=np.array(nodes, np.int64), **columns_of(rows))
+
+    def _scenery(self, first: int, new: Sequence[tuple[GivenNode, LabelMeaning]]) -> States:
+        """Poses of new entities that never move."""
+        still = [(first + row, node) for row, (node, _) in enumerate(new) if node.static]
+        rows = [
+            state_of(self._path, node.where, node.attributes, {}, any_state=self._any_state)[0]
+            for _, node in still
+        ]
+        return States.of(node=np.array([row for row, _ in still], np.int64), **columns_of(rows))
 
     def _edges(
         self, graphs: Sequence[Meant], ids: Sequence[Mapping[str, int]]
@@ -495,8 +519,8 @@ def _entities(first: int, new: Sequence[tuple[GivenNode, LabelMeaning]]) -> Enti
         special=tuple(text(node, "special", meaning.special) for node, meaning in new),
         subkind=tuple(text(node, "subkind", meaning.subkind) for node, meaning in new),
         type_name=tuple(text(node, "type_name", meaning.type_name) for node, meaning in new),
-        static=np.zeros(len(new), np.bool_),
-        map_ref=("",) * len(new),
+        static=np.array([node.static for node, _ in new], np.bool_),
+        map_ref=tuple(text(node, "map_ref", "") for node, _ in new),
     )
 
 
