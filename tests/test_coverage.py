@@ -44,6 +44,7 @@ from sgstore.coverage import (
 from sgstore.coverage._compare import estimate, expected_classes
 from sgstore.coverage._features import tree
 from sgstore.coverage._frames import block_of, query_of_features
+from sgstore.coverage._slots import slot_sets
 from sgstore.errors import ConfigError, QueryError, StoreError
 from sgstore.importing import import_graphs
 from sgstore.ingest import ingest
@@ -517,6 +518,49 @@ def test_the_matrix_of_slots_is_that_of_loops(worlds: Worlds, tmp_path: Path) ->
             never = ("car", "none") in {(one, value), (other, beside)}
             assert frames[i, j] == both
             assert wanted[i, j] == (one != other and not cannot and not never)
+
+
+def test_slots_ask_tables_of_tags_beside_their_file(worlds: Worlds, tmp_path: Path) -> None:
+    a, *_ = worlds
+    store = sgstore.open(a)
+    first, *others = [one.name for one in store.info()]
+    (tmp_path / "tags.csv").write_text(f"trace,road\n{first},city\n")
+    (tmp_path / "slots.toml").write_text(
+        "tables = {tags = 'tags.csv'}\n[[slot]]\nname = 'road'\n"
+        "values = {city = \"MATCH () WHERE tags.road = 'city'\"}\n"
+    )
+    (declared,) = read_specifications(tmp_path / "slots.toml")
+    _, there, _ = slot_coverage(selection_of(a), [declared])
+    frames = {one.name: one.frames for one in store.info()}
+
+    assert dict(row[1:3] for row in there.rows) == {
+        "road=city": frames[first],
+        "road=none": sum(frames[name] for name in others),
+    }
+    _, names, code = slot_sets(selection_of(a), declared)
+    assert Counter(names[i] for i in code.tolist()) == dict(row[1:3] for row in there.rows)
+
+
+def test_attributes_of_the_operational_design_domain_come_along(town_store: Path) -> None:
+    (odd,) = read_specifications("iso34503")
+    items, frames, wanted = slot_matrix(selection_of(str(town_store)), odd)
+    counted = {item: int(frames[i, i]) for i, item in enumerate(items)}
+    by_hand = {
+        ("speed of the ego", "stands"): "is_ego AND speed < 0.1",
+        ("speed of the ego", "to_50"): "is_ego AND speed >= 8.4 AND speed < 13.9",
+        ("agents", "person"): "kind = 'person'",
+        ("agents", "heavy"): "kind IN ('truck', 'bus', 'trailer')",
+        ("special vehicle", "public_transport"): "special = 'public_transport'",
+        ("crossing for people", "in_range"): "kind = 'crosswalk'",
+        ("traffic control", "light"): "kind = 'traffic_light'",
+    }
+    with sgstore.open(town_store) as store:
+        for item, where in by_hand.items():
+            ((rows,),) = store.sql(f"SELECT count(DISTINCT frame_id) FROM nodes WHERE {where}")
+            assert counted[item] == rows, item
+
+    assert counted["rainfall", "none"] == 750  # the sample tells no weather
+    assert not wanted[items.index(("rainfall", "none"))].any()
 
 
 @pytest.mark.parametrize("width", [1, 2])

@@ -149,6 +149,11 @@ class Collection:
     def close(self) -> None:
         """Do nothing: no file stays open between questions."""
 
+    def joined(self, tables: Mapping[str, object]) -> Collection:
+        """The same collection with other tables of one's own: see the parameter ``tables``."""
+        engine, partial = self._engine_name, self._partial
+        return Collection(self.place.url, engine=engine, tables=tables, partial=partial)
+
     @cached_property
     def engine(self) -> Engine:
         """Engine that asks the bundles; begun with the first question."""

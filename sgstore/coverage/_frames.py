@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -205,6 +205,14 @@ class ChosenFrames:
         raise StoreError(
             f"{self.text}: a collection, where one store is needed; 'sgstore collection unpack' makes one of it"
         )
+
+    def joined(self, tables: Mapping[str, Path]) -> ChosenFrames:
+        """The same frames, with tables of one's own that patterns can ask; see :class:`sgstore.query.Store`."""
+        if not tables:
+            return self
+        if isinstance(self.source, Store):
+            return replace(self, source=Store(self.source.file.path, tables=tables))
+        return replace(self, source=self.source.joined(tables))
 
     @property
     def abstracted(self) -> Abstracted | CollectionFrames:

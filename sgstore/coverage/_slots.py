@@ -14,6 +14,7 @@ A file says it, in TOML::
 
 A slot has a value in a frame where its pattern holds, several if several hold, and ``none`` if none does; a
 frame with several has each combination of them. Or a file has several such, each a ``[[specification]]``.
+``tables = { tags = "tags.csv" }`` joins tables of one's own, which lie beside the file, for patterns to ask.
 
 Or a specification is a query: each combination of what it returns is a cell.
 """
@@ -22,7 +23,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations, product
 from math import comb, prod
 from pathlib import Path
@@ -206,16 +207,29 @@ class Specification:
     slots : tuple of Slot
     impossible : tuple of mapping
         Slot → value: combinations that contain one of these do not count.
+    tables : mapping of str to Path
+        Tables that are joined to the frames, by name.
     """
 
     name: str
     where: str
     slots: tuple[Slot, ...]
     impossible: tuple[Mapping[str, str], ...]
+    tables: Mapping[str, Path] = field(default_factory=dict[str, Path])
+
+
+DECLARED: Final = ("iso34503",)
+"""Files of slots that come along, by name."""
 
 
 def read_specifications(path: str | Path) -> list[Specification]:
     """The specifications in a file.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file; or, where there is none, the name of one that comes along: ``iso34503``, attributes of an
+        operational design domain as far as recordings tell them.
 
     Raises
     ------
@@ -223,6 +237,8 @@ def read_specifications(path: str | Path) -> list[Specification]:
         It is no TOML, or something in it is not what it must be.
     """
     path = Path(path)
+    if str(path) in DECLARED and not path.exists():
+        path = Path(__file__).with_name(f"{path}.toml")
     try:
         if path.stat().st_size > _MAX_FILE:
             raise ConfigError(f"{path}: larger than {_MAX_FILE >> 20} MiB")
@@ -240,7 +256,7 @@ def read_specifications(path: str | Path) -> list[Specification]:
 
 
 def _specification(path: Path, given: Any, name: str) -> Specification:
-    known = {"name", "where", "slot", "impossible"}
+    known = {"name", "where", "slot", "impossible", "tables"}
     if not isinstance(given, dict) or given.keys() - known:
         odd = ", ".join(sorted(given.keys() - known)) if isinstance(given, dict) else str(given)
         raise ConfigError(f"{path}: {odd}: expected {', '.join(sorted(known))}")
@@ -259,7 +275,18 @@ def _specification(path: Path, given: Any, name: str) -> Specification:
         for key, value in one.items() if isinstance(one, dict) else [(one, None)]:
             if value not in domains.get(str(key), ()):
                 raise ConfigError(f"{path}: impossible: {key} = {value!r}: no such slot or value")
-    return Specification(str(given.get("name", name)), where, made, tuple(impossible))
+    named = str(given.get("name", name))
+    return Specification(named, where, made, tuple(impossible), _tables(path, given))
+
+
+def _tables(path: Path, given: Mapping[str, Any]) -> dict[str, Path]:
+    """Files of tables, which lie where the file of the slots says, from its own folder."""
+    tables = given.get("tables", {})
+    if not isinstance(tables, dict) or not all(isinstance(one, str) for one in tables.values()):
+        raise ConfigError(
+            f'{path}: tables: expected names of files, such as {{ tags = "tags.csv" }}'
+        )
+    return {name: path.parent / file for name, file in tables.items()}
 
 
 _EXPECTED: Final = "expected a pattern, MATCH … WHERE … and nothing else"
@@ -287,8 +314,8 @@ def _slot(path: Path, given: Any) -> Slot:
 class _Held:
     """The frames of a selection in which patterns hold; each is asked for once."""
 
-    def __init__(self, chosen: ChosenFrames) -> None:
-        self._chosen = chosen
+    def __init__(self, chosen: ChosenFrames, tables: Mapping[str, Path]) -> None:
+        self._chosen = chosen = chosen.joined(tables)
         ids = chosen.abstracted.times()[0]
         self._ids = ids[chosen.rows_of(ids)]
         self._known: dict[str, Bools] = {}
@@ -356,7 +383,7 @@ def slot_sets(chosen: ChosenFrames, specification: Specification) -> tuple[Ints,
         A pattern is none.
     """
     with chosen.snapshot():
-        return _Held(chosen).sets(specification)
+        return _Held(chosen, specification.tables).sets(specification)
 
 
 def _combined(
@@ -409,7 +436,7 @@ def slot_coverage(
     shares: list[Row] = []
     covered: list[Row] = []
     missing: list[Row] = []
-    held = _Held(chosen)
+    held = _Held(chosen, {k: v for one in specifications for k, v in one.tables.items()})
     for one in specifications:
         size = k or len(one.slots)
         with chosen.snapshot():
@@ -461,7 +488,7 @@ def slot_matrix(
             f"{specification.name}: {len(items) ** 2:,} pairs; {MOST:,} can be gone through"
         )
     with chosen.snapshot():
-        there = _Held(chosen).values(specification)
+        there = _Held(chosen, specification.tables).values(specification)
     bits = np.stack([there[item] for item in items])
     frames = np.stack([np.bitwise_count(bits & own).sum(axis=1, dtype=np.int64) for own in bits])
     names = np.array([name for name, _ in items])
