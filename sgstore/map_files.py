@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gzip
 import re
+import zlib
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final
 
@@ -55,8 +57,8 @@ def read_map_file(path: str | Path, signs: Signs = SIGNS) -> RoadMap:
     try:
         if path.stat().st_size > MAX_MAP_BYTES:
             raise MapError(f"{path}: larger than {MAX_MAP_BYTES} bytes, which no road map is")
-        text = _decoded(path.read_bytes())
-    except (OSError, UnicodeDecodeError, LookupError) as error:
+        text = _decoded(_unpacked(path))
+    except (OSError, EOFError, zlib.error, UnicodeDecodeError, LookupError) as error:
         reason = getattr(error, "strerror", None) or error
         raise MapError(f"{path}: cannot be read as an OpenDRIVE map: {reason}") from error
     try:
@@ -67,6 +69,18 @@ def read_map_file(path: str | Path, signs: Signs = SIGNS) -> RoadMap:
         return read_map(text, path.name, signs)
     except MapError as error:
         raise MapError(f"{path}: {error}") from error
+
+
+def _unpacked(path: Path) -> bytes:
+    """The bytes of a file, unpacked if it is in gzip, as networks of SUMO may be."""
+    content = path.read_bytes()
+    if content[:2] != b"\x1f\x8b":
+        return content
+    with gzip.open(path) as file:
+        content = file.read(MAX_MAP_BYTES + 1)
+    if len(content) > MAX_MAP_BYTES:
+        raise MapError(f"{path}: larger than {MAX_MAP_BYTES} bytes, which no road map is")
+    return content
 
 
 def _projection(path: Path) -> Projection | None:

@@ -2,7 +2,9 @@
 
 A lane is a line with a width; lane 0 of an edge is its rightmost. Lanes inside a junction (``:J0_1_0``) are
 lanes of that junction. Crossings become crosswalks, walking areas nothing. What links of a traffic light apply
-to are the lanes through the junction. Coordinates are the network's own, as they are in all of SUMO's outputs.
+to are the lanes through the junction; those that show the same in all phases are one signal, which bears the
+name of the traffic light and, where there are several, the number of its first link (``J/3``). Coordinates are
+the network's own, as they are in all of SUMO's outputs.
 
 Source: SUMO documentation, "SUMO Road Networks" (Eclipse, EPL-2.0).
 """
@@ -75,9 +77,12 @@ class _SumoNet:
     edges: list[_SumoEdge] = field(default_factory=list[_SumoEdge])
     connections: list[dict[str, str]] = field(default_factory=list[dict[str, str]])
     junctions: dict[str, tuple[str, str]] = field(default_factory=dict[str, tuple[str, str]])
+    phases: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
+    """States of the links of each traffic light, in all phases of all programs."""
     beside: dict[str, str] = field(default_factory=dict[str, str])
     """Lane → the lane of the opposite direction to its left."""
     depth: int = 0
+    logic: str = ""
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
         """An element starts."""
@@ -93,6 +98,10 @@ class _SumoNet:
         elif self.depth == 2 and tag == "junction":
             place = attributes.get("x", ""), attributes.get("y", "")
             self.junctions[attributes.get("id", "")] = place
+        elif self.depth == 2 and tag == "tlLogic":
+            self.logic = attributes.get("id", "")
+        elif self.depth == 3 and tag == "phase":
+            self.phases.setdefault(self.logic, []).append(attributes.get("state", ""))
         elif self.depth == 3 and tag == "lane" and self.edges:
             self.edges[-1].lanes.append(attributes)
         elif self.depth == 4 and tag == "neigh" and self.edges and self.edges[-1].lanes:
@@ -130,7 +139,7 @@ def sumo_net_text(text: str) -> str:
     if broken:
         warnings.insert(0, about_lanes(broken, "its shape is no line: left out"))
     row_of = {lane.name: row for row, lane in enumerate(lanes)}
-    return lane_text(lanes, warnings, _lights(net, row_of), crosswalks)
+    return lane_text(lanes, warnings, _lights(net, lines, row_of), crosswalks)
 
 
 def _lines(net: _SumoNet, broken: list[str]) -> tuple[dict[str, LaneLine], list[PlainCrosswalk]]:
@@ -241,18 +250,24 @@ def _joined(net: _SumoNet, lines: dict[str, LaneLine]) -> list[LaneLine]:
     ]
 
 
-def _lights(net: _SumoNet, row_of: dict[str, int]) -> list[PlainSignal]:
-    """A light for each traffic light logic, on the lanes through the junction that it is for."""
-    lanes: dict[str, set[int]] = defaultdict(set)
+def _lights(net: _SumoNet, lines: dict[str, LaneLine], row_of: dict[str, int]) -> list[PlainSignal]:
+    """Lights, each on the lanes through a junction whose links always show the same."""
+    links: dict[str, dict[tuple[str, ...], dict[int, str]]] = defaultdict(dict)
     for told in net.connections:
-        name = told.get("tl", "")
+        name, number = told.get("tl", ""), told.get("linkIndex", "0")
         through = told.get("via") or f"{told.get('from')}_{told.get('fromLane')}"
-        if name and len(name) <= MAX_NAME and through in row_of:
-            lanes[name].add(row_of[through])
+        if name and len(name) <= MAX_NAME and through in row_of and number.isdecimal():
+            link = int(number)
+            shown = tuple(state[link : link + 1] for state in net.phases.get(name, ()))
+            links[name].setdefault(shown, {})[link] = through
     signals: list[PlainSignal] = []
-    for name, rows in lanes.items():
-        x, y = (_number(one, np.nan) for one in net.junctions.get(name, ("", "")))
-        signals.append(PlainSignal(name, "traffic_light", x, y, lanes=tuple(sorted(rows))))
+    for name, groups in links.items():
+        for lanes in groups.values():
+            begins = np.array([lines[lane].centre[0] for lane in lanes.values()])
+            x, y, z = begins.mean(axis=0).tolist()
+            own = name if len(groups) == 1 else f"{name}/{min(lanes)}"
+            rows = tuple(sorted({row_of[lane] for lane in lanes.values()}))
+            signals.append(PlainSignal(own, "traffic_light", x, y, z, lanes=rows))
     return signals
 
 

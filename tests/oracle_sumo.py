@@ -3,7 +3,8 @@
     python tests/oracle_sumo.py
 
 SUMO makes a network of nine junctions, drives cars, buses, bicycles and people on it, and says of each at each
-step where it is and on which lane. Our frames must have them there, and our map that lane under their front.
+step where it is and on which lane. Our frames must have them there, and our map that lane under their front. It
+says of each link of a traffic light what it shows: so must the signal of our map that is for that lane.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from typing import Any
 import numpy as np
 
 from sgstore.map_files import read_map_file
-from sgstore.readers import open_trace
+from sgstore.readers import on_map, open_trace
+from sgstore.vocabulary import LIGHT_STATES
 
 STEPS, STEP = 240, 0.5
 TYPES = {"DEFAULT_VEHTYPE": "passenger", "city_bus": "bus", "a_bike": "bicycle", "lorry": "truck"}
@@ -62,9 +64,13 @@ def simulate(folder: Path) -> tuple[Path, Path, list[dict[str, tuple[Any, ...]]]
     import sumo
 
     net, fcd = network(folder, Path(sumo.SUMO_HOME)), folder / "drive.fcd.xml"
+    more = folder / "more.add.xml"
+    event = '<timedEvent type="SaveTLSStates" dest="drive.tls.xml"/>'
+    more.write_text(f"<additional>{event}</additional>", encoding="utf-8")
     libsumo.start(
         ["sumo", "-n", str(net), "-r", str(routes(folder)), "--fcd-output", str(fcd), "--precision", "6",
-         "--step-length", str(STEP), "--seed", "3", "--no-step-log", "--fcd-output.acceleration"]
+         "--step-length", str(STEP), "-a", str(more), "--seed", "3", "--no-step-log",
+         "--fcd-output.acceleration"]
     )  # fmt: skip
     told: list[dict[str, tuple[Any, ...]]] = []
     for _ in range(STEPS):
@@ -82,9 +88,43 @@ def simulate(folder: Path) -> tuple[Path, Path, list[dict[str, tuple[Any, ...]]]
                 for who in (libsumo.vehicle, libsumo.person)
                 for ident in who.getIDList()
             }
+            | {
+                f"light {name}": (
+                    libsumo.trafficlight.getRedYellowGreenState(name),
+                    [
+                        [via for _, _, via in of]
+                        for of in libsumo.trafficlight.getControlledLinks(name)
+                    ],
+                )
+                for name in libsumo.trafficlight.getIDList()
+            }
         )
     libsumo.close()
     return net, fcd, told
+
+
+SHOWN = {"r": "red", "s": "red", "y": "yellow", "Y": "yellow", "g": "green", "G": "green"}
+
+
+def compare_lights(
+    number: int, road_map: Any, shown: Any, lit: dict[str, tuple[Any, ...]], wrong: list[str]
+) -> int:
+    """Every lane through a junction has a light that shows what its link does; how many were compared."""
+    lanes: dict[str, set[str]] = {}
+    for name, state in shown.items():
+        for lane in road_map.lanes_of_signal(name.removeprefix("light ")).tolist():
+            code = int(state["light_state"])
+            lanes.setdefault(road_map.nodes.name[-1 - lane], set()).add(LIGHT_STATES[code])
+    compared = 0
+    for letters, links in lit.values():
+        for letter, ways in zip(letters, links, strict=True):
+            for way in ways:
+                if way not in road_map.nodes.name or "_c" in way:
+                    continue  # crossings are no lanes
+                compared += 1
+                if SHOWN[letter] not in lanes.get(way, set()):
+                    wrong.append(f"step {number}: {way} shows {lanes.get(way)}, not {letter}")
+    return compared
 
 
 def main() -> int:
@@ -92,13 +132,14 @@ def main() -> int:
         net, fcd, told = simulate(Path(folder))
         road_map = read_map_file(net)
         with open_trace(fcd) as trace:
+            on_map(trace, road_map)
             blocks = list(trace.blocks())
     names = [ident for block in blocks for ident in block.entities.ident]
     frames: list[dict[str, dict[str, float]]] = []
     for block in blocks:
         for start, stop in zip(block.offsets, block.offsets[1:], strict=False):
             rows = range(int(start), int(stop))
-            columns = ("x", "y", "heading", "vx", "vy", "length", "width")
+            columns = ("x", "y", "heading", "vx", "vy", "length", "width", "light_state")
             states = {n: getattr(block.states, n) for n in columns}
             frames.append(
                 {
@@ -106,8 +147,11 @@ def main() -> int:
                     for row in rows
                 }
             )
-    worst, checked, lanes, wrong = 0.0, 0, 0, list[str]()
+    worst, checked, lanes, links, wrong = 0.0, 0, 0, 0, list[str]()
     for number, (frame, truth) in enumerate(zip(frames, told, strict=False)):
+        lit = {name: truth.pop(name) for name in [*truth] if name.startswith("light ")}
+        shown = {name: frame.pop(name) for name in [*frame] if name.startswith("light ")}
+        links += compare_lights(number, road_map, shown, lit, wrong)
         if set(frame) != set(truth):
             wrong.append(f"step {number}: {sorted(set(frame) ^ set(truth))} in one of them only")
             continue
@@ -140,8 +184,8 @@ def main() -> int:
                 wrong.append(f"step {number}: {ident} on {lane}, not on {sorted(found)}")
     print(*wrong[:20], sep="\n")
     print(f"{checked} states of {len(told)} steps: {worst:.2g} m or rad away at most; {lanes} lanes,"
-          f" {len(wrong)} differences")  # fmt: skip
-    return bool(wrong or worst > 1e-4 or checked < 1000)
+          f" {links} links of lights, {len(wrong)} differences")  # fmt: skip
+    return bool(wrong or worst > 1e-4 or checked < 1000 or links < 1000)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -101,6 +102,61 @@ def test_a_file_that_is_cut_keeps_its_whole_steps_and_says_so(tmp_path: Path) ->
     assert read(cut)[2].frames == 6
     assert "ends inside a time step" in reasons(read(cut)[2])
     assert "without a time" in reasons(read(odd)[2])
+
+
+PHASES = '<phase duration="9" state="GG"/>'
+TLS = """<tlsStates>
+    <tlsState time="0.00" id="J" programID="0" phase="0" state="Gr"/>
+    <tlsState time="0.20" id="J" programID="0" phase="0" state="Gr"/>
+    <tlsState time="0.30" id="J" programID="0" phase="1" state="yo"/>
+</tlsStates>
+"""
+
+
+def test_lights_show_what_the_file_beside_says(tmp_path: Path) -> None:
+    net = written(
+        tmp_path / "town.net.xml", NET.replace(PHASES, f'{PHASES}<phase duration="3" state="yr"/>')
+    )
+    steps = (step(i / 10, vehicle("car", 80 + i, -4.8)) for i in range(6))
+    fcd = written(tmp_path / "drive.fcd.xml", export(*steps))
+    written(tmp_path / "drive.tls.xml", TLS)
+    store = sgstore.open(tmp_path / "drives.sgstore", create=True)
+    store.ingest(fcd, road_map=net, egos=["car"])
+    lit = store.sql("SELECT DISTINCT ident, light_state FROM nodes WHERE light_state IS NOT NULL")
+    rows = store.find(
+        "MATCH (t:TrafficLight)-[:controlsTrafficOf]->(l:Lane)"
+        " RETURN frame.seq, t.light_state, l.name"
+    ).rows()
+
+    assert sorted(lit.values) == [
+        *(("light J/0", "green"), ("light J/0", "yellow")),
+        *(("light J/1", "flashing"), ("light J/1", "red")),
+    ]
+    assert set(map(tuple, rows)) == {
+        (seq, shown[seq > 2], lane)
+        for seq in range(6)
+        for lane, shown in ((":J_0_0", ("green", "yellow")), (":J_1_0", ("red", "flashing")))
+    }
+    written(tmp_path / "drive.tls.xml", TLS.replace("tlsStates", "routes"))
+    with pytest.raises(TraceError, match="expected <tlsStates>"):
+        open_trace(fcd)
+
+
+def test_files_in_gzip_are_read_as_they_are(tmp_path: Path) -> None:
+    plain = written(tmp_path / "drive.fcd.xml", drive(20))
+    packed, net = tmp_path / "packed.fcd.xml.gz", tmp_path / "town.net.xml.gz"
+    packed.write_bytes(gzip.compress(drive(20).encode()))
+    net.write_bytes(gzip.compress(NET.encode()))
+
+    whole, again = read(plain), read(packed)
+    assert repr(states(whole[1])) == repr(states(again[1]))
+    refs = again[1][0].messages
+    place = {"chunk_offset": -1, "offset": int(refs.offset[5]), "length": int(refs.length[5])}
+    assert read_message(packed, **place).startswith(b'<timestep time="0.50">')
+    assert edges(read_map_file(net), "travelsTo") >= {("A_1", ":J_0_0")}
+    assert packed in recordings([tmp_path])
+    packed.write_bytes(gzip.compress(drive(600).encode())[:-30])
+    assert "the compressed file is damaged" in reasons(read(packed)[2])
 
 
 def test_a_folder_has_recordings_of_sumo_but_not_its_other_files(tmp_path: Path) -> None:

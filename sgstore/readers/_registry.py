@@ -21,6 +21,7 @@ from sgstore.readers.commonroad._file import read_messages as _read_scenario_mes
 from sgstore.readers.osi._file import ENDINGS as _OSI_ENDINGS
 from sgstore.readers.osi._file import OsiFile
 from sgstore.readers.osi._file import read_message as _read_osi_message
+from sgstore.readers.sumo._file import ENDINGS as _SUMO_ENDINGS
 from sgstore.readers.sumo._file import SumoFile, is_fcd
 from sgstore.readers.sumo._file import read_messages as _read_steps
 from sgstore.world import TraceReport
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from sgstore.roads import RoadMap
 
 
-ENDINGS: Final = (".mcap", *_OSI_ENDINGS, *_SCENARIO_ENDINGS)
+ENDINGS: Final = (".mcap", *_OSI_ENDINGS, *_SCENARIO_ENDINGS, *_SUMO_ENDINGS)
 """How the names of recordings end, where a folder is searched for them; see :func:`is_recording`."""
 
 
@@ -76,7 +77,7 @@ def readers() -> Iterator[RecordingReader]:
 def is_recording(path: Path) -> bool:
     """Return whether a file in a folder is a recording, by its name; of an XML file by its beginning, too."""
     name = path.name.lower()
-    xml = name.endswith(_SCENARIO_ENDINGS)
+    xml = name.endswith((*_SCENARIO_ENDINGS, *_SUMO_ENDINGS))
     return name.endswith(ENDINGS) and (not xml or is_scenario(path) or is_fcd(path))
 
 

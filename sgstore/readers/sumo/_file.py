@@ -1,13 +1,16 @@
 """Files of SUMO's floating-car data (``--fcd-output``) in the words of an MCAP file: a message for each step.
 
-The file is one XML document, of any length. It is read piece by piece, and cut where a time step begins and
-ends; what is in one is understood by whoever reads the message. A step that is larger than a bound, and what
-stands behind a cut, is a loss.
+The file is one XML document, of any length, plain or in gzip. It is read piece by piece, and cut where a time
+step begins and ends; what is in one is understood by whoever reads the message. A step that is larger than a
+bound, and what stands behind a cut, is a loss.
 """
 
 from __future__ import annotations
 
+import gzip
+import math
 import re
+import zlib
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -27,15 +30,17 @@ from sgstore.readers._file import MessageFile
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
+    from io import BufferedIOBase
     from pathlib import Path
-    from typing import BinaryIO
 
 STEP: Final = "sumo.Timestep"
 """Schema of the messages."""
 MAX_STEP: Final = 64 << 20
 """Greatest size of a time step; bytes. One of 100,000 vehicles takes 20 MB."""
 
-_ENDING: Final = ".xml"
+ENDINGS: Final = (".xml", ".xml.gz")
+"""How names of files end that SUMO writes."""
+
 _CHANNEL: Final = 1
 _PIECE: Final = 1 << 20
 _HEAD: Final = 1 << 16
@@ -43,31 +48,63 @@ _RUN_BYTES: Final = 1 << 20
 _BEGIN: Final = re.compile(rb"<timestep\b[^>]{0,1000}?(/?)>")
 _TIME: Final = re.compile(rb"""\stime\s*=\s*["']([0-9.:eE+-]{1,40})["']""")
 _CLOSE: Final = b"</timestep>"
+_GZIP: Final = b"\x1f\x8b"
+_DAMAGED: Final = (OSError, EOFError, zlib.error)
 
 
 def is_fcd(path: Path) -> bool:
     """Return whether a file is floating-car data of SUMO, by its name and its first element."""
-    if not path.name.lower().endswith(_ENDING):
+    if not path.name.lower().endswith(ENDINGS):
         return False
     try:
-        with open_regular(path) as file:
+        with opened(path) as file:
             return b"<fcd-export" in file.read(_HEAD)
-    except (OSError, TraceError):
+    except (*_DAMAGED, TraceError):
         return False
+
+
+def opened(path: Path) -> BufferedIOBase:
+    """A file that SUMO wrote, as plain bytes: unpacked while it is read, if it is in gzip.
+
+    Raises
+    ------
+    TraceError
+        It cannot be opened.
+    """
+    file = open_regular(path)
+    packed = file.read(2) == _GZIP
+    file.seek(0)
+    return _Unpacked(file) if packed else file
+
+
+class _Unpacked(gzip.GzipFile):
+    """A file in gzip, which closes the file beneath it."""
+
+    def __init__(self, file: BufferedIOBase) -> None:
+        super().__init__(fileobj=file, mode="rb")
+        self._beneath = file
+
+    def close(self) -> None:
+        super().close()
+        self._beneath.close()
 
 
 def time_ns(step: bytes) -> int | None:
     """The time of a time step; ns. ``None``: it tells none. SUMO writes seconds, or as an option ``h:m:s``."""
     found = _TIME.search(step[:1000])
-    if found is None:
-        return None
+    seconds = seconds_of(found and found[1].decode())
+    return None if math.isnan(seconds) else round(seconds * 1e9)
+
+
+def seconds_of(text: str | None) -> float:
+    """A time that SUMO writes; s. NaN: it is none."""
     seconds = 0.0
     try:
-        for part in found[1].decode().split(":"):
+        for part in (text or "none").split(":"):
             seconds = seconds * 60 + float(part)
     except ValueError:
-        return None
-    return round(seconds * 1e9) if abs(seconds) < 1e9 else None
+        return math.nan
+    return seconds if abs(seconds) < 1e9 else math.nan
 
 
 class SumoFile(MessageFile):
@@ -96,8 +133,9 @@ class SumoFile(MessageFile):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._file = open_regular(path)
-        self.size, self.mtime_ns = mark_of_open(self._file)
+        with open_regular(path) as file:
+            self.size, self.mtime_ns = mark_of_open(file)
+        self._file = opened(path)
         self.schemas = {_CHANNEL: Schema(id=_CHANNEL, data=b"", encoding="", name=STEP)}
         self.channels = {
             _CHANNEL: Channel(
@@ -150,10 +188,13 @@ def read_messages(path: Path, places: Iterable[tuple[int, int]]) -> Iterator[byt
     TraceError
         The file cannot be read, or there is no step of that length there: the file was replaced.
     """
-    with open_regular(path) as file:
+    with opened(path) as file:
         for offset, length in places:
-            file.seek(max(offset, 0))
-            data = file.read(length) if 0 < length <= MAX_STEP and offset >= 0 else b""
+            try:
+                file.seek(max(offset, 0))
+                data = file.read(length) if 0 < length <= MAX_STEP and offset >= 0 else b""
+            except _DAMAGED:
+                data = b""
             if len(data) != length or not data.startswith(b"<timestep"):
                 reason = f"no time step of {length} bytes at {offset} there: the file was replaced"
                 raise TraceError(reason, path=path)
@@ -175,12 +216,24 @@ def _messages(held: list[tuple[int, int, bytes]], number: int) -> Messages:
     )
 
 
-def _steps(file: BinaryIO, report: Findings) -> Iterator[tuple[int, bytes]]:
+def _pieces(file: BufferedIOBase, report: Findings) -> Iterator[bytes]:
+    """The bytes of a file, and an empty piece at its end, unless it is damaged before."""
+    while True:
+        try:
+            piece = file.read1(_PIECE)
+        except _DAMAGED as error:
+            report.lose(Loss(f"the compressed file is damaged: {error}", bytes=0))
+            return
+        yield piece
+        if not piece:
+            return
+
+
+def _steps(file: BufferedIOBase, report: Findings) -> Iterator[tuple[int, bytes]]:
     """Place and bytes of each time step, from its tag to its end."""
     file.seek(0)
     rest, place = b"", 0  # what was read and not used, and where it begins in the file
-    while True:
-        piece = file.read(_PIECE)
+    for piece in _pieces(file, report):
         rest += piece
         used = 0
         while (begin := _BEGIN.search(rest, used)) is not None:

@@ -3,7 +3,8 @@
 A frame is a time step, at its own time. SUMO tells where the middle of the front bumper is, and a direction
 clockwise from north; our position is the middle of the box. How large a vehicle is stands in no step: it is
 what SUMO takes for its kind, unless attributes ``length``, ``width`` and ``height`` tell it. What a vehicle is,
-is told by the name of its type.
+is told by the name of its type. What traffic lights show is told by a file beside, ``drive.tls.xml``; they
+stand where the road map has them.
 
 Source: SUMO documentation, "FCDOutput", "Vehicle Type Parameter Defaults" and "Vehicle Signaling" (Eclipse,
 EPL-2.0).
@@ -12,15 +13,20 @@ EPL-2.0).
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar, Final
 
 from sgstore.markup import MarkupError, MarkupParser
+from sgstore.mcap import digest_of
 from sgstore.readers._base import FramesTrace, TraceMessage
 from sgstore.readers.sumo._file import STEP, time_ns
+from sgstore.readers.sumo._lights import LightStates, lights_beside
 from sgstore.step import Frame
-from sgstore.vocabulary import TypeMeaning, type_meanings
+from sgstore.vocabulary import KINDS, TypeMeaning, type_meanings
 
 if TYPE_CHECKING:
+    from sgstore.mcap import Recording
+    from sgstore.roads import RoadMap
     from sgstore.world import Channel
 
 MAX_ENTITIES: Final = 1_000_000
@@ -73,6 +79,26 @@ class SumoTrace(FramesTrace):
 
     name: ClassVar[str] = "sumo"
 
+    def __init__(self, recording: Recording, *, ego: str = "", digest: str = "") -> None:
+        super().__init__(recording, ego=ego, digest=digest)
+        beside = lights_beside(recording.path)
+        self._lights = None if beside is None else LightStates(beside)
+        self._signals: dict[str, tuple[float, float, float]] = {}
+        if beside is not None:
+            self.info = replace(self.info, mapping=digest_of(beside))
+
+    def on_map(self, road_map: RoadMap | None) -> None:
+        """Find the places of traffic lights in the road map that the recording is read with."""
+        if road_map is None or self._lights is None:
+            return
+        nodes = road_map.nodes
+        places = zip(nodes.x.tolist(), nodes.y.tolist(), nodes.z.tolist(), strict=True)
+        self._signals = {
+            name: place
+            for name, place, kind in zip(nodes.name, places, nodes.kind.tolist(), strict=True)
+            if KINDS[kind] == "traffic_light"
+        }
+
     @staticmethod
     def role(channel: Channel) -> str:
         """Return the role of a channel."""
@@ -88,6 +114,19 @@ class SumoTrace(FramesTrace):
             parser.feed(message.data, last=True)
         except MarkupError as error:
             raise ValueError(str(error)) from error
+        for name, place in self._signals.items():
+            shown = None if self._lights is None else self._lights.of(name, frame.time_ns)
+            if shown is not None:
+                frame.add(
+                    f"light {name}",
+                    "traffic_light",
+                    *place,
+                    vx=0.0,
+                    vy=0.0,
+                    light_state=shown,
+                    map_ref=name,
+                    type_name="tlLogic",
+                )
         return frame
 
 

@@ -1,0 +1,107 @@
+"""States of traffic lights that SUMO writes beside its floating-car data: the output ``tlsStates``.
+
+A state is a text with a letter for each link of a traffic light. A signal of the road map is one or several
+links that always change together (:mod:`sgstore.sumo_net`), and bears the number of the first.
+
+Source: SUMO documentation, "Traffic Lights: Signal state definitions" and "Output: Traffic Lights" (Eclipse,
+EPL-2.0).
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from bisect import bisect_right
+from typing import TYPE_CHECKING, Final
+
+from sgstore.errors import TraceError
+from sgstore.markup import MarkupError, MarkupParser
+from sgstore.readers.sumo._file import ENDINGS, opened, seconds_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+MAX_CHANGES: Final = 5_000_000
+"""Most changes of state in a file."""
+
+_STATES: Final = {
+    **dict.fromkeys("rs", "red"),
+    **dict.fromkeys("gG", "green"),
+    **dict.fromkeys("yY", "yellow"),
+    "u": "red_yellow",
+    "o": "flashing",
+    "O": "off",
+}
+"""Letter of a link → what its light shows; ``s``: red, with an arrow to the right."""
+_PIECE: Final = 1 << 20
+
+
+def lights_beside(path: Path) -> Path | None:
+    """The file of states beside a recording, ``drive.tls.xml`` of ``drive.fcd.xml``, if there is one."""
+    name = path.name
+    for ending in (*ENDINGS, ".fcd"):
+        if name.lower().endswith(ending):
+            name = name[: -len(ending)]
+    found = [path.with_name(f"{name}.tls{ending}") for ending in ENDINGS]
+    return next((one for one in found if one.is_file()), None)
+
+
+class LightStates:
+    """States of traffic lights over time.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    TraceError
+        The file cannot be read, or is something else.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._times: dict[str, list[int]] = {}
+        self._states: dict[str, list[str]] = {}
+        self._changes = self._depth = 0
+        parser = MarkupParser(self._start, self._end, most=None, whose="recordings")
+        try:
+            with opened(path) as file:
+                while piece := file.read(_PIECE):
+                    parser.feed(piece)
+            parser.feed(b"", last=True)
+        except (MarkupError, OSError, EOFError, zlib.error) as error:
+            raise TraceError(f"states of lights cannot be read: {error}", path=path) from error
+
+    def _start(self, tag: str, told: dict[str, str]) -> None:
+        self._depth += 1
+        if self._depth == 1 and tag != "tlsStates":
+            raise MarkupError(f"the root element is <{tag[:80]}>, expected <tlsStates>")
+        if tag != "tlsState":
+            return
+        name, state, time = told.get("id", ""), told.get("state", ""), seconds_of(told.get("time"))
+        known = self._states.setdefault(name, [])
+        if not name or not state or math.isnan(time):
+            raise MarkupError("a <tlsState> needs a time, an id and a state")
+        if known and known[-1] == state:
+            return
+        self._changes += 1
+        times = self._times.setdefault(name, [])
+        if self._changes > MAX_CHANGES:
+            raise MarkupError(f"more than {MAX_CHANGES:,} changes of state")
+        times.append(max(round(time * 1e9), times[-1] if times else 0))
+        known.append(state)
+
+    def _end(self, _tag: str) -> None:
+        self._depth -= 1
+
+    def of(self, signal: str, time_ns: int) -> str | None:
+        """What a signal of the road map shows: a state of the vocabulary; ``None``: nobody tells."""
+        name, link = signal, 0
+        if name not in self._times:
+            name, _, number = signal.rpartition("/")
+            if name not in self._times or not number.isdecimal():
+                return None
+            link = int(number)
+        at = bisect_right(self._times[name], time_ns) - 1
+        state = self._states[name][at] if at >= 0 else ""
+        return _STATES.get(state[link]) if link < len(state) else None
