@@ -27,7 +27,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Final
+from typing import IO, TYPE_CHECKING, Any, ClassVar, Final
 
 from sgstore.errors import (
     AbstractionError,
@@ -131,6 +131,9 @@ class Sandbox:
     StoreError
         There is no such file, it is no store, or one of another version; or a table cannot be read.
     """
+
+    may_write: ClassVar[bool] = False
+    """Whether the process may write files."""
 
     def __init__(
         self,
@@ -289,6 +292,7 @@ class Sandbox:
                 "rows": self._max_rows,
                 "tables": self._tables,
                 "folder": str(self._folder),
+                "may_write": self.may_write,
             }
             wait = START_S + READ_S * len(self._tables)
             reply = self._exchange(self._child, json.dumps(settings), wait)
@@ -399,6 +403,12 @@ def _answer(reply: dict[str, Any]) -> Answer:
     columns, reasons = tuple(reply["columns"]), dict(reply["reasons"])
     graphs, notes = reply.get("graphs", False), tuple(reply.get("notes", ()))
     return Answer(columns, rows, reply["truncated"], reasons, graphs, notes)
+
+
+class Workshop(Sandbox):
+    """The same for work of our own that writes files, and ends at once when somebody says so."""
+
+    may_write: ClassVar[bool] = True
 
 
 class SandboxPool:
@@ -543,14 +553,15 @@ def _serve(answering: Answering) -> None:
     lines, replies = sys.stdin.buffer, sys.stdout.buffer
     settings = json.loads(lines.readline())
     tempfile.tempdir = settings["folder"]
-    _limit(settings["memory"], files=_TABLE_BYTES)
+    free = settings["may_write"]
+    _limit(settings["memory"], files=None if free else _TABLE_BYTES)
     from sgstore.query import Store
     from sgstore.store import UserTables
 
     path = Path(settings["store"])
     try:
         tables = UserTables(settings["tables"])
-        _limit(settings["memory"], files=0)
+        _limit(settings["memory"], files=None if free else 0)
         os.chdir(path.parent)  # so that the database knows no more of where it is than its name
         store = Store(path.name, memory=settings["memory"], tables=tables)
     except OSError as error:
@@ -568,6 +579,11 @@ def _serve(answering: Answering) -> None:
                 _send(replies, one)
         except SgstoreError as error:
             _send(replies, _refusal(error))
+
+
+def tell(reply: Mapping[str, Any]) -> None:
+    """Send a reply, before the others, while an answer is on its way: in the process that answers."""
+    _send(sys.stdout.buffer, {**reply, "more": True})
 
 
 def rows_found(store: Store, question: dict[str, Any], most: int) -> dict[str, Any]:
@@ -621,8 +637,11 @@ def _send(to: IO[bytes], reply: object) -> None:
     to.flush()
 
 
-def _limit(memory: int, *, files: int) -> None:
-    """Limit the resources of this process, where the system can; the limits cannot be widened again."""
+def _limit(memory: int, *, files: int | None) -> None:
+    """Limit the resources of this process, where the system can; the limits cannot be widened again.
+
+    ``files``: the largest file that it may write; bytes. ``None``: any.
+    """
     try:
         import resource
     except ImportError:  # not on Windows: there the database's own limits and the deadline hold
@@ -633,8 +652,9 @@ def _limit(memory: int, *, files: int) -> None:
         (resource.RLIMIT_CORE, 0),
     ):
         _, hard = resource.getrlimit(limit)
-        bound = most if hard == resource.RLIM_INFINITY else min(most, hard)
-        resource.setrlimit(limit, (bound, bound))
+        if most is not None:
+            bound = most if hard == resource.RLIM_INFINITY else min(most, hard)
+            resource.setrlimit(limit, (bound, bound))
 
 
 if __name__ == "__main__":

@@ -426,10 +426,8 @@ def test_tags_are_kept_beside_the_store_and_can_be_asked_for(page: Page, town_st
 
 
 def result_of(text: str) -> Any:
-    *_, last = (part for part in text.split("\n\n") if part)
-    event, data = last.split("\n")
-    assert event == "event: result", text
-    return json.loads(data.removeprefix("data: "))
+    *_, last = text.splitlines()
+    return json.loads(last)["result"]
 
 
 def test_coverage_is_that_of_the_verb(page: Page, store: Store) -> None:
@@ -616,8 +614,8 @@ def test_what_a_browser_has_left_ends(page: Page, path: str, body: dict[str, Any
     asyncio.run(page.leave(path, body, 0.2))
     # What was asked is stopped: its thread is free again at once.
     began, explorer = time.monotonic(), page.explorer
-    while explorer.busy and time.monotonic() - began < 10:
+    while explorer.busy and time.monotonic() - began < 30:
         time.sleep(0.05)
-    assert time.monotonic() - began < 5
+    assert time.monotonic() - began < 15  # 1 on a quiet machine
     assert page.find("SELECT 1 AS x")[0]["rows"] == [[1]]
     assert not (explorer.write_to / "left").exists()  # type: ignore[operator]

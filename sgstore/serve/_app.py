@@ -20,16 +20,15 @@ from starlette.routing import Route
 
 from sgstore.errors import QueryError, SgstoreError, SqlError, StoreError
 from sgstore.query import Store
-from sgstore.sandbox import SandboxPool
+from sgstore.sandbox import SandboxPool, Workshop
 from sgstore.serve._guard import Guard
-from sgstore.serve._measures import differing, exported, locked_clips
 from sgstore.serve._notes import Note, NotesFile, write_table
 from sgstore.serve._reads import Reads
 from sgstore.serve._requests import Fields, RequestError
 from sgstore.serve._wire import as_json
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
+    from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator, Mapping
 
     from starlette.requests import Request
     from starlette.types import Receive, Scope, Send
@@ -46,6 +45,9 @@ MOST_QUESTIONS: Final = 8
 TIMEOUT_S: Final = 60.0
 """Longest time for a question that somebody typed; s."""
 
+LONGEST_S: Final = 86_400.0
+"""Longest time for a lock, an export, or a comparison of stores; s."""
+
 MOST_MATCHES: Final = 50_000
 """Matches and rows of a question; the page says if there are more."""
 
@@ -56,6 +58,7 @@ _TYPES: Final = {
     ".svg": "image/svg+xml",
     ".txt": "text/plain",
 }
+WORKER: Final = "sgstore.serve._worker"
 _NONCE: Final = "{{nonce}}"
 _SCRIPT: Final = "js/main.js"
 
@@ -84,17 +87,17 @@ class _Question:
     Parameters
     ----------
     pool : function
-        Gives the sandboxes; it may take its time.
+        Gives what answers: the sandboxes, or an errand; it may take its time.
     question : mapping
     key : str
         What it is cancelled by.
     """
 
     def __init__(
-        self, pool: Callable[[], SandboxPool], question: Mapping[str, Any], key: str
+        self, pool: Callable[[], SandboxPool | _Errand], question: Mapping[str, Any], key: str
     ) -> None:
         self._pool, self._question, self._key = pool, question, key
-        self._asked: SandboxPool | None = None
+        self._asked: SandboxPool | _Errand | None = None
         self._gone = threading.Event()
         self._loop = asyncio.get_running_loop()
         self._found: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
@@ -128,6 +131,38 @@ class _Question:
             self._asked.cancel(self._key)
 
 
+class _Errand:
+    """A longer piece of work in a process of its own, which ends when it is cancelled.
+
+    Parameters
+    ----------
+    explorer : Explorer
+    """
+
+    def __init__(self, explorer: Explorer) -> None:
+        self._explorer = explorer
+        self._box: Workshop | None = None
+        self._gone = False
+
+    def ask(self, question: Mapping[str, Any], _: str) -> Iterator[dict[str, Any]]:
+        """Replies, as those of a sandbox."""
+        path, under = self._explorer.store.file.path, self._explorer.errands
+        with Workshop(path, timeout_s=LONGEST_S, memory=1 << 30, worker=WORKER) as self._box:
+            under.add(self)
+            try:
+                if not self._gone:
+                    yield from self._box.replies(question)
+            finally:
+                under.discard(self)
+
+    def cancel(self, _: str = "") -> bool:
+        """Stop it."""
+        self._gone = True
+        if self._box is not None:
+            self._box.stop()
+        return True
+
+
 class Explorer:
     """State that the endpoints of one store share.
 
@@ -144,6 +179,8 @@ class Explorer:
     ----------
     busy : int
         Questions and longer pieces of work that are under way.
+    errands : set
+        Processes of those pieces of work.
 
     Raises
     ------
@@ -169,6 +206,7 @@ class Explorer:
         self._threads = ThreadPoolExecutor(MOST_QUESTIONS + 4, "sgstore question")
         self._counting = threading.Lock()
         self._ended = threading.Event()
+        self.errands = set[_Errand]()
         self.busy = 0
 
     def warm(self) -> None:
@@ -179,6 +217,8 @@ class Explorer:
     def close(self) -> None:
         """End the sandboxes, wait for what is read, and give the stores back."""
         self._ended.set()
+        for errand in tuple(self.errands):
+            errand.cancel()
         for pool in self._pools.values():
             pool.close()
         # The process must not end while a thread is within the database.
@@ -195,7 +235,7 @@ class Explorer:
             timeout_s=TIMEOUT_S,
             max_rows=MOST_MATCHES,
             tables=tables,
-            worker="sgstore.serve._worker",
+            worker=WORKER,
         )
 
     def _tables(self) -> dict[str, Path]:
@@ -352,36 +392,30 @@ class Explorer:
         )
 
     async def work(self, request: Request, name: str) -> Response:
-        """A longer piece of work, as server-sent events: what is done of it, then its result or an error."""
+        """A longer piece of work, as lines of JSON: what is done of it, then its result or an error."""
         fields = await Fields.of(request)
-        work = _WORK[name](self, fields)
-        loop, gone = asyncio.get_running_loop(), threading.Event()
-        events: asyncio.Queue[tuple[str, Any] | None] = asyncio.Queue()
-        tell = partial(loop.call_soon_threadsafe, events.put_nowait)
-
-        def progress(done: int, of: int) -> None:
-            if gone.is_set() or self._ended.is_set():
-                raise RequestError("nobody waits for it any more")
-            tell(("progress", [done, of]))
-
-        def run() -> None:
-            try:
-                tell(("result", work(progress)))
-            except SgstoreError as error:
-                tell(("error", error.as_dict()))
-            except BaseException:
-                tell(("error", {"error": "SgstoreError", "reason": "it failed"}))
-                raise
-            finally:
-                tell(None)
-
-        self._begin(run)
+        asked = _Question(partial(_Errand, self), {"ask": name, **_WORK[name](self, fields)}, "")
+        self._begin(asked.ask)
 
         async def lines() -> AsyncGenerator[bytes]:
-            while (event := await events.get()) is not None:
-                yield f"event: {event[0]}\ndata: ".encode() + as_json(event[1]) + b"\n\n"
+            async for reply in asked.replies():
+                yield as_json(reply) + b"\n"
 
-        return _Answer(lines(), gone.set, "text/event-stream")
+        return _Answer(lines(), asked.end, "application/x-ndjson")
+
+    @property
+    def compared(self) -> Store:
+        """The second store.
+
+        Raises
+        ------
+        RequestError
+            There is none.
+        """
+        if self.other is None:
+            told = "there is no second store; start 'sgstore serve STORE' with --compare OTHER"
+            raise RequestError(told, 404)
+        return self.other
 
     def target(self, name: str) -> Path:
         """A place below the folder that may be written to.
@@ -415,19 +449,22 @@ async def given_file(request: Request) -> Response:
     return FileResponse(path, media_type=kind, headers={"cache-control": "no-cache"})
 
 
-_WORK: Final[Mapping[str, Callable[[Explorer, Fields], Callable[..., Any]]]] = {
-    "lock": lambda of, fields: partial(
-        locked_clips, of.store, fields.clips(), of.target(fields.text("name"))
-    ),
-    "export": lambda of, fields: partial(
-        exported,
-        of.store,
-        fields.clips(),
-        of.target(fields.text("name")),
-        fields.text("format", "mcap"),
-    ),
-    "diff": lambda of, fields: partial(differing, of.store, of.other, fields.text("text", "")),
+_WORK: Final[Mapping[str, Callable[[Explorer, Fields], dict[str, Any]]]] = {
+    "lock": lambda of, fields: {
+        "clips": fields.clips(),
+        "to": str(of.target(fields.text("name"))),
+    },
+    "export": lambda of, fields: {
+        "clips": fields.clips(),
+        "to": str(of.target(fields.text("name"))),
+        "format": fields.text("format", "mcap"),
+    },
+    "diff": lambda of, fields: {
+        "other": str(of.compared.file.path.absolute()),
+        "abstraction": fields.text("text", "") or "RSV",
+    },
 }
+"""What a longer piece of work needs to be told, by its name."""
 
 
 def _is_sql(text: str) -> bool:

@@ -92,17 +92,9 @@ def exported(store: Store, clips: Clips, to: Path, form: str, progress: Progress
     return {"folder": str(to), "files": [one.file.name for one in written], "losses": losses}
 
 
-def differing(a: Store, b: Store | None, abstraction: str, _: Progress) -> dict[str, Any]:
-    """Scenes and frames in which two stores differ.
-
-    Raises
-    ------
-    StoreError
-        There is no second store.
-    """
-    if b is None:
-        raise StoreError("there is no second store; start 'sgstore serve STORE --compare OTHER'")
-    both = [classed(ChosenFrames(one.file.path.name, one), abstraction or "RSV") for one in (a, b)]
+def differing(a: Store, b: Store, abstraction: str) -> dict[str, Any]:
+    """Scenes and frames in which two stores differ."""
+    both = [classed(ChosenFrames(one.file.path.name, one), abstraction) for one in (a, b)]
     return {"scenes": _table(scenes(*both)), "frames": _table(by_frame(*both))}
 
 

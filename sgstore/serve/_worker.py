@@ -10,18 +10,17 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 from sgstore.errors import QueryError
 from sgstore.lang import WhyNotSteps
-from sgstore.sandbox import plain, rows_found, serve
+from sgstore.query import Store
+from sgstore.sandbox import plain, rows_found, serve, tell
 from sgstore.temporal import margin_cells
 
-if TYPE_CHECKING:
-    from sgstore.query import Store
-
 Reply = dict[str, Any]
-Asked = Callable[["Store", dict[str, Any], int], Iterator[Reply]]
+Asked = Callable[[Store, dict[str, Any], int], Iterator[Reply]]
 
 BATCH_S: Final = 0.1
 """How long matches wait for others, to be sent together; s."""
@@ -121,18 +120,25 @@ def _told_check(store: Store, question: dict[str, Any], most: int) -> Iterator[R
     yield {"count": many, "truncated": many >= most, "notes": run.notes}
 
 
-def _told_coverage(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
-    """A table of coverage."""
-    from sgstore.serve._measures import measured  # not needed by the others
+def _measured(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
+    """Coverage, a selection, or work on clips; what is done of it is told before."""
+    from sgstore.serve import _measures as of  # not needed by the others
 
-    yield measured(store, question["what"], question["abstraction"])
+    def progress(done: int, whole: int) -> None:
+        tell({"progress": [done, whole]})
 
-
-def _told_selection(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
-    """Size of clips, and what they keep."""
-    from sgstore.serve._measures import measured_clips
-
-    yield measured_clips(store, question["clips"], question["abstraction"])
+    match question:
+        case {"ask": "coverage", "what": what, "abstraction": abstraction}:
+            yield of.measured(store, what, abstraction)
+        case {"ask": "select", "clips": clips, "abstraction": abstraction}:
+            yield of.measured_clips(store, clips, abstraction)
+        case {"ask": "lock", "clips": clips, "to": to}:
+            yield {"result": of.locked_clips(store, clips, Path(to), progress)}
+        case {"ask": "export", "clips": clips, "to": to, "format": form}:
+            yield {"result": of.exported(store, clips, Path(to), form, progress)}
+        case {"other": other, "abstraction": abstraction}:
+            with Store(other) as second:
+                yield {"result": of.differing(store, second, abstraction)}
 
 
 QUESTIONS: Final[Mapping[str, Asked]] = {
@@ -142,8 +148,7 @@ QUESTIONS: Final[Mapping[str, Asked]] = {
     "parts": _told_parts,
     "why": _told_why,
     "check": _told_check,
-    "coverage": _told_coverage,
-    "select": _told_selection,
+    **dict.fromkeys(("coverage", "select", "lock", "export", "diff"), _measured),
 }
 """What ``ask`` may be; each is given the store, the question, and the most matches or rows."""
 

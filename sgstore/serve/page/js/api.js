@@ -51,37 +51,28 @@ export async function columns(path, body, how) {
   return unpacked(await (await send(path, body, how)).arrayBuffer());
 }
 
-/** Parts of an answer, as they come, cut where a separator stands.
- * @param {Response} answer @param {string} separator */
-async function* cut(answer, separator) {
+/** Lines of an answer, as they come. @param {string} path @param {Plain} body @param {RequestInit} [how] */
+export async function* lines(path, body, how) {
+  const answer = await send(path, body, how);
   if (!answer.body) return;
-  const reader = answer.body.getReader(), decoder = new TextDecoder();
+  const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();
   let rest = "";
   for (;;) {
     const { done, value } = await reader.read();
-    rest += decoder.decode(value, { stream: !done });
-    const parts = rest.split(separator);
+    const parts = (rest + (value || "")).split("\n");
     rest = parts.pop() || "";
-    for (const part of parts) if (part) yield part;
-    if (done) break;
+    for (const part of parts) yield JSON.parse(part);
+    if (done) return;
   }
-  if (rest.trim()) yield rest;
-}
-
-/** @param {string} path @param {Plain} body @param {AbortSignal} signal */
-export async function* lines(path, body, signal) {
-  for await (const line of cut(await send(path, body, { signal }), "\n")) yield JSON.parse(line);
 }
 
 /** The result of a longer piece of work.
  * @param {string} path @param {Plain} body @param {(done: number, of: number) => void} [progress] @param {RequestInit} [how] */
 export async function work(path, body, progress, how) {
-  for await (const part of cut(await send(path, body, how), "\n\n")) {
-    const [event, data] = part.split("\ndata: ");
-    const value = JSON.parse(data || "null");
-    if (event === "event: progress") progress?.(value[0], value[1]);
-    else if (event === "event: error") throw new Refused(value.reason, value);
-    else return value;
+  for await (const { progress: done, error, result } of lines(path, body, how)) {
+    if (done) progress?.(done[0], done[1]);
+    else if (error) throw new Refused(error.reason, error);
+    else return result;
   }
   throw new Refused("the server ended before it was done");
 }

@@ -25,7 +25,7 @@ const inB = computed(() => side.value || (store.value?.other ? "b" : "a"));
 async function framesOf(query, of, signal) {
   /** @type {Found} */
   const by = new Map();
-  for await (const match of matchesIn(api.lines("api/find", { text: query, parameters: parametersOf(query), side: of }, signal))) {
+  for await (const match of matchesIn(api.lines("api/find", { text: query, parameters: parametersOf(query), side: of }, { signal }))) {
     const one = by.get(match.trace) || { frames: new Set(), matches: [] };
     by.set(match.trace, one);
     one.matches.push(match);

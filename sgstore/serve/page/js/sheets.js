@@ -24,7 +24,6 @@ let counting = false;
 export async function countLibrary() {
   if (counting) return;
   counting = true;
-  const signal = new AbortController().signal;
   for (const one of library.value) {
     if (one.kind === "predicate" || one.kind === "property" || tally.value[one.name]) continue;
     while (answer.value.state === "busy" || view.value !== "find" || open.value) await new Promise((done) => setTimeout(done, 400));
@@ -32,7 +31,7 @@ export async function countLibrary() {
     const spans = [];
     let count = 0;
     try {
-      for await (const line of api.lines("api/find", { text: one.text }, signal)) {
+      for await (const line of api.lines("api/find", { text: one.text })) {
         for (const row of line.matches || []) spans.push([placeOf(row[0], row[1]), placeOf(row[0], row[2] + 1)]);
         if (line.error) count = -1;
         if (line.count !== undefined) count = line.count;
@@ -110,19 +109,18 @@ function Chart({ table, x, lines }) {
 
 /** Something that takes a while: asks once, and says what came of it; what is not looked at any more ends. @param {string} path @param {any} body */
 export function useWork(path, body) {
-  const [told, tell] = useState(/** @type {any} */ ({}));
+  const [told, tell] = useState(/** @type {any} */ ({})), asked = path + JSON.stringify(body);
   useEffect(() => {
     const mine = new AbortController(), how = { signal: mine.signal };
-    tell({ busy: true });
     (path === "api/diff" ? api.work(path, body, undefined, how) : api.json(path, body, how).then((found) => { if (found.error) throw new Error(found.error.reason); return found; }))
-      .then((found) => tell({ found })).catch((error) => { if (!mine.signal.aborted) tell({ error: reasonOf(error) }); });
+      .then((found) => tell({ asked, found })).catch((error) => { if (!mine.signal.aborted) tell({ asked, error: reasonOf(error) }); });
     return () => mine.abort();
-  }, [path, JSON.stringify(body)]);
-  return told;
+  }, [asked]);
+  return told.asked === asked ? told : {}; // not the answer to what was asked before
 }
 
 /** @param {{told: any, children?: any}} props */
-export const Waiting = ({ told, children }) => (told.error ? html`<p class="error" role="alert">${told.error}</p>` : told.busy || !told.found ? html`<p class="faint" role="status">working …</p>` : children(told.found));
+export const Waiting = ({ told, children }) => (told.error ? html`<p class="error" role="alert">${told.error}</p>` : !told.found ? html`<p class="faint" role="status">working …</p>` : children(told.found));
 
 // Coverage ---------------------------------------------------------------------------------------------------------------
 

@@ -161,7 +161,7 @@ export async function find(how = {}) {
       return;
     }
     let last = 0;
-    for await (const line of api.lines("api/find", { text: query, parameters: parametersOf(query), id }, mine.signal)) {
+    for await (const line of api.lines("api/find", { text: query, parameters: parametersOf(query), id }, { signal: mine.signal })) {
       if (line.names) told.names = line.names;
       if (line.matches) for (const row of line.matches) told.matches.push(matchOf(row, told));
       for (const name of ["reasons", "columns", "rows", "notes", "count", "truncated", "ms", "error"]) {
