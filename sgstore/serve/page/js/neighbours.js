@@ -39,12 +39,15 @@ function hopOf(graph, bound, placeOf) {
 function layout(nodes, placeOf, bound, turn) {
   const of = nodes.filter((n) => bound.has(n)).map((n) => placeOf(n) || [0, 0]), many = Math.max(of.length, 1);
   const cx = of.reduce((s, [x]) => s + (x || 0), 0) / many, cy = of.reduce((s, [, y]) => s + (y || 0), 0) / many;
-  const polar = nodes.map((node) => {
+  const spots = nodes.map((node) => {
     const [x, y] = placeOf(node) || [0, 0], dx = (x || 0) - cx, dy = (y || 0) - cy;
-    return { node, far: Math.sqrt(Math.hypot(dx, dy)), angle: Math.atan2(dy, dx) + turn };
+    const far = Math.sqrt(Math.hypot(dx, dy)), angle = Math.atan2(dy, dx) + turn;
+    return { node, x: far * Math.cos(angle), y: -far * Math.sin(angle) };
   });
-  const most = Math.max(...polar.map((p) => p.far), 1);
-  const spots = polar.map(({ node, far, angle }) => ({ node, x: WIDE / 2 + (far / most) * (WIDE / 2 - 44) * Math.cos(angle), y: HIGH / 2 - (far / most) * (HIGH / 2 - 24) * Math.sin(angle) }));
+  // The panel is filled both ways, as far as that does not twist directions too much: on a road all are ahead or behind.
+  const wide = Math.max(...spots.map((p) => Math.abs(p.x)), 1), high = Math.max(...spots.map((p) => Math.abs(p.y)), 1);
+  const down = Math.min((HIGH / 2 - 24) / high, 4 * (WIDE / 2 - 44) / wide), right = Math.min((WIDE / 2 - 44) / wide, 4 * down);
+  for (const p of spots) { p.x = WIDE / 2 + p.x * right; p.y = HIGH / 2 + p.y * down; }
   for (let round = 0; round < 40; round++) { // who would stand on another steps aside
     for (const a of spots) for (const b of spots) {
       const dx = b.x - a.x, dy = b.y - a.y;
@@ -80,7 +83,7 @@ export function Neighbours({ graph, states, north }) {
         const words = [...labels], text = words.length > 2 && !on ? `${words[0]} +${words.length - 1}` : words.join(", ");
         return html`<g class=${on || inside ? "holds" : "faint"} stroke="currentColor" onMouseEnter=${() => { lit.value = new Set([src, dst]); }} onMouseLeave=${() => { lit.value = new Set(); }}>
           <title>${`${name(src)} ${words.join(", ")} ${name(dst)}${both ? ", and back" : ""}`}</title><path d=${`M${ax} ${ay}L${bx} ${by}`} stroke-width=${on ? 3 : inside ? 2 : 1} /><path d=${`M${ax} ${ay}L${bx} ${by}`} stroke="transparent" stroke-width="9" />
-          ${on || inside || drawn.length < 9 ? html`<text class="halo" x=${((ax || 0) + (bx || 0)) / 2} y=${((ay || 0) + (by || 0)) / 2 - 3} font-size="9.5" text-anchor="middle" fill="currentColor">${text}</text>` : null}</g>`;
+          ${on || inside || drawn.length < 5 ? html`<text class="halo" x=${((ax || 0) + (bx || 0)) / 2} y=${((ay || 0) + (by || 0)) / 2 - 3} font-size="9.5" text-anchor="middle" fill="currentColor">${text}</text>` : null}</g>`;
       })}
       ${shown.map((node) => {
         const [x, y] = at.get(node) || [0, 0], one = name(node).slice(0, 14), wide = Math.max(one.length * 6 + 14, 34);
