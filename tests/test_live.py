@@ -20,7 +20,7 @@ from columns_read import unpacked
 
 from sgstore.config import Config
 from sgstore.demo import RECORDING
-from sgstore.errors import QueryNameError
+from sgstore.errors import QueryNameError, StoreError
 from sgstore.serve import LiveRun, live_application, paced
 from sgstore.step import Frame
 from sgstore.temporal import Monitor, MonitorEvent, opened
@@ -112,6 +112,22 @@ def test_lanes_of_truth_are_those_of_a_store(watched: Any, open_town: Store) -> 
             seqs = {seq for a, z in lane["spans"] for seq in range(a, z + 1)}
             kept = range(FRAMES)
             assert seqs == {seq for a, z in one.spans for seq in range(a, z + 1) if seq in kept}
+
+
+def test_graphs_and_why_not_are_those_of_a_store(watched: Any, open_town: Store) -> None:
+    run, events, _ = watched
+    found = next(event for event in events if event.kind == "found")
+    for seq in (found.start.seq, FRAMES - 1):
+        graph, of = run.graph(seq), open_town.graph(f"town#{seq}")
+        assert {node["id"]: node["kind"] for node in graph["nodes"] if node["id"] >= 0} == {
+            node: about["kind"] for node, about in of.nodes(data=True) if node >= 0
+        }
+        joined = {(edge["src"], edge["dst"], edge["relation"]) for edge in graph["edges"]}
+        assert joined == {(src, dst, relation) for src, dst, relation in of.edges(keys=True)}
+        why = open_town.why_not(f"town#{seq}", NEAR).as_dict()
+        assert run.why("pattern", seq)["failed"] == why["failed"]
+    with pytest.raises(StoreError, match="not kept; those from #0 on are"):
+        run.graph(FRAMES)
 
 
 def test_a_part_over_time_is_not_known(open_town: Store) -> None:

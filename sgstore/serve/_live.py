@@ -22,11 +22,11 @@ from starlette.applications import Starlette
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from sgstore.errors import QueryNameError, SgstoreError
-from sgstore.lang import Binding, FrameView, ScopeSearch, parts_of
+from sgstore.errors import QueryNameError, SgstoreError, StoreError
+from sgstore.lang import Binding, FrameView, ScopeSearch, parts_of, why_not
 from sgstore.serve._app import given_file, page_of, told
 from sgstore.serve._guard import Guard
-from sgstore.serve._reads import clean, drawn_map
+from sgstore.serve._reads import clean, drawn_map, told_graph
 from sgstore.serve._requests import Fields
 from sgstore.serve._wire import as_json, packed
 from sgstore.vocabulary import KIND_CODE, KINDS, LIGHT_STATE_CODE, LIGHT_STATES
@@ -281,17 +281,52 @@ class LiveRun:
             There is no such pattern, or it has no such variable.
         """
         with self._lock:
-            queries = self._monitor.patterns if self._monitor is not None else {}
-            if name not in queries:
-                raise QueryNameError(f"no pattern {name!r} is watched")
+            query = self._query(name)
             key = (name, *sorted(nodes.items()))
             if key not in self._watched:
-                self._watched[key] = WatchedMatch(queries[name], nodes)
+                self._watched[key] = WatchedMatch(query, nodes)
                 self._watched[key].look(self._views)
             self._watched.move_to_end(key)
             while len(self._watched) > WATCHED:
                 self._watched.popitem(last=False)
             return {"trace": self.name, **self._watched[key].lanes(self._gone)}
+
+    def graph(self, seq: int) -> dict[str, Any]:
+        """The scene graph of a frame, as the explorer gives it.
+
+        Raises
+        ------
+        StoreError
+            The graph of this frame is not kept.
+        """
+        return told_graph(self._view(seq).graph)
+
+    def why(self, name: str, seq: int) -> dict[str, Any]:
+        """The first part of a pattern that fails in a frame, as the explorer tells it.
+
+        Raises
+        ------
+        QueryNameError
+            There is no such pattern.
+        StoreError
+            The graph of this frame is not kept.
+        """
+        return why_not(self._query(name), self._view(seq)).as_dict()
+
+    def _query(self, name: str) -> Query:
+        queries = self._monitor.patterns if self._monitor is not None else {}
+        if name not in queries:
+            raise QueryNameError(f"no pattern {name!r} is watched")
+        return queries[name]
+
+    def _view(self, seq: int) -> FrameView:
+        with self._lock:
+            views = tuple(self._views)
+        for view in views:
+            if view.frame["seq"] == seq:
+                return view
+        first = views[0].frame["seq"] if views else 0
+        raise StoreError(f"the graph of frame #{seq} is not kept; those from #{first} on are")
 
     def _hello(self) -> tuple[int, bytes]:
         """The number of the first message that is kept, and what a page must know before it."""
@@ -345,6 +380,15 @@ def live_application(run: LiveRun, token: str, hosts: tuple[str, ...], cookie: s
         nodes = fields.binding() or {}
         return JSONResponse(await asyncio.to_thread(run.parts, fields.text("text"), nodes))
 
+    async def frame(request: Request) -> Response:
+        fields = await Fields.of(request)
+        return JSONResponse(await asyncio.to_thread(run.graph, fields.whole("seq")))
+
+    async def why(request: Request) -> Response:
+        fields = await Fields.of(request)
+        about = fields.text("text"), fields.whole("seq")
+        return JSONResponse(await asyncio.to_thread(run.why, *about))
+
     async def live(_: Request) -> Response:
         return StreamingResponse(run.messages(), media_type="text/event-stream")
 
@@ -355,6 +399,8 @@ def live_application(run: LiveRun, token: str, hosts: tuple[str, ...], cookie: s
         Route("/api/store", told(about), methods=get),
         Route("/api/map", told(outlines), methods=get),
         Route("/api/parts", told(parts), methods=["POST"]),
+        Route("/api/frame", told(frame), methods=get),
+        Route("/api/why", told(why), methods=["POST"]),
         Route("/api/live", told(live), methods=get),
     ]
     return Guard(Starlette(routes=routes), token, hosts, cookie)

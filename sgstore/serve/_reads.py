@@ -24,6 +24,7 @@ from sgstore.serve._words import words
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from sgstore.graph import SceneGraph
     from sgstore.lang import Catalog
     from sgstore.query import Store
     from sgstore.roads import RoadMap
@@ -196,13 +197,7 @@ class Reads:
         trace, seq = fields.text("trace"), fields.whole("seq")
 
         def read() -> dict[str, Any]:
-            graph = self._store.file.graph(self.frame_id(trace, seq))
-            nodes = [{"id": node, **about} for node, about in graph.nodes.items()]
-            edges = [
-                {"src": src, "relation": relation, "dst": dst, **about}
-                for src, relation, dst, about in graph.edges
-            ]
-            return clean({"nodes": nodes, "edges": edges})
+            return told_graph(self._store.file.graph(self.frame_id(trace, seq)))
 
         return read
 
@@ -268,6 +263,16 @@ def drawn_map(road_map: RoadMap | None) -> bytes:
     names = ("x", "y", "start", "node", "word", "closed")
     columns = {name: getattr(drawn, name) for name in names}
     return packed({"origin": drawn.origin, "words": drawn.words}, columns)
+
+
+def told_graph(graph: SceneGraph) -> dict[str, Any]:
+    """All that is known of the nodes and edges of a scene graph, as JSON holds it."""
+    nodes = [{"id": node, **about} for node, about in graph.nodes.items()]
+    edges = [
+        {"src": src, "relation": relation, "dst": dst, **about}
+        for src, relation, dst, about in graph.edges
+    ]
+    return clean({"nodes": nodes, "edges": edges})
 
 
 def clean(value: Any) -> Any:

@@ -97,7 +97,7 @@ effect(() => {
 });
 
 export async function askWhy() {
-  const now = open.value, query = asked.value;
+  const now = open.value, query = live.value ? now?.match?.pattern : asked.value;
   if (!now || !query) return;
   try {
     why.value = { at: frame.value, ...(await api.json("api/why", {

@@ -1,7 +1,7 @@
 // @ts-check
 // Keys of the scene: what they do, and the list of them.
 import { h, htm } from "../vendor/core.js";
-import { camera, frame, goTo, matchEnd, nextMatch, panel } from "./clock.js";
+import { askWhy, camera, frame, goTo, matchEnd, nextMatch, panel } from "./clock.js";
 import { dialog, open, playing, tick, traces, writeAddress } from "./state.js";
 
 const html = htm.bind(h);
@@ -24,6 +24,7 @@ export const keys = [
     const all = ["pattern", "near", "nodes", "edges"];
     panel.value = all[(all.indexOf(panel.value) + 1) % 4] || "pattern";
   } }],
+  ["w", "why does this frame match, or not", { w: () => { askWhy(); } }],
   ["Esc", "close", { Escape: () => {
     if (dialog.value) dialog.value = "";
     else if (open.value) { playing.value = false; open.value = null; writeAddress(); }

@@ -115,7 +115,7 @@ function Live() {
     ${toast.value ? html`<div class="toast" role="status">${toast.value}</div>` : null}`;
 }
 
-for (const sign of ["x", "g", "c"]) keys.splice(keys.findIndex(([one]) => one === sign), 1);
+for (const sign of ["x", "c"]) keys.splice(keys.findIndex(([one]) => one === sign), 1);
 keys.push(["l", "follow what comes", { l: follow }]);
 
 async function run() {

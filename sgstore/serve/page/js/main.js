@@ -2,7 +2,7 @@
 // The page: its head, the search, what was found, and the view that is open; keys.
 import { effect, h, htm, render, untracked, useEffect } from "../vendor/core.js";
 import * as api from "./api.js";
-import { askWhy, copyLink, frame } from "./clock.js";
+import { copyLink, frame } from "./clock.js";
 import { Editor, focusEditor, NumberSlider, setQuery } from "./editor.js";
 import { Gallery } from "./gallery.js";
 import { Keys, keys } from "./keys.js";
@@ -134,8 +134,7 @@ function App() {
 }
 
 keys.unshift(["/", "editor", { "/": focusEditor }], ["Ctrl ⏎", "find", {}]);
-keys.push(["t", "tag this frame", { t: () => { if (open.value) dialog.value = "tag"; } }],
-  ["w", "why does this frame match, or not", { w: () => { askWhy(); } }], ["y", "copy a link", { y: copyLink }]);
+keys.push(["t", "tag this frame", { t: () => { if (open.value) dialog.value = "tag"; } }], ["y", "copy a link", { y: copyLink }]);
 
 effect(() => {
   if (theme.value) document.documentElement.dataset.theme = theme.value; else delete document.documentElement.dataset.theme;

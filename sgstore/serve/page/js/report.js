@@ -33,7 +33,6 @@ store.value = kept.about;
 notes.value = kept.notes;
 text.value = kept.query;
 values.value = Object.fromEntries(Object.entries(kept.parameters).map(([name, value]) => [name, String(value)]));
-keys.splice(keys.findIndex(([sign]) => sign === "x"), 1);
-keys.splice(keys.findIndex(([sign]) => sign === "g"), 1);
+for (const sign of ["x", "g", "w"]) keys.splice(keys.findIndex(([one]) => one === sign), 1);
 render(html`<${Report} />`, /** @type {HTMLElement} */ (document.getElementById("app")));
 find();

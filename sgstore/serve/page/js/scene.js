@@ -151,7 +151,7 @@ const PAIRS = ["distance", "gap", "ttc", "headway", "bearing", "closing_speed"];
 const OF_NODE = ["speed", "accel", "yaw_rate", "heading", "steer", "brake"];
 
 function Details() {
-  const tabs = [["pattern", "pattern"], ...(offline.value ? [] : [["near", "neighbours"], ["nodes", "nodes"], ["edges", "edges"]]), ...(chosen.value === null ? [] : [["node", nameOf(open.value?.trace || "", chosen.value)]])];
+  const tabs = [["pattern", "pattern"], ...(offline.value && !live.value ? [] : [["near", "neighbours"], ["nodes", "nodes"], ["edges", "edges"]]), ...(chosen.value === null ? [] : [["node", nameOf(open.value?.trace || "", chosen.value)]])];
   const now = panel.value === "node" && chosen.value === null ? "pattern" : panel.value;
   return html`<div class="panel pattern">
     <div class="tabs" role="tablist">${tabs.map(([key, name]) => html`<button role="tab" aria-selected=${now === key}
@@ -181,10 +181,18 @@ function NodePanel() {
 /** @param {{what: string}} props */
 function GraphTable({ what }) {
   const [graph, setGraph] = useState(/** @type {any} */ (null));
-  const now = open.value, at = playing.value ? -1 : frame.value;
-  useEffect(() => {
+  const now = open.value, at = playing.value ? -1 : frame.value, want = useRef(""), busy = useRef(false);
+  useEffect(() => { // one request at a time: of a monitor that goes on, the next one is for the frame of then
     if (!now || at < 0) return;
-    api.json(api.address("api/frame", { trace: now.trace, seq: at })).then(setGraph).catch((error) => say(reasonOf(error)));
+    want.current = api.address("api/frame", { trace: now.trace, seq: at });
+    const ask = async () => {
+      const asked = want.current;
+      busy.current = true;
+      try { setGraph(await api.json(asked)); } catch (error) { say(reasonOf(error)); }
+      busy.current = false;
+      if (want.current !== asked) ask();
+    };
+    if (!busy.current) ask();
   }, [now?.trace, at]);
   if (!graph) return html`<p class="faint" style=${{ padding: "8px 12px" }}>${playing.value ? "pause to read the graph of a frame" : "…"}</p>`;
   if (what === "near") return html`<${Neighbours} graph=${graph} states=${now ? statesAt(now.trace, frame.value) : null} north=${zoom.value.north} />`;
@@ -200,7 +208,7 @@ function GraphTable({ what }) {
   const listed = graph.nodes.filter((/** @type {any} */ n) => n.id >= 0).sort((/** @type {any} */ a, /** @type {any} */ b) => Number(bound.has(b.id)) - Number(bound.has(a.id)));
   return html`<div class="scroll"><table><thead><tr><th>node</th><th>kind</th><th>speed</th></tr></thead><tbody>
     ${listed.map((/** @type {any} */ n) => html`<tr class=${chosen.value === n.id ? "chosen" : ""} onMouseEnter=${() => { lit.value = new Set([n.id]); }}
-      onMouseLeave=${() => { lit.value = new Set(); }} onClick=${() => { chosen.value = n.id; panel.value = "node"; showSeries("speed", n.id); }}>
+      onMouseLeave=${() => { lit.value = new Set(); }} onClick=${() => { chosen.value = n.id; panel.value = "node"; if (!offline.value) showSeries("speed", n.id); }}>
       <td>${n.name || n.id}</td><td>${n.kind}</td><td class="number">${n.speed === undefined || n.speed === null ? "" : `${n.speed.toFixed(1)}`}</td></tr>`)}</tbody></table></div>`;
 }
 
@@ -222,8 +230,8 @@ function Transport() {
     <span class="time"><b>${now?.trace}</b>#${frame.value} · ${t.toFixed(2)} s</span>
     <span class="grow"></span>
     ${traces.value.has(inOther(now?.trace || "")) ? html`<button aria-pressed=${beside.value} title="the second store by the same clock" onClick=${() => { beside.value = !beside.value; }}>Beside</button>` : null}
-    ${offline.value ? null : html`<button title="why does this frame match, or not (w)" aria-expanded=${told ? "true" : "false"} onClick=${() => { if (told) why.value = null; else askWhy(); }}>Why?</button>
-    <button title="copy a link (y)" onClick=${copyLink}>Link</button>`}
+    ${offline.value && !now?.match?.pattern ? null : html`<button title="why does this frame match, or not (w)" aria-expanded=${told ? "true" : "false"} onClick=${() => { if (told) why.value = null; else askWhy(); }}>Why?</button>`}
+    ${offline.value ? null : html`<button title="copy a link (y)" onClick=${copyLink}>Link</button>`}
     ${live.value ? null : html`<button aria-label="Close" title="close (Esc)" onClick=${() => { playing.value = false; open.value = null; writeAddress(); }}>✕</button>`}
     ${told ? html`<span class="gap" role="status">${gap?.failed ? html`<span><b>fails</b> <code>${gap.failed}</code>${gap.found ? html` · found <code>${gap.found}</code>` : null}</span>`
       : told.error ? told.error.reason : "all of it holds in this frame"}
