@@ -130,7 +130,7 @@ def test_patterns_of_the_library(store: Store, pattern: NamedPattern) -> None:
 def test_patterns_of_the_library_in_other_towns(data: Path, tmp_path: Path, trace: str) -> None:
     (outcome,) = ingest(tmp_path / "other.sgstore", [data / "traces" / f"{trace}.mcap"])
     assert outcome.error is None
-    store = Store(tmp_path / "other.sgstore")
+    store = Store(tmp_path / "other.sgstore", memory=4 << 30)  # a step alone may hold of most pairs
     with store.file.snapshot():
         for pattern in ONE_STEP:
             compare_lanes(store, pattern, None)
