@@ -44,7 +44,7 @@ from sgstore.files import new_place
 from sgstore.processes import command
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterator, Mapping
 
     from sgstore.query import Store
 
@@ -422,6 +422,8 @@ class SandboxPool:
     store : str or Path
     size : int
         How many questions are answered at a time; the others wait.
+    small : collection of str
+        What is asked (``ask`` of a question) that waits for none of the others: the spare one answers it.
     **limits
         As :class:`Sandbox` takes them.
 
@@ -431,9 +433,12 @@ class SandboxPool:
         As :class:`Sandbox`.
     """
 
-    def __init__(self, store: str | Path, *, size: int = 2, **limits: Any) -> None:
+    def __init__(
+        self, store: str | Path, *, size: int = 2, small: Collection[str] = (), **limits: Any
+    ) -> None:
         self._changed = threading.Condition()
         self._turns = threading.BoundedSemaphore(size)
+        self._small = dict.fromkeys(small, threading.BoundedSemaphore(1))
         self._free = [Sandbox(store, **limits)]
         self._asked: dict[str, Sandbox | None] = {}
         self._closed = False
@@ -478,7 +483,7 @@ class SandboxPool:
                 raise QueryError(f"a question {key!r} is under way")
             self._asked[key] = None
         try:
-            with self._turns:
+            with self._small.get(str(question.get("ask")), self._turns):
                 box = self._taken(key)
                 try:
                     yield from box.replies(question)

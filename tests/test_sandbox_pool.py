@@ -100,6 +100,16 @@ def test_a_question_behind_a_runaway_is_answered_at_once(pool: SandboxPool) -> N
     assert asked(pool, "sql", "SELECT 1 AS x")[0]["rows"] == [[1]]
 
 
+def test_a_small_question_waits_for_none_of_the_others(town_store: Path) -> None:
+    small = {"size": 1, "small": ("why",), "worker": "sgstore.serve._worker"}
+    with SandboxPool(town_store, timeout_s=60, **small) as pool:
+        away = pool.ask({"ask": "matches", "text": NEAR, "parameters": {}}, "away")
+        next(away)  # it holds the only turn
+        frame = Store(town_store).file.frame("town#100").frame_id
+        assert asked(pool, "why", NEAR, frame=frame)[0]["relax"] == []
+        away.close()  # type: ignore[attr-defined]
+
+
 def test_who_stops_reading_stops_the_question(pool: SandboxPool) -> None:
     found = pool.ask({"ask": "matches", "text": NEAR, "parameters": {}}, "half")
     next(found)

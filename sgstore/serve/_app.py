@@ -236,6 +236,7 @@ class Explorer:
             max_rows=MOST_MATCHES,
             tables=tables,
             worker=WORKER,
+            small=("parts", "why"),
         )
 
     def _tables(self) -> dict[str, Path]:

@@ -4,7 +4,7 @@ import { h, htm, signal, useEffect, useState } from "../vendor/core.js";
 import * as api from "./api.js";
 import { beside } from "./clock.js";
 import { setQuery } from "./editor.js";
-import { answer, find, keyOf, library, open, openFrame, openMatch, reasonOf, store, tally, tick, ticked, values, view } from "./state.js";
+import { answer, find, idle, keyOf, library, open, openFrame, openMatch, reasonOf, store, tally, tick, ticked, values, view } from "./state.js";
 
 const html = htm.bind(h);
 
@@ -24,20 +24,22 @@ let counting = false;
 export async function countLibrary() {
   if (counting) return;
   counting = true;
-  for (const one of library.value) {
-    if (one.kind === "predicate" || one.kind === "property" || tally.value[one.name]) continue;
+  const left = library.value.filter((one) => one.kind !== "predicate" && one.kind !== "property" && !tally.value[one.name]);
+  for (let one = left.shift(); one; one = left.shift()) {
     while (answer.value.state === "busy" || view.value !== "find" || open.value) await new Promise((done) => setTimeout(done, 400));
     /** @type {number[][]} */
-    const spans = [];
+    const spans = [], mine = new AbortController();
     let count = 0;
+    idle.stop = () => mine.abort();
     try {
-      for await (const line of api.lines("api/find", { text: one.text })) {
-        for (const row of line.matches || []) spans.push([placeOf(row[0], row[1]), placeOf(row[0], row[2] + 1)]);
+      for await (const line of api.lines("api/find", { text: one.text }, { signal: mine.signal })) {
+        for (const row of line.matches || []) if (spans.length < 300) spans.push([placeOf(row[0], row[1]), placeOf(row[0], row[2] + 1)]);
         if (line.error) count = -1;
         if (line.count !== undefined) count = line.count;
       }
     } catch { count = -1; }
-    tally.value = { ...tally.value, [one.name]: { count, spans: spans.slice(0, 300) } };
+    if (mine.signal.aborted) left.unshift(one); // somebody asks: again later
+    else tally.value = { ...tally.value, [one.name]: { count, spans } };
   }
   counting = false;
 }

@@ -94,6 +94,8 @@ export const reasonOf = (error) => (error instanceof Error ? error.message : Str
 let number = 0;
 /** @type {AbortController | null} */
 let under = null;
+/** What is asked while nothing else is: it ends where somebody asks. */
+export const idle = { stop: () => {} };
 
 /** What the browser kept for the page; nothing where it may keep nothing. @param {string} name */
 export function remembered(name) {
@@ -144,6 +146,7 @@ export async function find(how = {}) {
   const query = text.value.trim();
   if (!query) { answer.value = { state: "idle", matches: [], names: [], reasons: {}, notes: [] }; return; }
   cancel();
+  idle.stop();
   const id = `q${Date.now().toString(36)}${number++}`;
   const mine = (under = new AbortController());
   const began = performance.now();
