@@ -5,7 +5,7 @@ import * as api from "./api.js";
 import { beside } from "./clock.js";
 import { setQuery } from "./editor.js";
 import { Gallery } from "./gallery.js";
-import { abstraction, Table, useWork, Waiting } from "./sheets.js";
+import { abstraction, Table, useWork } from "./sheets.js";
 import { find, inOther, matchesIn, openFrame, parametersOf, reasonOf, say, store, text, traces, view } from "./state.js";
 
 const html = htm.bind(h);
@@ -107,18 +107,18 @@ export function Compare() {
 /** @param {{found: any}} props */
 function OfStores({ found }) {
   const told = useWork("api/diff", { text: abstraction.value });
-  return html`<${Waiting} told=${told}>${(/** @type {any} */ d) => html`<${Differing} found=${found} diff=${d} />`}</${Waiting}>`;
+  return html`${told.error ? html`<p class="sheet error" role="alert">${told.error}</p>` : null}<${Differing} found=${found} diff=${told.found} waits=${!told.found && !told.error} />`;
 }
 
-/** @param {{found: any, diff?: any}} props */
-function Differing({ found, diff }) {
+/** @param {{found: any, diff?: any, waits?: boolean}} props */
+function Differing({ found, diff, waits }) {
   const tiles = found ? [...onlyIn(found.a, found.b, "a", "A", text.value.trim()), ...onlyIn(found.b, found.a, inB.value, "B", other.value)] : [];
   const scenes = diff ? scenesOf(diff.scenes) : [], all = [...tiles, ...scenes];
   const many = (/** @type {Found} */ one) => [...one.values()].reduce((n, { frames }) => n + frames.size, 0);
   const only = (/** @type {string} */ word) => tiles.filter((t) => t.group?.endsWith(`only in ${word}`)).reduce((n, t) => n + t.last - t.first + 1, 0);
   return html`<div class="status" role="status">${found ? html`<span><b>${many(found.a).toLocaleString("en")}</b> frames in A, <b>${many(found.b).toLocaleString("en")}</b> in B; only in A <b>${only("A").toLocaleString("en")}</b>, only in B <b>${only("B").toLocaleString("en")}</b></span>` : null}
-      ${diff ? html`<span class="faint">${diff.scenes.said[0]}</span>` : null}${all.length > MOST ? html`<span class="note">the first ${MOST.toLocaleString("en")} of ${all.length.toLocaleString("en")} pictures</span>` : null}</div>
-    ${shown.value === "tiles" ? html`<main>${all.length ? html`<${Gallery} found=${all.slice(0, MOST)} word=${["stretch", "stretches"]} />` : html`<div class="sheet"><h2>Nothing differs</h2><p class="faint">${found ? "Both find the same frames." : "Both have the same scenes. A query under Find is compared, too."}</p></div>`}</main>`
+      ${diff ? html`<span class="faint">${diff.scenes.said[0]}</span>` : waits ? html`<span class="faint">scenes are compared …</span>` : null}${all.length > MOST ? html`<span class="note">the first ${MOST.toLocaleString("en")} of ${all.length.toLocaleString("en")} pictures</span>` : null}</div>
+    ${shown.value === "tiles" ? html`<main>${all.length ? html`<${Gallery} found=${all.slice(0, MOST)} word=${["stretch", "stretches"]} />` : waits ? null : html`<div class="sheet"><h2>Nothing differs</h2><p class="faint">${found ? "Both find the same frames." : "Both have the same scenes. A query under Find is compared, too."}</p></div>`}</main>`
       : html`<div class="sheet" tabindex="0">${found ? html`<h2>Matches of the query</h2><${ByTrace} found=${found} />` : null}
         ${diff ? html`<h2>Scenes</h2><${Table} table=${diff.scenes} /><h2>Frame by frame</h2><${Table} table=${diff.frames} />` : null}</div>`}`;
 }
