@@ -6,7 +6,8 @@
 
 Needs Playwright and Chromium (``SGSTORE_CHROMIUM`` names its program). There are a small store of the bundled
 sample, one of a crowded town where the shared recordings are, and a large one of replicas (:mod:`bench.real`;
-``SGSTORE_BENCH_REAL=FILE`` takes one that is there). Processor times are of the server and its sandboxes.
+``SGSTORE_BENCH_REAL=FILE`` takes one that is there). Processor times of requests are of the server and its
+sandboxes, those of frames are of the browser: they say something on a busy machine, too.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import sys
 import tempfile
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,6 +32,7 @@ from bench.real import QUICK, TRACES, made
 from sgstore.demo import RECORDING
 from sgstore.ingest import ingest
 from sgstore.query import Store
+from sgstore.serve import report
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator
@@ -135,8 +137,18 @@ def _worked(pid: int) -> float:
 def _children(pid: int) -> list[int]:
     found: list[int] = []
     for task in Path(f"/proc/{pid}/task").glob("*/children"):
-        found += map(int, task.read_text().split())
+        with suppress(OSError):  # it has ended
+            found += map(int, task.read_text().split())
     return found
+
+
+def _browser_worked(pid: int) -> float:
+    """Processor time so far of the browsers among the children of a process, and of theirs; s."""
+    try:
+        mine = _worked(pid) if Path(f"/proc/{pid}/comm").read_text().startswith("chrom") else 0.0
+    except OSError:
+        return 0.0
+    return mine + sum(map(_browser_worked, _children(pid)))
 
 
 # In a browser -----------------------------------------------------------------------------------------------
@@ -183,6 +195,13 @@ def asked(page: Any, query: str, tiles: int) -> tuple[float, float]:
     return answered - begun, painted - begun
 
 
+def costed(page: Any, script: str, seconds: float) -> tuple[Any, float]:
+    """What a script says after some seconds, and the processor time of the browser meanwhile; s."""
+    before = _browser_worked(os.getpid())
+    told = page.evaluate(script, seconds)
+    return told, _browser_worked(os.getpid()) - before
+
+
 def playing(page: Any, seconds: float) -> dict[str, float]:
     """Frames a second, and what a step costs, while a match plays from the beginning of its trace."""
     page.locator(".tile").first.click()
@@ -190,7 +209,8 @@ def playing(page: Any, seconds: float) -> dict[str, float]:
     page.wait_for_timeout(1000)
     page.keyboard.press(" ")
     page.wait_for_timeout(300)
-    return page.evaluate(STEPS, seconds)
+    told, spent = costed(page, STEPS, seconds)
+    return {**told, "spent": spent / (told["fps"] * seconds) * 1e3}
 
 
 def of_sample(browser: Any, server: Server, seconds: float) -> Iterator[Measure]:
@@ -208,16 +228,14 @@ def of_sample(browser: Any, server: Server, seconds: float) -> Iterator[Measure]
     yield Measure("plays, with camera, view, drawing, lanes", told["fps"], "frames/s", "aim 30")
     yield Measure("  a step, 95th percentile", told["p95"], "ms", "aim 17")
     yield Measure("  steps with a late picture", told["late"], "", "aim 0")
+    yield Measure("  processor time a frame", told["spent"], "ms")
     page.keyboard.press(" ")
     page.keyboard.press("Escape")
     asked(page, MANY, 16)
     many = page.evaluate("document.querySelector('.status b').textContent")
-    yield Measure(
-        f"scrolls {many} tiles by 400 points a frame",
-        page.evaluate(SCROLL, seconds),
-        "frames/s",
-        "aim 50",
-    )
+    fps, spent = costed(page, SCROLL, seconds)
+    yield Measure(f"scrolls {many} tiles by 400 points a frame", fps, "frames/s", "aim 50")
+    yield Measure("  processor time a frame", spent / (fps * seconds) * 1e3, "ms")
     yield Measure("jump to the middle", page.evaluate(JUMP), "ms", "aim 500")
     page.context.close()
 
@@ -234,6 +252,7 @@ def of_crowd(browser: Any, store: Path, seconds: float) -> Iterator[Measure]:
         told = playing(page, seconds)
         yield Measure(f"plays {most} entities, 900 by 700", told["fps"], "frames/s", "aim 30")
         yield Measure("  a step, 95th percentile", told["p95"], "ms")
+        yield Measure("  processor time a frame", told["spent"], "ms")
         page.context.close()
 
 
@@ -275,6 +294,37 @@ def requests_of(server: Server, store: Path, times: int) -> Iterator[Measure]:
             ask().raise_for_status()
         spent = (server.worked() - before) / times * 1e3
         yield Measure(f"processor time: {name}", spent, "ms", f"aim {aim}")
+
+
+BAD: list[tuple[str, str, dict[str, Any]]] = [
+    ("GET", "/api/states", {"params": {"trace": "town", "first": -1, "last": 1}}),
+    ("GET", "/api/frame", {"params": {"trace": "none", "seq": 1}}),
+    ("GET", "/api/nothing", {}),
+    ("PUT", "/api/find", {"json": {}}),
+    ("POST", "/api/find", {"json": {"text": 5}}),
+    ("POST", "/api/find", {"content": b"[" * 100_000}),
+    ("POST", "/api/thumbs", {"json": {"frames": [["town", True]]}}),
+    ("POST", "/api/parts", {"json": {"text": NEAR, "trace": "town", "seq": 10**9}}),
+]
+
+
+def bad_requests(server: Server) -> Iterator[Measure]:
+    """A thousand requests that are refused."""
+    client, before, begun = server.client(), server.worked(), time.perf_counter()
+    every = [client.request(m, p, **how).status_code for _ in range(125) for m, p, how in BAD]
+    spent, worked = time.perf_counter() - begun, server.worked() - before
+    wrong = sum(not 400 <= code < 500 for code in every)
+    note = f"aim 10; {wrong} not refused; {worked:.1f} s of the processor"
+    yield Measure("1,000 bad requests", spent, "s", note)
+
+
+def of_report(store: Path, to: Path) -> Iterator[Measure]:
+    """A report of a hundred matches."""
+    begun = time.process_time()
+    many, _ = report(Store(store), LARGE, to)
+    spent = time.process_time() - begun
+    note = f"aim 2.5; {many} matches, {spent:.1f} s of the processor"
+    yield Measure("report", to.stat().st_size / 1e6, "MB", note)
 
 
 def of_large(browser: Any, store: Path) -> Iterator[Measure]:
@@ -331,9 +381,14 @@ def run(quick: bool = False) -> Iterator[Measure]:
             else:
                 yield from of_sample(browser, server, seconds)
             yield from requests_of(server, folder / "town.sgstore", times)
-        if browser is not None and crowd.exists():
-            ingest(folder / "crowd.sgstore", [crowd])
-            yield from of_crowd(browser, folder / "crowd.sgstore", seconds)
+            yield from bad_requests(server)
+        many = folder / "town.sgstore"
+        if crowd.exists():
+            many = folder / "crowd.sgstore"
+            ingest(many, [crowd])
+            if browser is not None:
+                yield from of_crowd(browser, many, seconds)
+        yield from of_report(many, folder / "report.html")
         large = Path(os.environ.get("SGSTORE_BENCH_REAL") or folder / "real.sgstore")
         if not large.exists():
             yield from made(large, QUICK if quick else TRACES)
