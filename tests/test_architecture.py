@@ -52,7 +52,8 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"collection"}),
     frozenset({"demo", "locks", "notebook", "sandbox"}),
     frozenset({"coverage", "pytest_plugin"}),
-    frozenset({"assistant", "criticality", "diff", "selection"}),
+    frozenset({"criticality"}),
+    frozenset({"assistant", "diff", "selection"}),
     frozenset({"serve"}),
     frozenset({"cli"}),
 )

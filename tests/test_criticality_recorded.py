@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import math
 import os
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +13,11 @@ import numpy as np
 import pytest
 import shapely
 from thorough import LONG
+from typer.testing import CliRunner
 
+import sgstore
+from sgstore.cli import application
+from sgstore.coverage import ChosenFrames
 from sgstore.criticality import (
     RECORDED,
     Encounter,
@@ -30,8 +36,10 @@ from sgstore.criticality import (
     ttc_recorded,
     ttce_recorded,
 )
-from sgstore.errors import ConfigError
+from sgstore.errors import ConfigError, QueryError
 from sgstore.geometry import corners
+from sgstore.selection import PrioritySpec, SelectionUnit, prioritize
+from sgstore.temporal import Monitor
 from sgstore.vocabulary import VEHICLES
 
 if TYPE_CHECKING:
@@ -286,6 +294,64 @@ def test_a_store_tells_the_measures_of_its_egos(open_town: Store) -> None:
 def test_a_measure_that_is_none_is_refused(open_town: Store) -> None:
     with pytest.raises(ConfigError, match="no recorded measure: 'ttc'; expected some of pet"):
         recorded(open_town, ["ttc"])
+
+
+def test_the_verb_makes_a_table_that_patterns_and_orders_understand(
+    town_store: Path, open_town: Store, tmp_path: Path
+) -> None:
+    file = tmp_path / "close.csv"
+    line = ["criticality", str(town_store), "-m", "dce_recorded", "--most", "5", "-o", str(file)]
+    assert CliRunner().invoke(application(line), line).exit_code == 0
+    every = recorded(open_town, ["dce_recorded"]).dicts()
+    close = {(row["trace"], row["dst"]) for row in every if row["dce_recorded"] <= 5}
+    store = sgstore.open(town_store, tables={"close": file})
+
+    listed = {(row["trace"], int(row["dst"])) for row in csv.DictReader(StringIO(file.read_text()))}
+    found = store.find(
+        "MATCH (e:Ego), (v:Entity) WHERE HAPPENS close(e, v) RETURN trace.name, v.id"
+    )
+    there = store.sql("SELECT DISTINCT trace, dst FROM close WHERE dce_recorded <= 5").values
+
+    assert listed == close == set(there)
+    assert 0 < len(close) < len(every)
+    assert set(found) == close
+
+
+def test_cases_are_put_in_order_by_what_was_recorded_later(open_town: Store) -> None:
+    chosen = ChosenFrames("town", open_town)
+    names = ("dce_recorded", "tet")
+    spec = PrioritySpec(measures=names, unit=SelectionUnit.clip)
+    frames = {
+        row[0]: row[1:] for row in open_town.sql("SELECT frame_id, trace, t FROM frames").values
+    }
+    wanted: dict[int, list[float]] = {}
+    for trace in {trace for trace, _ in frames.values()}:
+        for _, _, _, one in encounters(open_town, trace):
+            times = set(one.times.tolist())
+            values = dce_recorded(one)[0], -tet(one)
+            for frame, (of, t) in frames.items():
+                if of == trace and t in times:
+                    known = wanted.setdefault(frame, [math.inf, math.inf])
+                    wanted[frame] = [min(pair) for pair in zip(known, values, strict=True)]
+
+    order = prioritize(chosen, spec)
+
+    units = order.units
+    for worst, sign, place in zip(order.worst, (1, -1), (0, 1), strict=True):
+        for unit in range(len(units)):
+            ids = units.frame_id[units.begin[unit] : units.end[unit]].tolist()
+            least = min(wanted[frame][place] for frame in ids)
+            assert sign * worst.value[unit] == pytest.approx(least)
+    assert f"{order.worst[0].value[order.picked[0]]:.3g} m with" in order.reasons()[0]
+
+
+def test_a_pattern_says_where_measures_of_what_was_recorded_are(open_town: Store) -> None:
+    close = "(e:Ego), (v:Vehicle) WHERE pet(e, v) < 1"
+    rule = f"CHECK ALWAYS NOT EXISTS {{{close}}}"
+
+    for ask in (lambda: open_town.find(f"MATCH {close}"), lambda: Monitor(rule)):
+        with pytest.raises(QueryError, match=r"unknown function 'pet'(.|\n)*sgstore criticality"):
+            ask()
 
 
 PAGE = Path(__file__).parents[1] / "docs" / "criticality.md"

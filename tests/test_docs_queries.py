@@ -81,7 +81,9 @@ def store(town_store: Path) -> Iterator[sgstore.Store]:
     frames.csv(labels)
     notes = town_store.with_name("notes.csv")  # tags of the explorer
     notes.write_text("trace,seq,tag,note,who,at\ntown,12,check this,,,\n")
-    store = sgstore.open(town_store, tables={"labels": labels, "notes": notes})
+    close = town_store.with_name("close.csv")  # of sgstore criticality
+    close.write_text("trace,src,dst,kind,pet\ntown,0,4,car,1.2\n")
+    store = sgstore.open(town_store, tables={"labels": labels, "notes": notes, "close": close})
     with store.file.snapshot():
         yield store
 

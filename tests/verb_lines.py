@@ -58,6 +58,7 @@ LINES: dict[str, list[str]] = {
     "coverage explain": ["{store}:MATCH (e:Ego) WHERE e.speed > 5", "--vs", "{store}"],
     "coverage failures": ["--train", "{store}", "--test", "{store}", "--outcomes", "{outcomes}"],
     "select": ["{store}", "--minimal"],
+    "criticality": ["{store}"],
     "prioritize": ["{store}"],
     "diff": ["{store}", "{store}", "--json"],
     "lock verify": ["{lock}", "{store}", "--no-payloads", "--format", "json"],

@@ -36,7 +36,7 @@ VERBS: Final = {
     "queries": ("find", "why-not", "like", "translate", "sql", "patterns"),
     "checks": ("check", "monitor", "timeline"),
     "coverage": ("coverage", "select", "diff", "lock"),
-    "prioritize": ("prioritize",),
+    "prioritize": ("criticality", "prioritize"),
     "exports": ("show", "export", "shrink"),
     "serve": ("serve", "report"),
     "assistant": ("mcp",),

@@ -1,4 +1,4 @@
-"""The verb that puts test cases in an order, by risk, diversity, both, or known outcomes."""
+"""How critical it was, and test cases in an order: by risk, diversity, both, or known outcomes."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from sgstore.cli._options import (
     PrintedRows,
     QueryLimits,
     QueryText,
+    RowOptions,
     StorePath,
     app,
     parameters_of,
@@ -27,6 +28,40 @@ from sgstore.cli._output import count_bar, say
 
 if TYPE_CHECKING:
     from sgstore.selection import Prioritized, PrioritySpec
+
+
+@app.command(rich_help_panel=PANEL)
+def criticality(
+    store: StorePath,
+    measures: Annotated[
+        list[str] | None,
+        Option("--measure", "-m", metavar="NAME", help="Such as pet; by default all; repeatable."),
+    ] = None,
+    most: Annotated[
+        float | None,
+        Option(
+            "--most", metavar="X", help="Only pairs whose first measure is known, and at most X."
+        ),
+    ] = None,
+    *,
+    out: RowOptions,
+    bounds: QueryLimits,
+) -> None:
+    """List measures of what was recorded: PET, TET, CPI, the closest encounter.
+
+    A row is the ego of a trace and one of those that it could meet. As a file it
+    is a table for --with: a view in SQL, and HAPPENS in patterns.
+    """
+    from dataclasses import replace
+
+    from sgstore.criticality import RECORDED, recorded
+
+    found = recorded(bounds.opened(store), tuple(measures or RECORDED))
+    if most is not None:
+        first = found.columns.index("kind") + 1
+        rows = [row for row in found.rows if row[first] is not None and row[first] <= most]
+        found = replace(found, rows=rows)
+    out.report(found)
 
 
 @dataclass(frozen=True)

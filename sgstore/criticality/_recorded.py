@@ -44,12 +44,15 @@ class RecordedMeasure:
         Its value, or its values in the frames that have both.
     least : bool
         Whether the least of the values in the frames is that of the encounter, and not the first one.
+    worse : str
+        Which values are the more critical ones: ``low`` or ``high``; empty: neither.
     """
 
     doc: str
     unit: str
     of: Callable[[Encounter], float | Floats]
     least: bool = False
+    worse: str = "low"
 
     def value(self, encounter: Encounter) -> float:
         """The value of an encounter; NaN: not known, or there is none."""
@@ -68,7 +71,7 @@ RECORDED: Final = {
         pet,
     ),
     "et_recorded": RecordedMeasure(
-        "encroachment time: how long a is in that area", "s", et_recorded
+        "encroachment time: how long a is in that area", "s", et_recorded, worse="high"
     ),
     "ttc_recorded": RecordedMeasure(
         "time until the footprints first touch, from the first frame that has both on",
@@ -80,12 +83,18 @@ RECORDED: Final = {
     ),
     "dce_recorded": RecordedMeasure("least gap", "m", dce_recorded),
     "ttce_recorded": RecordedMeasure(
-        "time until the least gap, from the first frame that has both on", "s", ttce_recorded
+        "time until the least gap, from the first frame that has both on",
+        "s",
+        ttce_recorded,
+        worse="",
     ),
-    "tet": RecordedMeasure("time exposed to a ttc of at most 2 s", "s", tet),
-    "tit": RecordedMeasure("the same, weighted by how far below 2 s", "s²", tit),
+    "tet": RecordedMeasure("time exposed to a ttc of at most 2 s", "s", tet, worse="high"),
+    "tit": RecordedMeasure("the same, weighted by how far below 2 s", "s²", tit, worse="high"),
     "cpi": RecordedMeasure(
-        "crash potential index: mean probability that braking would not suffice", "share", cpi
+        "crash potential index: mean probability that braking would not suffice",
+        "share",
+        cpi,
+        worse="high",
     ),
 }
 """Measures by name."""

@@ -408,7 +408,7 @@ def _rows_of_table(happened: Happened) -> str:
     select = Select(['"u"."frame_id" AS "frame_id"'], [f'{quoted(happened.kind)} AS "u"'])
     for place, name in enumerate(happened.table[: len(happened.nodes)]):
         column = f'"u".{quoted(name)}'
-        if name.lower() in {"node_id", "other"}:
+        if name.lower() in {"node_id", "other", "src", "dst"}:
             select.columns.append(f'TRY_CAST({column} AS BIGINT) AS ":{place}"')
             continue
         alias = quoted(f"e{place}")

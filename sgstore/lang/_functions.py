@@ -360,7 +360,7 @@ def _to_whom(e: s.HappensExpression, argument: s.Expression, names: SymbolTable)
     return found.node
 
 
-_WHOM: Final = (("node_id", "other"), ("ident", "other_ident"))
+_WHOM: Final = (("node_id", "other"), ("ident", "other_ident"), ("src", "dst"))
 """Columns of a table of a user's own that say to whom something happens: node ids, or the simulator's ids."""
 
 

@@ -1,7 +1,8 @@
 """Order of test cases: the most critical first, the most diverse first, both, or as other outcomes teach.
 
 The *risk* of a case goes by measures of criticality of the ego and others that move, each the worst value
-in its frames. Measures have different units and scales, so cases are ranked by each of them, and the ranks
+in its frames. Those of what was recorded later (``pet``) are of a whole encounter, in each frame that has
+both. Measures have different units and scales, so cases are ranked by each of them, and the ranks
 are added up (Borda count): no weight, no threshold. A rank is one more than the number of cases that are more
 critical, as ``rank()`` in SQL. A case of which a measure is not known comes after those of which it is. An
 expression of the query language is a measure, too, its least value being the worst:
@@ -22,12 +23,13 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.coverage import UNKNOWN, ReportTable, classed, told_outcomes
+from sgstore.criticality import RECORDED, encounters
 from sgstore.errors import ConfigError
 from sgstore.locks import lock_of
 from sgstore.pair_numbers import PAIR_FUNCTIONS
 from sgstore.selection._choose import BudgetTracker, names_of_units
 from sgstore.selection._learn import cross_fitted, features_of, learned_elsewhere, model_name
-from sgstore.selection._situations import OTHERS, SITUATION, situations
+from sgstore.selection._situations import OTHERS, SITUATION, frames_in_parts, situations
 from sgstore.selection._units import Budget, SelectionUnit, numbers_of_frames, units_of
 from sgstore.store import trace_of
 
@@ -43,7 +45,10 @@ MEASURES: Final = ("closing_time", "ttc_mild")
 """Measures of risk by default: what happens at the closing speed, and by mild manoeuvres of both."""
 
 RANKED: Final = {name: one for name, one in PAIR_FUNCTIONS.items() if one.sql and one.worse}
-"""Measures by which cases can be ranked."""
+"""Measures by which cases can be ranked, of pairs in a frame."""
+
+LATER: Final = {name: one for name, one in RECORDED.items() if one.worse}
+"""Those of what was recorded later, too."""
 
 
 class Priority(StrEnum):
@@ -93,10 +98,12 @@ class PrioritySpec:
         ------
         ConfigError
         """
-        wrong = [name for name in self.measures if name not in RANKED and name.isidentifier()]
+        wrong = [
+            name for name in self.measures if name not in RANKED | LATER and name.isidentifier()
+        ]
         if wrong or not self.measures:
             said = f"no measure of criticality: {wrong[0]!r}" if wrong else "no measure is given"
-            known = ", ".join(RANKED)
+            known = ", ".join(RANKED | LATER)
             raise ConfigError(
                 f"{said}; expected some of {known}, or an expression such as -ego.speed"
             )
@@ -149,7 +156,8 @@ class WorstValues:
 
 def _sign(name: str) -> float:
     """Sign that makes the worst value of a measure the least one: 1, or −1."""
-    return -1.0 if name in RANKED and RANKED[name].worse == "high" else 1.0
+    known = (RANKED | LATER).get(name)
+    return -1.0 if known is not None and known.worse == "high" else 1.0
 
 
 @dataclass(frozen=True)
@@ -376,13 +384,41 @@ def _classes(units: Units, abstraction: str) -> Ints:
 def worst_values(units: Units, measures: Sequence[str]) -> tuple[WorstValues, ...]:
     """The worst value of each measure in each unit: of the ego and others that move, or an expression's."""
     pairs = _worst_of_pairs(units, [name for name in measures if name in RANKED])
-    return tuple(pairs[m] if m in RANKED else _worst_of_expression(units, m) for m in measures)
+    later = _worst_of_encounters(units, [name for name in measures if name in LATER])
+    known = pairs | later
+    return tuple(known[m] if m in known else _worst_of_expression(units, m) for m in measures)
+
+
+def _worst_of_encounters(units: Units, measures: Sequence[str]) -> dict[str, WorstValues]:
+    """Of what was recorded later: the value of an encounter is that of each frame that has both."""
+    if not measures:
+        return {}
+    value, other = (np.full((len(measures), len(units.frame_id)), fill) for fill in (np.inf, -1))
+    store = units.chosen.store
+    sql = "SELECT frame_id, t FROM frames WHERE trace = ? ORDER BY t"
+    here = set(trace_of(units.frame_id[units.asked]).tolist())
+    for trace in [one for one in store.file.traces() if one.trace_id in here]:
+        frames = store.file.arrays(sql, [trace.name])
+        ids, times = frames["frame_id"].astype(np.int64), frames["t"].astype(np.float64)
+        for _, met, _, encounter in encounters(store, trace.name):
+            both = ids[np.searchsorted(times, encounter.times)]
+            rows = np.minimum(np.searchsorted(units.frame_id, both), len(units.frame_id) - 1)
+            rows = rows[(units.frame_id[rows] == both) & units.asked[rows]]
+            for i, name in enumerate(measures):
+                signed = _sign(name) * LATER[name].value(encounter)
+                worse = rows[signed < value[i, rows]]
+                value[i, worse], other[i, worse] = signed, met
+    return {
+        name: _worst_of(units, name, value[i], other[i].astype(np.int64))
+        for i, name in enumerate(measures)
+    }
 
 
 def _worst_of_expression(units: Units, text: str) -> WorstValues:
     asked, value = numbers_of_frames(units, text)
-    value = np.where(np.isnan(value), np.inf, value)
-    return _worst_of(units, text, asked, value, np.full(len(asked), -1))
+    frames = np.full(len(units.frame_id), np.inf)
+    frames[asked] = np.where(np.isnan(value), np.inf, value)
+    return _worst_of(units, text, frames, np.full(len(frames), -1))
 
 
 def _worst_of_pairs(units: Units, measures: Sequence[str]) -> dict[str, WorstValues]:
@@ -400,26 +436,28 @@ def _worst_of_pairs(units: Units, measures: Sequence[str]) -> dict[str, WorstVal
     )
     sql = f"""
       SELECT frame_id, {parts} FROM (
-        SELECT {", ".join(columns)} FROM criticality WHERE {OTHERS} GROUP BY frame_id)
-      ORDER BY frame_id
+        SELECT {", ".join(columns)} FROM criticality
+        WHERE {OTHERS} AND frame_id BETWEEN ? AND ? GROUP BY frame_id)
     """  # noqa: S608  names of ours
-    found = units.chosen.store.file.arrays(sql)
-    frame_id = found["frame_id"].astype(np.int64)
-    at = np.searchsorted(units.frame_id, frame_id)
-    here = at < len(units.frame_id)
-    here[here] = units.frame_id[at[here]] == frame_id[here]
-    here[here] &= units.asked[at[here]]
+    value, other = (np.full((len(measures), len(units.frame_id)), fill) for fill in (np.inf, -1))
+    for start, part in frames_in_parts(units.frame_id):
+        found = units.chosen.store.file.arrays(sql, [int(part[0]), int(part[-1])])
+        frame_id = found["frame_id"].astype(np.int64)
+        at = np.minimum(np.searchsorted(part, frame_id), len(part) - 1)
+        here = (part[at] == frame_id) & units.asked[start + at]
+        for i in range(len(measures)):
+            for all_of, name in ((value, "value"), (other, "other")):
+                told = np.ma.asarray(found[f"{name}{i}"])[here]
+                known = ~np.ma.getmaskarray(told)
+                all_of[i, start + at[here][known]] = np.ma.getdata(told)[known]
     return {
-        name: _worst_of(units, name, at[here], found[f"value{i}"][here], found[f"other{i}"][here])
+        name: _worst_of(units, name, value[i], other[i].astype(np.int64))
         for i, name in enumerate(measures)
     }
 
 
-def _worst_of(units: Units, name: str, rows: Ints, value: Any, other: Any) -> WorstValues:
-    frames = np.full(len(units.frame_id), np.inf)
-    frames[rows] = np.ma.filled(np.ma.asarray(value).astype(np.float64), np.inf)
-    who = np.full(len(units.frame_id), -1, np.int64)
-    who[rows] = np.ma.filled(np.ma.asarray(other).astype(np.int64), -1)
+def _worst_of(units: Units, name: str, frames: Floats, who: Ints) -> WorstValues:
+    """The worst value of each unit, of values of frames; inf: not known."""
     ranges = np.stack([units.begin, units.end], axis=1).ravel()
     least = np.minimum.reduceat(np.append(frames, np.inf), ranges)[::2]
     row = units.begin.copy()
@@ -443,9 +481,9 @@ def _reason(
     worst: WorstValues, unit: int, kind: str | None, times: Mapping[int, float], units: Units
 ) -> str:
     time = times[int(units.frame_id[worst.row[unit]])]
-    if worst.name not in RANKED:
+    if worst.name not in RANKED | LATER:
         return f"{worst.name} is {worst.value[unit]:.3g} at {time:.1f} s"
-    measure = RANKED[worst.name]
+    measure = (RANKED | LATER)[worst.name]
     of = "" if measure.unit == "ratio" else f" {measure.unit}"
     return (
         f"{worst.name} {worst.value[unit]:.3g}{of} with {kind} {worst.other[unit]} at {time:.1f} s"
