@@ -267,6 +267,7 @@ VERBS = {
     "export parquet": Verb(
         "export {i}/s.db MATCH_ALL --to {p}/tables --format parquet", (), gives="tables"
     ),
+    "shrink --to": Verb("shrink {i}/s.db MATCH_ALL --to {p}/cut", (), gives="cut"),
     "select -o": Verb("select {i}/s.db -o {p}/t.lock", ("t.lock",), gives="t.lock"),
     "lock union": Verb(
         "lock union {i}/a.lock {i}/b.lock -o {p}/t.lock",

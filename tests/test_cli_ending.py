@@ -83,6 +83,7 @@ ENDLESS = {
     "diff": ["{store}", "{store}", "-q", RULE],
     "coverage spec": ["{store}", MANY.partition(" ORDER BY")[0], "-o", "{new}.csv"],
     "export": ["{store}", MATCHES, "--to", "{new}/clips"],
+    "shrink": ["{store}", RULE, "--to", "{new}/cut"],
 }
 """Questions that take longer than the deadline, however fast the machine is."""
 
