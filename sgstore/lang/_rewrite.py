@@ -401,7 +401,8 @@ def narrowed(scope: Scope, catalog: Catalog) -> Scope:
     held = catalog.moving | catalog.fixed | catalog.mapped
     kinds = {key: scope.kinds(key).only(held) for key in (*scope.nodes, *scope.outer)}
     single = [edge for edge in scope.edges if edge.high == 1]
-    while _pass(kinds, single, triples):
+    ways = [[*possible(e, kinds[e.src], kinds[e.dst], triples)] for e in single]
+    while _pass(kinds, single, ways):
         pass
     if not all(kinds.values()):
         return replace(scope, where=(FALSE,))
@@ -409,15 +410,18 @@ def narrowed(scope: Scope, catalog: Catalog) -> Scope:
     return replace(scope, nodes=nodes, outer={key: kinds[key] for key in scope.outer})
 
 
-def _pass(kinds: dict[str, Kinds], edges: list[Edge], triples: tuple[Triple, ...]) -> bool:
-    """Narrow the ends of each edge once; whether that changed anything."""
+def _pass(kinds: dict[str, Kinds], edges: list[Edge], ways: list[list[Triple]]) -> bool:
+    """Narrow the ends of each edge once, and what it may be; whether that changed anything."""
     changed = False
-    for edge in edges:
-        found = list(possible(edge, kinds[edge.src], kinds[edge.dst], triples))
-        for key, side in ((edge.src, 1), (edge.dst, 2)):
-            narrower = kinds[key].only(frozenset(triple[side] for triple in found))
-            changed |= narrower != kinds[key]
-            kinds[key] = narrower
+    for place, edge in enumerate(edges):
+        starts, ends = kinds[edge.src].every, kinds[edge.dst].every
+        found = ways[place] = [w for w in ways[place] if w[1] in starts and w[2] in ends]
+        for key, side, held in ((edge.src, 1, starts), (edge.dst, 2, ends)):
+            seen = {triple[side] for triple in found}
+            if held <= seen:
+                continue
+            kinds[key] = kinds[key].only(frozenset(seen))
+            changed = True
     return changed
 
 
@@ -425,13 +429,14 @@ def possible(
     edge: Edge, src: Kinds, dst: Kinds, triples: tuple[Triple, ...] | Mapping[Triple, int]
 ) -> Iterator[Triple]:
     """The triples that an edge may be, as seen from its ends: the second is what ``src`` is."""
+    relations, starts, ends, both = edge.relations, src.every, dst.every, edge.both
     for triple in triples:
         relation, one, other = triple
-        if relation not in edge.relations:
+        if relation not in relations:
             continue
-        if one in src.every and other in dst.every:
+        if one in starts and other in ends:
             yield triple
-        if edge.both and other in src.every and one in dst.every:
+        if both and other in starts and one in ends:
             yield relation, other, one
 
 
