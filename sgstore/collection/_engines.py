@@ -191,14 +191,16 @@ class _Ray:
             raise MissingExtraError("the engine ray", "ray") from error
         if not self._ray.is_initialized():
             self._ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+        # Once: what is made for each question, each worker has to be given anew.
+        self._run: Any = self._ray.remote(max_retries=RETRIES)(_done)
 
     def map(self, function: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[Outcome]:
-        run = self._ray.remote(max_retries=RETRIES)(_done)
         name = f"{function.__module__}:{function.__qualname__}"
-        pending = {run.remote(name, task): task for task in tasks}
+        pending = {self._run.remote(name, task): task for task in tasks}
         while pending:
-            ready, _ = self._ray.wait([*pending], num_returns=1)
-            for one in ready:
+            some, left = self._ray.wait([*pending], num_returns=1)
+            others, _ = self._ray.wait(left, num_returns=len(left), timeout=0) if left else ([], [])
+            for one in (*some, *others):
                 task = pending.pop(one)
                 try:
                     yield self._ray.get(one)
