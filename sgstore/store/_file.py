@@ -169,7 +169,7 @@ class StoreFile:
 
     def snapshot(self) -> AbstractContextManager[object]:
         """Keep the store open for several questions: they see the same state, and cost less."""
-        return self.access.reading(public=True)  # nothing is asked by it, so no schema is chosen
+        return self.access.reading(idle=True)
 
     def close(self) -> None:
         """Close the file, unless something is asked of it now; it is opened again with the next question."""

@@ -113,10 +113,11 @@ class AttachedFile:
         told = f"ATTACH {literal(str(place))} AS {quoted(self.name)} (READ_ONLY)"
         self._instance.cursor().execute(told)
 
-    def cursor(self, schema: str = "main") -> DuckDBPyConnection:
-        """A connection that reads the file, and looks for names in a schema of it."""
+    def cursor(self, schema: str = "") -> DuckDBPyConnection:
+        """A connection that reads the file, and looks for names in a schema of it, if one is named."""
         connection = self._instance.cursor()
-        connection.execute(f"USE {quoted(self.name)}.{schema}")
+        if schema:
+            connection.execute(f"USE {quoted(self.name)}.{schema}")
         return connection
 
     def close(self) -> None:

@@ -347,13 +347,15 @@ class Access:
         finalize(self, file.let_go, token).atexit = False
 
     @contextmanager
-    def reading(self, *, public: bool = False) -> Generator[DuckDBPyConnection]:
+    def reading(self, *, public: bool = False, idle: bool = False) -> Generator[DuckDBPyConnection]:
         """A read-only connection. Readings may be nested; all that overlap see the same state.
 
         Parameters
         ----------
         public : bool
             Whether names are looked for among the public views, not first among the tables.
+        idle : bool
+            Whether nothing will be asked by the connection, which only keeps the file open.
 
         Raises
         ------
@@ -361,7 +363,7 @@ class Access:
             There is no such file, it is no database, or a writer kept it for too long.
         """
         deadline = _Deadline(self._wait_s)
-        connection = self._enter(deadline, public=public)
+        connection = self._enter(deadline, public=public, idle=idle)
         failed = True
         try:
             if self._tables is not None:
@@ -400,6 +402,9 @@ class Access:
         where = "" if trace is None else str(trace.tb_frame.f_globals.get("__name__", ""))
         if where == __name__ or not where.startswith(("sgstore.", "json", "numpy")):
             return ""  # the fault of who called us
+        instance = self._file.instance
+        if isinstance(instance, AttachedFile):
+            return self._diagnose(instance.cursor(shape.INSIDE), self.path)
         connection.execute(f"USE {shape.INSIDE}")  # it may have been open for public names
         return self._diagnose(connection, self.path)
 
@@ -424,7 +429,7 @@ class Access:
             again, file.careful = not file.careful, True
         return again
 
-    def _enter(self, deadline: _Deadline, *, public: bool) -> DuckDBPyConnection:
+    def _enter(self, deadline: _Deadline, *, public: bool, idle: bool) -> DuckDBPyConnection:
         file = self._file
         if not file.mine:  # a nested one must not wait for a writer who waits for the outer one
             _pass_gate(self.path, deadline)
@@ -444,17 +449,17 @@ class Access:
                     instance = self._open(deadline)
                 if self._checked and not file.checked:
                     if isinstance(instance, AttachedFile):
-                        self._check(instance.cursor(), instance.name, file.opened)
+                        self._check(instance.cursor("main"), instance.name, file.opened)
                     else:
                         self._check(instance, "", file.opened)
                     file.checked = True
                 inside = self._checked and not public
-                if isinstance(instance, AttachedFile):
-                    connection = instance.cursor(shape.INSIDE if inside else "main")
-                else:
+                if idle or not isinstance(instance, AttachedFile):
                     connection = instance.cursor()
-                    if inside:
+                    if inside and not idle:
                         connection.execute(f"USE {shape.INSIDE}")  # a cursor does not inherit it
+                else:
+                    connection = instance.cursor(shape.INSIDE if inside else "main")
             except BaseException:
                 file.close()
                 raise
