@@ -71,7 +71,20 @@ def as_told(road_map: RoadMap) -> dict[str, Any]:
             for row, kind in enumerate(kinds)
             if kind == "traffic_light"
         },
+        "areas": {
+            names[row]: [kind, *_ground(outlines[row])]
+            for row, kind in enumerate(kinds)
+            if kind in AREAS.values()
+        },
     }
+
+
+AREAS = {"building": "building", "vegetation": "vegetation", "traffic_island": "prop"}
+
+
+def _ground(outline: Any) -> list[float]:
+    """Its size, and where its middle is."""
+    return np.round([outline.area, outline.centroid.x, outline.centroid.y], 2).tolist()
 
 
 def by_library(path: Path) -> dict[str, Any]:
@@ -150,6 +163,14 @@ def by_library(path: Path) -> dict[str, Any]:
         "stop_lines": {str(one.id): _middle(one) for one in sorted(stops, key=lambda one: one.id)},
         "lights": {
             ident: [at, sorted(set(lanes))] for ident, (at, lanes) in sorted(lights.items())
+        },
+        "areas": {
+            str(one.id): [
+                AREAS[one.attributes["subtype"]],
+                *_ground(shapely.Polygon([(p.x, p.y) for p in one.outerBoundPolygon()])),
+            ]
+            for one in sorted(lanelets.areaLayer, key=lambda one: one.id)
+            if one.attributes["subtype"] in AREAS
         },
     }
 

@@ -85,6 +85,29 @@ def test_crosswalks_lights_signs_and_stop_lines_are_parts_of_the_map() -> None:
     assert ("traffic_light", lane, 99.0, 99.0) in places
 
 
+def test_areas_stand_beside_the_lanes_or_are_counted() -> None:
+    made, _ = two_lanes()
+    half = made.way([(10, 20), (14, 20), (14, 22)])
+    rest = made.way([(10, 20), (10, 22), (14, 22)])  # the other way round
+    open_way = made.way([(20, 20), (24, 20), (24, 22)])
+    area = {"type": "multipolygon"}
+    house = made.relation(
+        [("way", half, "outer"), ("way", rest, "outer")], {**area, "subtype": "building"}
+    )
+    made.relation([("way", open_way, "outer")], {**area, "subtype": "vegetation"})
+    made.relation([("way", half, "outer")], {**area, "subtype": "parking"})
+    road_map = a_map(made)
+
+    at = row_of(road_map, str(house), "building")
+    nodes = road_map.nodes
+    assert (nodes.x[at], nodes.y[at]) == (12, 21)
+    assert (nodes.length[at], nodes.width[at]) == (4, 2)
+    assert abs(np.sin(nodes.heading[at])) < 1e-9
+    assert road_map.outlines()[at].area == 8
+    assert any("areas are left out: 1 parking" in text for text in road_map.warnings)
+    assert any("an outer border that closes" in text for text in road_map.warnings)
+
+
 def test_lanelets_that_cross_or_part_lie_in_a_junction_unless_one_is_a_bridge() -> None:
     def crossing(height: float) -> RoadMap:
         made = LaneletMap()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -22,6 +22,7 @@ from sgstore.roads import (
     LaneLine,
     PlainCrosswalk,
     PlainLane,
+    PlainObject,
     PlainSignal,
     about_lanes,
     lane_text,
@@ -124,7 +125,59 @@ def lanelet2_text(text: str, projection: Projection | None = None) -> str:
         for ident, one in lanelets.items()
         if _type(one.element) == CROSSWALK
     ]
-    return lane_text(lanes, [*document.warnings, *warnings], signals, crosswalks)
+    objects = _areas(document)
+    return lane_text(lanes, [*document.warnings, *warnings], signals, crosswalks, objects)
+
+
+_AREAS: Final = {"building": "building", "vegetation": "vegetation", "traffic_island": "prop"}
+"""Subtype of an area on which nobody drives → kind of an object."""
+
+
+def _areas(document: OsmDocument) -> list[PlainObject]:
+    """Areas on which nobody drives or walks, by their outer borders; others are counted."""
+    found: list[PlainObject] = []
+    left: Counter[str] = Counter()
+    broken: list[str] = []
+    for ident, element in document.relations.items():
+        if element.tags.get("type") != "multipolygon":
+            continue
+        subtype = element.tags.get("subtype", "")
+        if subtype not in _AREAS:
+            left[subtype[:40] or "without a subtype"] += 1
+            continue
+        ring = _ring(document, element.members_of("outer"))
+        if len(ident) > MAX_NAME or len(np.unique(ring[:, :2], axis=0)) < 3:
+            broken.append(ident)
+        else:
+            z = float(ring[:, 2].mean())
+            found.append(PlainObject(ident, ring[:, :2], z, _AREAS[subtype]))
+    if left:
+        told = ", ".join(f"{many} {what}" for what, many in sorted(left.items()))
+        document.warnings.append(f"areas are left out: {told}")
+    if broken:
+        named = ", ".join(broken[:8]) + (f" and {len(broken) - 8} more" if broken[8:] else "")
+        document.warnings.append(f"areas {named}: expected an outer border that closes; left out")
+    return found
+
+
+def _ring(document: OsmDocument, ways: Sequence[str]) -> Floats:
+    """The corners (n, 3) around an area, whose ways follow one another, each either way; none: it is open."""
+    pieces = [way for way in ways if way in document.lines]
+    if not pieces or len(pieces) < len(ways):
+        return np.zeros((0, 3))
+    first = pieces.pop(0)
+    nodes, line = [*document.nodes[first]], [*document.lines[first]]
+    while pieces:
+        ends = {way: (document.nodes[way][0], document.nodes[way][-1]) for way in pieces}
+        found = next((way for way in pieces if nodes[-1] in ends[way]), "")
+        if not found:
+            return np.zeros((0, 3))
+        pieces.remove(found)
+        back = document.nodes[found][0] != nodes[-1]
+        more, points = document.nodes[found], document.lines[found]
+        nodes += (more[::-1] if back else more)[1:]
+        line += [*(points[::-1] if back else points)[1:]]
+    return np.array(line[:-1]) if nodes[0] == nodes[-1] else np.zeros((0, 3))
 
 
 # Lanelets --------------------------------------------------------------------------------------------

@@ -27,6 +27,7 @@ from ._lane_text import read_lane_text as read_lane_text
 from ._lanes import Edge as Edge
 from ._lanes import PlainLane as PlainLane
 from ._lanes import PlainCrosswalk as PlainCrosswalk
+from ._lanes import PlainObject as PlainObject
 from ._lanes import PlainSignal as PlainSignal
 from ._lanes import cross_sections as cross_sections
 from ._lanes import edges_of as edges_of
@@ -75,6 +76,7 @@ __all__ = [
     "OFF_ROAD",
     "OF_LANES",
     "PlainCrosswalk",
+    "PlainObject",
     "PlainLane",
     "PlainSignal",
     "Ribbons",

@@ -7,9 +7,9 @@ The text is JSON, one lane a line, so that people can read it and tools can comp
     …
     ], "signals": [{"name": "7", "kind": "traffic_light", "x": 1.5, "y": -3.0, "lanes": [0]}]}
 
-``signals`` and ``crosswalks`` are left out where there are none. Lengths are rounded to a tenth of a millimetre
-when the text is written, and the map is always made from the text: what is read back is what was there before.
-Texts come from files, so nothing in them is trusted.
+``signals``, ``crosswalks`` and ``objects`` are left out where there are none. Lengths are rounded to a tenth of
+a millimetre when the text is written, and the map is always made from the text: what is read back is what was
+there before. Texts come from files, so nothing in them is trusted.
 """
 
 from __future__ import annotations
@@ -21,7 +21,14 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import MapError
-from sgstore.roads._lanes import PlainCrosswalk, PlainLane, PlainSignal, road_map_of
+from sgstore.roads._lanes import (
+    OBJECT_KINDS,
+    PlainCrosswalk,
+    PlainLane,
+    PlainObject,
+    PlainSignal,
+    road_map_of,
+)
 from sgstore.vocabulary import SIGNALS
 
 if TYPE_CHECKING:
@@ -63,14 +70,17 @@ def lane_text(
     warnings: Iterable[str] = (),
     signals: Sequence[PlainSignal] = (),
     crosswalks: Sequence[PlainCrosswalk] = (),
+    objects: Sequence[PlainObject] = (),
 ) -> str:
-    """The text of plain lanes, signals and crosswalks; ``warnings`` are kept in it."""
+    """The text of plain lanes, signals, crosswalks and objects; ``warnings`` are kept in it."""
     head = {"format": FORMAT, "version": VERSION, "warnings": list(warnings)}
     rows = ",\n".join(_dumps(_fields(lane)) for lane in lanes)
     more = ",\n".join(_dumps(_signal_fields(signal)) for signal in signals)
     more = f', "signals": [\n{more}\n]' if more else ""
     walks = ",\n".join(_dumps(_crosswalk_fields(one)) for one in crosswalks)
     more += f', "crosswalks": [\n{walks}\n]' if walks else ""
+    things = ",\n".join(_dumps({"kind": o.kind, **_crosswalk_fields(o)}) for o in objects)
+    more += f', "objects": [\n{things}\n]' if things else ""
     return f'{_dumps(head)[:-1]}, "lanes": [\n{rows}\n]{more}}}\n'
 
 
@@ -106,7 +116,9 @@ def read_lane_text(text: str, name: str) -> RoadMap:
     crosswalks = [
         row.crosswalk() for row in _text_rows(document, "crosswalk", MAX_SIGNALS, len(lanes))
     ]
-    return road_map_of(lanes, signals, crosswalks, name=name, text=text, warnings=warnings)
+    objects = [row.object() for row in _text_rows(document, "object", MAX_SIGNALS, len(lanes))]
+    parts = lanes, signals, crosswalks, objects
+    return road_map_of(*parts, name=name, text=text, warnings=warnings)
 
 
 def _dumps(value: Any) -> str:
@@ -219,6 +231,12 @@ class _TextRow:
 
     def crosswalk(self) -> PlainCrosswalk:
         return PlainCrosswalk(self._text("name"), self._points("outline", 3), self._place("z"))
+
+    def object(self) -> PlainObject:
+        if self._fields.get("kind") not in OBJECT_KINDS:
+            raise self._wrong("kind", f"one of {', '.join(OBJECT_KINDS)}")
+        ground = self.crosswalk()
+        return PlainObject(ground.name, ground.outline, ground.z, self._text("kind"))
 
     def _points(self, key: str, least: int) -> Floats:
         points = self._floats(key).reshape(-1, 2)

@@ -127,16 +127,35 @@ class PlainCrosswalk:
     z: float
 
 
+@dataclass(frozen=True, slots=True)
+class PlainObject(PlainCrosswalk):
+    """What stands beside the lanes, by its outline on the ground.
+
+    Attributes
+    ----------
+    name, outline, z
+        As of :class:`PlainCrosswalk`.
+    kind : str
+        One of :data:`OBJECT_KINDS`.
+    """
+
+    kind: str
+
+
+OBJECT_KINDS: Final = ("building", "vegetation", "prop")
+
+
 def road_map_of(
     lanes: Sequence[PlainLane],
     signals: Sequence[PlainSignal] = (),
     crosswalks: Sequence[PlainCrosswalk] = (),
+    objects: Sequence[PlainObject] = (),
     *,
     name: str,
     text: str,
     warnings: Iterable[str] = (),
 ) -> RoadMap:
-    """The road map that plain lanes, signals and crosswalks make; ``text`` is what they were read from.
+    """The road map of plain lanes, signals, crosswalks and objects; ``text`` is what they were read from.
 
     Raises
     ------
@@ -148,12 +167,13 @@ def road_map_of(
     roads, junctions = _road_nodes(lanes, ribbons), _junction_nodes(lanes)
     off_road = MapNodes.of("off_road", ["off_road"])
     before = [off_road, surfaces, roads, junctions, _crosswalk_nodes(crosswalks)]
-    nodes = chained([*before, _signal_nodes(signals)])
+    nodes = chained([*before, _signal_nodes(signals), _object_nodes(objects)])
     first = sum(map(len, before))
     shapes = np.full(len(nodes), None, object)
     outlines = [shapely.Polygon(crosswalk.outline) for crosswalk in crosswalks]
     lines = [shapely.LineString(s.line) if len(s.line) > 1 else None for s in signals]
-    shapes[first - len(outlines) :] = [*outlines, *lines]
+    grounds = [shapely.Polygon(one.outline) for one in objects]
+    shapes[first - len(outlines) :] = [*outlines, *lines, *grounds]
     return RoadMap(
         name=name,
         text=text,
@@ -291,6 +311,26 @@ def _crosswalk_nodes(crosswalks: Sequence[PlainCrosswalk]) -> MapNodes:
     z = np.array([one.z for one in crosswalks], np.float64)
     names = [one.name for one in crosswalks]
     return MapNodes.of("crosswalk", names, x=middles[:, 0], y=middles[:, 1], z=z)
+
+
+def _object_nodes(objects: Sequence[PlainObject]) -> MapNodes:
+    """Objects as the smallest boxes around them, which look along their longer side."""
+    boxes = [shapely.Polygon(one.outline).minimum_rotated_rectangle for one in objects]
+    sides = np.array([np.diff(shapely.get_coordinates(box)[:3], axis=0) for box in boxes])
+    sides = sides.reshape(-1, 2, 2)
+    long = np.hypot(sides[..., 0], sides[..., 1])
+    longer = np.take_along_axis(sides, long.argmax(axis=1)[:, None, None], axis=1)[:, 0]
+    middles = np.array([shapely.get_coordinates(box.centroid)[0] for box in boxes]).reshape(-1, 2)
+    return MapNodes.of(
+        [one.kind for one in objects],
+        [one.name for one in objects],
+        x=middles[:, 0],
+        y=middles[:, 1],
+        z=np.array([one.z for one in objects], np.float64),
+        heading=np.arctan2(longer[:, 1], longer[:, 0]),
+        length=long.max(axis=1, initial=0.0),
+        width=long.min(axis=1, initial=np.inf),
+    )
 
 
 def _signal_nodes(signals: Sequence[PlainSignal]) -> MapNodes:
