@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: help demo check test tests test-edges test-ui test-wheel test-versions lint format bench fuzz kill mutants soak soak-explorer pyg viewers maps oracle patterns sample clean duckdb-versions fuzz-queries frozen house reproduce api vendor cluster
+.PHONY: help demo check test tests test-edges test-ui test-wheel test-versions docs lint format bench fuzz kill mutants soak soak-explorer pyg viewers maps oracle patterns sample clean duckdb-versions fuzz-queries frozen house reproduce api vendor cluster
 
 help:
 	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
@@ -15,6 +15,7 @@ help:
 	@echo "make test-ui     the explorer in a browser (Chromium), and the types of its page; without a browser it says so"
 	@echo "make test-wheel  build the wheel, install it elsewhere, and run the short tests there"
 	@echo "make test-versions  ingest, verify and find under the lowest and the highest versions of other packages"
+	@echo "make docs    build the documentation as a site, build/site/index.html; a link that leads nowhere is an error"
 	@echo "make lint    format, lint and types only"
 	@echo "make reproduce  make the tables of docs/reproduction.md again from public data (SGSTORE_DATA; minutes)"
 	@echo "make house   figures of the code, each beside its target: files, lines, classes, circles, what a find runs"
@@ -60,6 +61,10 @@ $(VENV)/.browser: $(VENV)/.dev
 
 $(VENV)/.sample: $(VENV)/.base
 	@$(call install,-e '.[sample]')
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.base
+	@$(call install,--group docs)
 	@touch $@
 
 demo: $(VENV)/.base
@@ -113,6 +118,11 @@ test-wheel: $(VENV)/.dev
 
 test-versions: $(VENV)/.dev
 	$(BIN)/python tests/packages.py versions
+
+# Every page is in the list of docs/conf.py, every link and heading that a page speaks of is there.
+docs: $(VENV)/.docs
+	@rm -rf build/site
+	$(BIN)/sphinx-build -q -W --keep-going -b html -c docs . build/site
 
 bench: $(VENV)/.dev
 	$(BIN)/python -m bench

@@ -1,0 +1,109 @@
+"""The documentation as a site: ``make docs``. Every page is one of the repository, which is read there, too."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pygments.lexer import RegexLexer
+from pygments.lexers.special import TextLexer
+from pygments.token import Comment, Keyword, Name, Number, Operator, Punctuation, String, Text
+
+import sgstore
+from sgstore.lang import keywords
+
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+
+project, author, release = "sgstore", "the sgstore contributors", sgstore.__version__
+project_copyright = author
+
+extensions = ["myst_parser"]
+root_doc = "README"
+include_patterns = ["*.md", "docs/**.md", "samples/town/README.md", "sgstore/mcap/README.md"]
+exclude_patterns = ["docs/description.md"]  # of the package index, which says what README says
+myst_heading_anchors = 4
+highlight_language = "text"
+
+html_theme = "furo"
+html_title = f"sgstore {release}"
+html_show_sphinx = False
+html_copy_source = False
+html_static_path = ["site.css"]
+html_css_files = ["site.css"]
+
+CONTENTS = {
+    "Begin": (
+        *("docs/first-hour", "docs/gallery", "docs/pictures/README"),
+        *("docs/commands", "docs/notebooks", "docs/explorer"),
+    ),
+    "Ask": (
+        *("docs/language", "docs/one_page", "docs/cookbook", "docs/patterns", "docs/views"),
+        *("docs/graphs", "docs/relations", "docs/parameters"),
+    ),
+    "Read and write": (
+        "docs/flavours",
+        "docs/exports",
+        "docs/online",
+        "docs/assistants",
+        "docs/scale",
+    ),
+    "Measure and choose": ("docs/coverage", "docs/selection", "docs/criticality"),
+    "Reference": ("docs/api", "docs/performance", "docs/reproduction"),
+    "Work on it": (
+        *("docs/architecture", "CONTRIBUTING", "sgstore/mcap/README", "samples/town/README"),
+        *("SECURITY", "CODE_OF_CONDUCT", "CHANGELOG"),
+    ),
+}
+"""The pages in their order: one that is missing here, or is not there, ends the build."""
+
+
+def _with_contents(app: Sphinx, page: str, source: list[str]) -> None:
+    """Append the list of all pages to the first one, where the theme looks for it."""
+    if page == root_doc:
+        for caption, names in CONTENTS.items():
+            pages = "\n".join(names)
+            source[0] += f"\n```{{toctree}}\n:hidden:\n:caption: {caption}\n{pages}\n```\n"
+
+
+def _with_start(app: Sphinx, exception: Exception | None) -> None:
+    """Let the site begin where a browser looks for it."""
+    if exception is None:
+        page = f'<!doctype html><meta http-equiv="refresh" content="0; url={root_doc}.html">'
+        (Path(app.outdir) / "index.html").write_text(page, encoding="utf-8")
+
+
+class QueryLexer(RegexLexer):
+    """Colours of queries: words of the language, labels and relations, functions, values."""
+
+    name, aliases = "sgql", ["sgql", "sgql-check"]
+    flags = re.IGNORECASE
+    tokens = {  # noqa: RUF012  as Pygments has it
+        "root": [
+            (r"--[^\n]*", Comment.Single),
+            (r"'(?:[^'\\]|\\.)*'|\"(?:[^\"\\]|\\.)*\"", String),
+            (
+                rf"\b(?:{'|'.join(sorted(filter(str.isalpha, keywords()), reverse=True))})\b",
+                Keyword,
+            ),
+            (r"\$\w+", Name.Variable),
+            (r"(?<=:)\s*\w+", Name.Class),
+            (r"\w+(?=\()", Name.Function),
+            (r"\d+(?:\.\d+)?(?:ms|s|min|frames)?\b", Number),
+            (r"\w+", Name),
+            (r"[-<>=!+*/%|&]+", Operator),
+            (r"[^\w\s]", Punctuation),
+            (r"\s+", Text),
+        ]
+    }
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Make what is said above known."""
+    for name in QueryLexer.aliases:
+        app.add_lexer(name, QueryLexer)
+    app.add_lexer("csv", TextLexer)
+    app.connect("source-read", _with_contents)
+    app.connect("build-finished", _with_start)
+    return {"parallel_read_safe": True}
