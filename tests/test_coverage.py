@@ -420,6 +420,33 @@ def test_the_matrix_shows_frames_with_both_and_what_is_wanted(worlds: Worlds) ->
         assert wanted[i, j] == any(both <= one_set for one_set in theirs)
 
 
+def test_the_picture_of_gaps_has_each_pair_once_and_the_features_that_surprise_most(
+    tmp_path: Path,
+) -> None:
+    from sgstore.draw import draw_matrix
+
+    names = ["car near ego", "ego near car", "rare", "often", "also often"]
+    held = np.array(
+        [
+            [1, 1, 0, 1, 0],
+            [1, 1, 0, 1, 0],
+            [0, 0, 1, 0, 0],
+            *[[0, 0, 0, 1, 0]] * 8,
+            *[[0, 0, 0, 0, 1]] * 9,
+        ]
+    )
+    frames = held.T @ held
+    draw_matrix(names, frames, np.ones_like(frames, bool), tmp_path / "m.svg", title="gaps", most=2)
+    drawn = (tmp_path / "m.svg").read_text(encoding="utf-8")
+
+    shown = {name for name in names if drawn.count(f">{name}<") == 2}
+    assert shown == {"often", "also often"}
+    assert "1 features are in the same frames" in drawn
+    draw_matrix(names, frames, np.ones_like(frames, bool), tmp_path / "m.svg", title="gaps")
+    drawn = (tmp_path / "m.svg").read_text(encoding="utf-8")
+    assert {name for name in names if f">{name}<" in drawn} == {*names} - {"car near ego"}
+
+
 def test_features_count_how_often_they_occur_and_nodes_count_where_there_are_no_edges(
     worlds: Worlds,
 ) -> None:

@@ -66,6 +66,46 @@ def test_the_verb_prints_lanes_or_draws_them(
     assert run(["timeline", str(town)]) == 2
 
 
+def test_traces_have_one_scale(tmp_path: Path) -> None:
+    lane = Lane("brakes", "car 3", "", [(0, 4.9, False)])
+    short, long = Timeline("short", 5.0, [lane]), Timeline("long", 20.0, [lane])
+
+    assert lines_of(short, 8, 20.0)[1].split("  ")[2] == "██"
+    assert lines_of(long, 8, 20.0)[1].split("  ")[2] == "██······"
+    assert lines_of(short, 8)[1].split("  ")[2] == "████████"
+    draw_timelines([short, long], tmp_path / "a.svg")
+    drawn = (tmp_path / "a.svg").read_text(encoding="utf-8")
+    assert drawn.count(">20 s<") == 2
+    assert drawn.count("found once, 4.9 s") == 2
+
+
+def test_only_traces_with_a_hit_are_shown_unless_all_are_asked_for(
+    town: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = tmp_path / "two.sgstore"
+    assert run(["ingest", str(store), str(RECORDING), "--until", "5s", "--json"]) == 0
+    assert (
+        run(["import", str(store), str(_graph(tmp_path)), "--format", "csv", "--kind", "a=car"])
+        == 0
+    )
+    capsys.readouterr()
+    rule = "CHECK slow: ALWAYS ego.speed < 1"
+
+    assert run(["timeline", str(store), rule]) == 0
+    out, err = capsys.readouterr()
+    assert out.startswith("town  0 … ")
+    assert "graphs  0" not in out
+    assert "in 1 more traces; --all shows them" in err
+    assert run(["timeline", str(store), rule, "--all"]) == 0
+    assert "graphs  0" in capsys.readouterr().out
+
+
+def _graph(folder: Path) -> Path:
+    file = folder / "graphs.csv"
+    file.write_text("graph,src,relation,dst\n1,a,near,a\n2,a,near,a\n", encoding="utf-8")
+    return file
+
+
 def test_parts_of_a_pattern_have_lanes_and_what_they_have_in_common(
     town: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

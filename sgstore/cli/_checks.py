@@ -433,6 +433,9 @@ def timeline(
     output: Annotated[
         Path | None, Option("--output", "-o", help="A picture: FILE.png or FILE.svg.")
     ] = None,
+    every: Annotated[
+        bool, Option("--all", help="Also traces in which nothing is found or violated.")
+    ] = False,
     parts: Annotated[
         str | None,
         Option(
@@ -444,9 +447,10 @@ def timeline(
     *,
     bounds: QueryLimits,
 ) -> int:
-    """Plot matches and rule violations over time, one lane per entity, for each trace.
+    """Plot matches and rule violations over time, one lane per entity, for each trace that has some.
 
-    In the terminal, or with -o as a picture. With --parts FRAME one lane for each part of a pattern.
+    In the terminal, or with -o as a picture; all traces have one scale. With --parts FRAME one lane
+    for each part of a pattern.
     """
     from sgstore.draw import LETTERS, NAME, lines_of, parts_timeline, timelines
 
@@ -461,10 +465,18 @@ def timeline(
     for name in {*(traces or ())} - {one.trace for one in found}:
         raise typer.BadParameter(f"--trace: the store has no trace {name!r}")
     say_unknown((lane.name, one.trace, lane.reason) for one in found for lane in one.lanes)
+    hits = [one for one in found if one.hit]
+    if not every and hits:
+        if len(hits) < len(found):
+            say(
+                f"nothing is found or violated in {len(found) - len(hits)} more traces; --all shows them"
+            )
+        found = hits
     if output is None:
         letters = max(LETTERS, min(shutil.get_terminal_size().columns - NAME - 26, 3 * LETTERS))
+        longest = max((one.seconds for one in found), default=0.0)
         for one in found:
-            typer.echo(without_controls("\n".join(lines_of(one, letters))))
+            typer.echo(without_controls("\n".join(lines_of(one, letters, longest))))
         return 0
     from sgstore.draw import draw_timelines
 

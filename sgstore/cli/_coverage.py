@@ -258,6 +258,9 @@ def combos_(
     missing: Missing = False,
     covered: Covered = False,
     picture: Picture = None,
+    top: Annotated[
+        int, Option("--top", min=2, help="Features in the picture: those with the most gaps.")
+    ] = 40,
     limit: Limit = None,
     *,
     ask: FrameAskOptions,
@@ -283,7 +286,7 @@ def combos_(
 
         names, frames, wanted = found.matrix()
         title = f"Pairs of features in {abstraction} of {_short(a)}"
-        draw_matrix(names, frames, wanted, picture, title=title)
+        draw_matrix(names, frames, wanted, picture, title=title, most=top)
         say(f"drawn: {picture}")
 
 

@@ -204,8 +204,11 @@ def draw_matrix(
     *,
     title: str,
     groups: Sequence[str] = (),
+    most: int = MOST_FEATURES,
 ) -> None:
     """Draw which pairs of features occur together, and mark the gaps: pairs that are wanted and do not.
+
+    Each pair has one place, below the diagonal.
 
     Parameters
     ----------
@@ -221,6 +224,9 @@ def draw_matrix(
     groups : sequence of str, optional
         Slot of each value, those of one slot together: lines part the slots, and pairs that cannot be are grey.
 
+    most : int
+        Features that are shown at most.
+
     Raises
     ------
     ExportError, MissingExtraError
@@ -228,7 +234,9 @@ def draw_matrix(
 
     Notes
     -----
-    Of more than :data:`MOST_FEATURES` features, those with the most gaps are shown, and the picture says so.
+    Of features that are in the very same frames, as both directions of an edge, one is shown, the ego's if it
+    is among them. Of more than ``most`` those with the most gaps are, where a gap of two counts as much as the
+    frames of one by the frames of the other: that they never meet surprises the more. The picture says so.
     """
     from matplotlib.colors import to_rgb
 
@@ -238,26 +246,34 @@ def draw_matrix(
     gaps = wanted & (frames == 0)
     pairs = np.triu(wanted, 1)
     below = f"{int((pairs & (frames > 0)).sum())} of {int(pairs.sum())} pairs occur"
-    if len(names) > MOST_FEATURES:
-        shown = np.sort(np.argsort(-gaps.sum(axis=0), kind="stable")[:MOST_FEATURES])
+    if not groups:
+        shown = _one_direction(names, frames, wanted)
+        if len(shown) < len(names):
+            below += (
+                f"; {len(names) - len(shown)} features are in the same frames as one of the others"
+            )
+    if len(shown) > most:
+        often = np.diagonal(frames) + 1.0
+        surprise = (gaps[np.ix_(shown, shown)] * often[shown]).sum(axis=1) * often[shown]
         what = "values" if groups else "features"
-        below += f"; the {MOST_FEATURES} of {len(names)} {what} with the most gaps"
+        below += f"; of {len(shown)} {what} the {most} with the most gaps"
+        shown = np.sort(shown[np.argsort(-surprise, kind="stable")[:most]])
     square = np.ix_(shown, shown)
     image = _colours(frames[square], gaps[square])
     if groups:
         image[~wanted[square] & ~np.eye(len(shown), dtype=np.bool_)] = to_rgb(_CANNOT)
         groups = [groups[i] for i in shown.tolist()]
+    image[np.triu_indices(len(shown), 1)] = (1.0, 1.0, 1.0)
     gaps = gaps[square]
     names = [printable(names[i]) for i in shown.tolist()]
     side = len(names) * _CELL
     label = 12 + 3.7 * max((len(name) for name in names), default=0)
-    least = 480 if groups else 420  # for the words that explain the colours
+    least = max(480 if groups else 420, 7.4 * len(title))  # for the words above and below
     with _page(to, title, below, max(label + side + 30, least), side + label + 90) as page:
-        axes = page.plot(label, 30.0, label + side, 30.0 + side)
+        axes = page.plot(label, 30.0 + label, label + side, 30.0 + label + side)
         axes.imshow(image, interpolation="nearest", aspect="auto")
         axes.grid(visible=False)
         axes.spines[:].set_visible(False)
-        axes.xaxis.tick_top()
         places = range(len(names))
         look: dict[str, Any] = {"fontsize": 6, "color": INK, "parse_math": False}
         axes.set_xticks(places, names, rotation=90, **look)
@@ -266,6 +282,18 @@ def draw_matrix(
             axes.axhline(place, color=INK, linewidth=0.6)
             axes.axvline(place, color=INK, linewidth=0.6)
         _explain_colours(page, gaps, cannot=bool(groups))
+
+
+def _one_direction(
+    names: Sequence[str], frames: NDArray[np.int64], wanted: NDArray[np.bool_]
+) -> NDArray[np.intp]:
+    """Features but for those that are in the same frames as one before, those of the ego being before all."""
+    order = np.array(
+        sorted(range(len(names)), key=lambda i: not names[i].startswith("ego ")), np.intp
+    )
+    told = np.hstack([frames, wanted])[order]
+    _, first = np.unique(told, axis=0, return_index=True)
+    return np.sort(order[first])
 
 
 def _colours(frames: NDArray[np.int64], gaps: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -73,6 +73,11 @@ class Timeline:
     seconds: float
     lanes: list[Lane] = field(default_factory=list[Lane])
 
+    @property
+    def hit(self) -> bool:
+        """True if something is found, or violated."""
+        return any(lane.spans for lane in self.lanes)
+
 
 def timelines(
     store: Store,
@@ -194,10 +199,18 @@ def _spans(intervals: Iterable[Interval], *, violation: bool) -> list[LaneSpan]:
     return [(one.start, one.end, violation) for one in intervals]
 
 
-def lines_of(timeline: Timeline, letters: int = LETTERS) -> list[str]:
-    """A timeline as lines of text; each letter stands for an equal part of the trace.
+def lines_of(timeline: Timeline, letters: int = LETTERS, longest: float = 0.0) -> list[str]:
+    """A timeline as lines of text; each letter stands for an equal part of the longest trace.
 
     ``█``: it holds, or is violated, for most of the part; ``▌``: in some of it; ``·``: nowhere in it.
+
+    Parameters
+    ----------
+    timeline : Timeline
+    letters : int
+        As many as the longest trace has.
+    longest : float
+        The time of that, so that traces have one scale; by default that of this one; s.
     """
     head = f"{timeline.trace}  0 … {timeline.seconds:.1f} s"
     if not timeline.lanes:
@@ -205,10 +218,10 @@ def lines_of(timeline: Timeline, letters: int = LETTERS) -> list[str]:
     labels = [_cut(lane.label, NAME) for lane in timeline.lanes]
     width = max(map(len, labels))
     lines = [head]
+    own = max(round(letters * timeline.seconds / max(longest, timeline.seconds, 1e-9)), 1)
     for label, lane in zip(labels, timeline.lanes, strict=True):
-        lines.append(
-            f"  {label.ljust(width)}  {_letters(lane, timeline.seconds, letters)}  {_told(lane)}"
-        )
+        drawn = _letters(lane, timeline.seconds, own).ljust(letters)
+        lines.append(f"  {label.ljust(width)}  {drawn}  {_told(lane)}")
     return [line.rstrip() for line in lines]
 
 
@@ -258,7 +271,8 @@ MOST_LANES: Final = 400
 
 _WIDTH: Final = 720.0
 _LEFT: Final = 190.0
-_RIGHT: Final = 20.0
+_RIGHT: Final = 130.0
+"""Room for the verdict, or how often something is found, behind a lane."""
 _LANE: Final = 15.0
 _BAR: Final = 9.0
 _ABOVE: Final = 26.0
@@ -272,7 +286,7 @@ _REASON: Final = 100
 
 
 def draw_timelines(timelines: list[Timeline], to: Path) -> None:
-    """Draw the swim lanes of traces, one trace under the other, each on its own time.
+    """Draw the swim lanes of traces, one trace under the other, all on one scale, with verdicts behind them.
 
     Parameters
     ----------
@@ -304,8 +318,9 @@ def draw_timelines(timelines: list[Timeline], to: Path) -> None:
         kinds = {span[2] for one in timelines for lane in one.lanes for span in lane.spans}
         _key(page, kinds, sum(len(one.lanes) for one in timelines) - MOST_LANES)
         top = height - _TOP
+        longest = max(timeline.seconds for timeline in timelines)
         for timeline, lanes in shown:
-            _draw(page, timeline, lanes, top)
+            _draw(page, timeline, lanes, top, max(longest, 1e-9))
             top -= _ABOVE + lanes * _LANE + _BELOW
         page.save(to)
 
@@ -321,8 +336,8 @@ def _key(page: Page, kinds: set[bool], more: int) -> None:
     page.legend(handles, (8, page.height - 6), "upper left", fontsize=8, handlelength=1.6)
 
 
-def _draw(page: Page, timeline: Timeline, lanes: int, top: float) -> None:
-    """Draw the lanes of a trace below a height of the page."""
+def _draw(page: Page, timeline: Timeline, lanes: int, top: float, longest: float) -> None:
+    """Draw the lanes of a trace below a height of the page, where the longest trace takes all the width."""
     from matplotlib.ticker import MaxNLocator
 
     from sgstore.draw._page import printable
@@ -331,7 +346,7 @@ def _draw(page: Page, timeline: Timeline, lanes: int, top: float) -> None:
     axes = page.plot(_LEFT, top - _ABOVE - lanes * _LANE, _WIDTH - _RIGHT, top - _ABOVE)
     axes.spines[:].set_visible(False)
     seconds = max(timeline.seconds, 1e-9)
-    axes.set_xlim(0, seconds)
+    axes.set_xlim(0, longest)
     axes.set_ylim(lanes - 0.5, -0.5)
     axes.xaxis.set_major_locator(MaxNLocator(9, steps=[1, 2, 5, 10]))
     axes.xaxis.set_major_formatter("{x:g} s")
@@ -341,15 +356,19 @@ def _draw(page: Page, timeline: Timeline, lanes: int, top: float) -> None:
     axes.set_yticks(range(len(shown)), labels, color=INK, parse_math=False)
     if not shown:
         page.write(axes, 0, 0, "nothing", color=FAINT_INK)
-    shortest = _LEAST / (_WIDTH - _RIGHT - _LEFT) * seconds
+    shortest = _LEAST / (_WIDTH - _RIGHT - _LEFT) * longest
     for row, lane in enumerate(shown):
         across = (row - _BAR / _LANE / 2, _BAR / _LANE)
         axes.broken_barh([(0, seconds)], across, color=GROUND, linewidth=0, zorder=0.4)
         if not lane.spans and lane.verdict == "unknown":
             said = f"cannot be told: {lane.reason}" if lane.reason else "cannot be told"
             page.write(
-                axes, seconds / 120, row, _cut(said, _REASON), va="center_baseline", color=FAINT_INK
+                axes, longest / 120, row, _cut(said, _REASON), va="center_baseline", color=FAINT_INK
             )
+        elif told := _told(lane):
+            colour = EGO if lane.verdict == "false" else FAINT_INK
+            look = {"va": "center_baseline", "color": colour, "clip_on": False}
+            page.write(axes, seconds + longest / 120, row, told, **look)
         for violation, colour in ((False, ROAD_EDGE), (True, EGO)):
             spans = [
                 (start, max(end - start, shortest))
