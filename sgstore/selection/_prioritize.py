@@ -29,7 +29,14 @@ from sgstore.locks import lock_of
 from sgstore.pair_numbers import PAIR_FUNCTIONS
 from sgstore.selection._choose import BudgetTracker, names_of_units
 from sgstore.selection._learn import cross_fitted, features_of, learned_elsewhere, model_name
-from sgstore.selection._situations import OTHERS, SITUATION, frames_in_parts, situations
+from sgstore.selection._situations import (
+    OTHERS,
+    SITUATION,
+    WHO,
+    Situations,
+    frames_in_parts,
+    situations,
+)
 from sgstore.selection._units import Budget, SelectionUnit, numbers_of_frames, units_of
 from sgstore.store import trace_of
 
@@ -41,8 +48,8 @@ if TYPE_CHECKING:
     from sgstore.selection._units import Units
     from sgstore.world import Bools, Floats, Ints
 
-MEASURES: Final = ("closing_time", "ttc_mild")
-"""Measures of risk by default: what happens at the closing speed, and by mild manoeuvres of both."""
+MEASURES: Final = ("closing_time", "dce_3s")
+"""Measures of risk by default: what happens at the closing speed, and at constant velocity."""
 
 RANKED: Final = {name: one for name, one in PAIR_FUNCTIONS.items() if one.sql and one.worse}
 """Measures by which cases can be ranked, of pairs in a frame."""
@@ -280,8 +287,11 @@ def prioritize(
     worst: tuple[WorstValues, ...] = ()
     total, risk, key = rank.astype(np.float64), np.zeros(0), units.begin
     chance, lesson = np.zeros(0), ""
+    told: Situations | None = None
     if spec.by is not Priority.diverse:
-        worst = worst_values(units, spec.measures)
+        if spec.by is Priority.both and {*spec.measures} & {*RANKED}:
+            told = Situations(len(units.frame_id))
+        worst = worst_values(units, spec.measures, told)
         key = worst[0].row
         total = np.sum([one.ranks() for one in worst], axis=0)
         if spec.by is Priority.learned:
@@ -293,7 +303,7 @@ def prioritize(
     names: list[str] = []
     if spec.by in {Priority.diverse, Priority.both}:
         if spec.abstraction == SITUATION:
-            code, names = situations(units, key)
+            code, names = situations(units, key) if told is None else told.of(key)
         else:
             code = _classes(units, spec.abstraction)[key]
         rounds = _in_rounds(order, code)
@@ -381,9 +391,14 @@ def _classes(units: Units, abstraction: str) -> Ints:
     return code
 
 
-def worst_values(units: Units, measures: Sequence[str]) -> tuple[WorstValues, ...]:
-    """The worst value of each measure in each unit: of the ego and others that move, or an expression's."""
-    pairs = _worst_of_pairs(units, [name for name in measures if name in RANKED])
+def worst_values(
+    units: Units, measures: Sequence[str], told: Situations | None = None
+) -> tuple[WorstValues, ...]:
+    """The worst value of each measure in each unit: of the ego and others that move, or an expression's.
+
+    ``told``: where the situations of frames go, too, which cost little beside numbers of pairs.
+    """
+    pairs = _worst_of_pairs(units, [name for name in measures if name in RANKED], told)
     later = _worst_of_encounters(units, [name for name in measures if name in LATER])
     known = pairs | later
     return tuple(known[m] if m in known else _worst_of_expression(units, m) for m in measures)
@@ -421,7 +436,9 @@ def _worst_of_expression(units: Units, text: str) -> WorstValues:
     return _worst_of(units, text, frames, np.full(len(frames), -1))
 
 
-def _worst_of_pairs(units: Units, measures: Sequence[str]) -> dict[str, WorstValues]:
+def _worst_of_pairs(
+    units: Units, measures: Sequence[str], told: Situations | None
+) -> dict[str, WorstValues]:
     if not measures:
         return {}
     columns = ["frame_id"]
@@ -434,6 +451,9 @@ def _worst_of_pairs(units: Units, measures: Sequence[str]) -> dict[str, WorstVal
     parts = ", ".join(
         f"worst{i}[1] AS value{i}, worst{i}[2] AS other{i}" for i in range(len(measures))
     )
+    if told is not None:
+        columns.append(WHO)
+        parts += ", situation"
     sql = f"""
       SELECT frame_id, {parts} FROM (
         SELECT {", ".join(columns)} FROM criticality
@@ -444,12 +464,15 @@ def _worst_of_pairs(units: Units, measures: Sequence[str]) -> dict[str, WorstVal
         found = units.chosen.store.file.arrays(sql, [int(part[0]), int(part[-1])])
         frame_id = found["frame_id"].astype(np.int64)
         at = np.minimum(np.searchsorted(part, frame_id), len(part) - 1)
-        here = (part[at] == frame_id) & units.asked[start + at]
+        here = part[at] == frame_id
+        if told is not None:
+            told.add(start + at[here], np.asarray(found["situation"])[here])
+        here &= units.asked[start + at]
         for i in range(len(measures)):
             for all_of, name in ((value, "value"), (other, "other")):
-                told = np.ma.asarray(found[f"{name}{i}"])[here]
-                known = ~np.ma.getmaskarray(told)
-                all_of[i, start + at[here][known]] = np.ma.getdata(told)[known]
+                column = np.ma.asarray(found[f"{name}{i}"])[here]
+                known = ~np.ma.getmaskarray(column)
+                all_of[i, start + at[here][known]] = np.ma.getdata(column)[known]
     return {
         name: _worst_of(units, name, value[i], other[i].astype(np.int64))
         for i, name in enumerate(measures)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -28,15 +28,19 @@ NOBODY: Final = "nobody"
 _FRAMES: Final = 1 << 17
 """Frames whose pairs are looked at together."""
 
-_SQL: Final = f"""
-  SELECT frame_id, min(ROW(coalesce(closing_time, 1e300), coalesce(dce_3s, 1e300), dst,
+WHO: Final = """
+  min(ROW(coalesce(closing_time, 1e300), coalesce(dce_3s, 1e300), dst,
     dst_kind::VARCHAR
     || CASE WHEN abs(rel_heading) <= 45 THEN ' of the same direction'
       WHEN abs(rel_heading) < 135 THEN ' that crosses'
       WHEN abs(rel_heading) >= 135 THEN ' that comes towards it' ELSE '' END
     || CASE WHEN lat_gap <= 0 THEN ' in its way' WHEN lat_gap > 0 THEN ' beside its way' ELSE '' END
     || CASE WHEN lon > 0 THEN ', ahead' WHEN lon <= 0 THEN ', behind' ELSE '' END))[4] AS situation
-  FROM criticality WHERE {OTHERS} AND frame_id BETWEEN ? AND ? GROUP BY frame_id
+"""
+"""The situation of a frame, of the pairs of :data:`OTHERS` in it; SQL."""
+
+_SQL: Final = f"""
+  SELECT frame_id, {WHO} FROM criticality WHERE {OTHERS} AND frame_id BETWEEN ? AND ? GROUP BY frame_id
 """  # noqa: S608  names of ours
 
 
@@ -56,12 +60,34 @@ def situations(units: Units, rows: Ints) -> tuple[Ints, list[str]]:
         The row of the frame of each unit.
     """
     frames, place = np.unique(units.frame_id[rows], return_inverse=True)
-    told = np.full(len(frames), NOBODY, object)
+    told = Situations(len(frames))
     for start, part in frames_in_parts(frames):
         found = units.chosen.store.file.arrays(_SQL, [int(part[0]), int(part[-1])])
         ids = found["frame_id"].astype(np.int64)
         at = np.minimum(np.searchsorted(part, ids), len(part) - 1)
         here = part[at] == ids
-        told[start + at[here]] = np.asarray(found["situation"])[here]
-    names, code = np.unique(told.astype(str), return_inverse=True)
-    return code[place].astype(np.int64), names.tolist()
+        told.add(start + at[here], np.asarray(found["situation"])[here])
+    return told.of(place)
+
+
+class Situations:
+    """Situations of so many frames, each once as a text; nobody is there where nothing is told."""
+
+    def __init__(self, count: int) -> None:
+        self._code = np.zeros(count, np.int64)
+        self._places = {NOBODY: 0}
+
+    def add(self, rows: Ints, texts: Any) -> None:
+        """Tell the situations of some frames."""
+        names, code = np.unique(texts.astype(str), return_inverse=True)
+        places = [self._places.setdefault(n, len(self._places)) for n in names.tolist()]
+        self._code[rows] = np.array(places, np.int64)[code]
+
+    def of(self, rows: Ints) -> tuple[Ints, list[str]]:
+        """The situations of some frames, as places in a list of all of theirs."""
+        used, code = np.unique(self._code[rows], return_inverse=True)
+        every = list(self._places)
+        names = [every[place] for place in used.tolist()]
+        order = sorted(range(len(names)), key=names.__getitem__)
+        rank = np.argsort(np.array(order, np.int64))
+        return rank[code].astype(np.int64), sorted(names)
