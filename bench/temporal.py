@@ -20,16 +20,19 @@ import numpy as np
 from bench.measure import Measure
 from sgstore.step import Frame
 from sgstore.temporal import Monitor, MonitorEvent, evaluate
+from sgstore.temporal._formula import Bound, Not, Or, Proposition, Since, Until, always, eventually
+from sgstore.temporal._robustness import MarginTable
 from sgstore.temporal._verdicts import Settled
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 from formulas import OnlineFormula, formula_of  # pyright: ignore[reportMissingImports]
+from oracle_robustness import of_rtamt  # pyright: ignore[reportMissingImports]
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from sgstore.temporal import Formula
-    from sgstore.world import Bools, Ints
+    from sgstore.world import Bools, Floats, Ints
 
 FORMULAS: Final = (
     "ALWAYS NOT a",
@@ -85,6 +88,7 @@ def run(quick: bool) -> Iterator[Measure]:
     """Measure."""
     yield from _columns(100_000 if quick else 1_000_000, 1_000_000 if quick else 10_000_000)
     yield from _beside_dfa(20_000 if quick else 200_000)
+    yield from _margins(100_000 if quick else 1_000_000)
     yield from _monitor(200 if quick else 1000)
 
 
@@ -170,6 +174,58 @@ def _beside_dfa(frames: int) -> Iterator[Measure]:
         )
         columnar = _taken(partial(evaluate, formula_of(text), columns, times))
         yield Measure("… and beside columns", seconds / columnar, "times")
+
+
+def _margins(frames: int) -> Iterator[Measure]:
+    """Margins over columns: each operator, and nested ones beside rtamt; processor time."""
+    rng, times = np.random.default_rng(3), np.arange(frames, dtype=np.int64) * PERIOD
+    columns = {name: rng.normal(size=(1, frames)) for name in "abc"}
+    a, b, c = map(Proposition, "abc")
+    near, far = (Bound(0, n, frames=True) for n in (20, 100))
+    one = {
+        "ALWAYS[0, 100]": always(a, far),
+        "EVENTUALLY": eventually(a),
+        "UNTIL[0, 100]": Until(a, b, far),
+        "UNTIL": Until(a, b),
+        "SINCE[0, 100]": Since(a, b, far),
+    }
+    for text, formula in one.items():
+        spent = min(_worked(partial(_margin, formula, columns, times)) for _ in range(2))
+        yield Measure(f"margin: {text}, {frames:,} frames", spent, "s", "goal at 1,000,000: 0.1 s")
+    if find_spec("rtamt") is None:
+        print("margins beside rtamt: left out, pip install --group dev", file=sys.stderr)
+        return
+    nested = {
+        "ALWAYS[0, 20] EVENTUALLY[0, 20]": always(eventually(a, near), near),
+        "ALWAYS[0, 100] (NOT a OR EVENTUALLY[0, 100] b)": always(
+            Or((Not(a), eventually(b, far))), far
+        ),
+        "(a UNTIL[0, 20] b) SINCE[0, 20] c": Since(Until(a, b, near), c, near),
+    }
+    some = {name: column[:, :PEER_FRAMES] for name, column in columns.items()}
+    word = {name: column[0].tolist() for name, column in some.items()}
+    for text, formula in nested.items():
+        theirs = _worked(partial(of_rtamt, formula, word))
+        own = partial(_margin, formula, some, times[:PEER_FRAMES])
+        if not np.array_equal(own()[0], of_rtamt(formula, word)):
+            raise AssertionError(f"{text}: rtamt has other margins")
+        ratio = theirs / min(_worked(own) for _ in range(5))
+        yield Measure(
+            f"rtamt beside it: {text}", ratio, "times", f"{PEER_FRAMES:,} frames, goal 20"
+        )
+
+
+PEER_FRAMES: Final = 5_000
+
+
+def _margin(formula: Formula, columns: Mapping[str, Floats], times: Ints) -> Floats:
+    return MarginTable(columns, times).value(formula)
+
+
+def _worked(work: Callable[[], object]) -> float:
+    began = time.process_time()
+    work()
+    return time.process_time() - began
 
 
 def _agree(text: str, machine: Callable[[Sequence[Mapping[str, bool]]], bool]) -> None:

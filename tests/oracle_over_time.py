@@ -836,18 +836,21 @@ def periods(store: Store) -> dict[str, int]:
     return {trace.name: trace.period_ns for trace in store.info()}
 
 
-def compare_sequence(world: World, store: Store, text: str, policy: str) -> int:
-    """Ask a sequence both ways; how many matches there are."""
+def compare_sequence(world: World, store: Store, text: str, policy: str, written: str = "") -> int:
+    """Ask a sequence both ways; how many matches there are. ``written``: what is asked of the store for it."""
     (statement,) = parse(text)
     assert isinstance(statement, s.MatchClause)
     steps = [step for step in statement.sequence.steps if isinstance(step, s.StepClause)]
     names = sorted(set().union(*(names_of(step) for step in steps if not step.absent)))
     times = [f"t({step.name})" for step in steps if step.name]
-    asked = f"USING UNKNOWN false, MATCHES {policy} {text} RETURN trace.name, {', '.join(names + times)}"
-    found = Counter(tuple(row) for row in store.find(asked))
+    using = f"USING UNKNOWN false, MATCHES {policy} "
+    query = written.replace("{}", using) if written else using + text
+    found = Counter(
+        tuple(row) for row in store.find(f"{query} RETURN trace.name, {', '.join(names + times)}")
+    )
     spans = Counter(
         (i.trace, i.start_seq, i.end_seq, *(i.values[name] for name in names))
-        for i in store.find(f"USING UNKNOWN false, MATCHES {policy} {text}").intervals()
+        for i in store.find(query).intervals()
     )
     expected: Counter[Any] = Counter()
     expected_spans: set[Any] = set()
@@ -1212,10 +1215,11 @@ def compare_check(world: World, store: Store, check: str) -> int:
     return sum(not holds for holds in found.values())
 
 
-def worlds(seed: int, folder: Path) -> tuple[World, Store]:
+def worlds(seed: int, folder: Path, *, traces: int = 3, frames: int = 0) -> tuple[World, Store]:
+    """A random world, and the store that holds it."""
     path = folder / f"{seed}.sgstore"
     StoreFile.create(path)
-    world = random_world(seed, traces=3, frames=8 + seed % 5, path=path)
+    world = random_world(seed, traces=traces, frames=frames or 8 + seed % 5, path=path)
     world.connection.close()
     return world, sgstore.open(path)
 

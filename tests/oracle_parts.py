@@ -527,7 +527,8 @@ def online(text: str, world: World) -> tuple[str, int]:
         monitor, found = Monitor(text, trace=trace.name, period_s=0.1), Counter[tuple[Any, ...]]()
         for n, frame in enumerate(frames):
             for event in monitor.look([graph_of(frame)]):
-                found[event.start.seq, tuple(sorted(event.nodes.items()))] += 1
+                nodes = sorted((k, v) for k, v in event.nodes.items() if k != "ego")
+                found[event.start.seq, tuple(nodes)] += 1
                 known = [values for some in rows[n].values() for values in some]
                 passed = rounded(tuple(event.values.values()))
                 if sorted(map(str, passed)) not in [sorted(map(str, one)) for one in known]:
@@ -559,10 +560,13 @@ def shown_node(value: Any) -> Any:
 
 
 def answering(match: Any, world: World) -> Iterator[Frame]:
-    """The frames of the traces that can answer a query."""
+    """The frames of the traces that a query is asked of, and that can answer it."""
+    egos = [setting.value for setting in match.settings if setting.name.lower() == "ego"]
     needed = {name.lower() for name in relations_of(match)}
     for frame in world.frames:
-        if needed <= {name.lower() for name in frame.trace.answers}:
+        if needed <= {name.lower() for name in frame.trace.answers} and (
+            not egos or egos == [frame.trace.hero]
+        ):
             yield frame
 
 

@@ -7,7 +7,9 @@ from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from oracle_answers import run
 from oracle_over_time import worlds
+from thorough import LONG
 
 from sgstore.cli import run as run_verb
 from sgstore.errors import QueryError
@@ -17,6 +19,7 @@ from sgstore.vocabulary import natural
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from sgstore.query import Store
 
@@ -48,6 +51,12 @@ def asked(store: Store, *queries: str, word: str = "UNION") -> Any:
 def key(row: tuple[Any, ...]) -> tuple[Any, ...]:
     """NULL last, names of traces as people count, everything else as it is."""
     return tuple((v is None, natural(v) if str(v).startswith("trace") else v) for v in row)
+
+
+def test_random_answers_are_what_their_definition_says(tmp_path: Path) -> None:
+    found = run(range(4) if LONG else range(1), 50 if LONG else 2, tmp_path)
+
+    assert {"union", "sql", "second", "scenario"} <= found.keys()
 
 
 @pytest.mark.parametrize("form", RETURNS)
