@@ -150,7 +150,8 @@ def test_a_monitor_tells_when_rows_of_parts_begin() -> None:
     monitor = Monitor(
         "MATCH (e:Ego) OPTIONAL MATCH (v:Car) WHERE v.x - e.x > 20;"
         "MATCH (e:Ego), (v:Car) WITH e, COUNT(v) AS many WHERE many > 1;"
-        "MATCH p = (e:Ego)-[:super_near*1..2]->(v:Car) RETURN length(p) AS edges, nodes(p) AS ids"
+        "MATCH p = (e:Ego)-[:super_near*1..2]->(v:Car) RETURN length(p) AS edges, nodes(p) AS ids;"
+        "MATCH (e:Ego)-[:super_near]->(v:Car) WITH v AS e"
     )
     told = list[tuple[int, str, dict[str, str], dict[str, object]]]()
     for number, places in enumerate(((0, 7, 14), (0, 7, 14), (0, 50))):
@@ -165,5 +166,6 @@ def test_a_monitor_tells_when_rows_of_parts_begin() -> None:
         (0, "2", {"e": "car 0"}, {"many": 2}),
         (0, "3", {"e": "car 0", "v": "car 1"}, {"edges": 1, "ids": [0, 1]}),
         (0, "3", {"e": "car 0", "v": "car 2"}, {"edges": 2, "ids": [0, 1, 2]}),
+        (0, "4", {"e": "car 1"}, {}),
         (2, "1", {"e": "car 0", "v": "car 1"}, {}),
     ]

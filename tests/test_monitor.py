@@ -377,3 +377,17 @@ def test_sequences_joined_in_parts_are_those_joined_at_once(
 
     assert list(town.store.find(text)) == at_once
     assert len(at_once) > 1
+
+
+def test_types_of_the_simulator_are_known_while_it_drives() -> None:
+    monitor = Monitor("MATCH (v:Car) WHERE v.type = 'a.taxi'; MATCH (v {type_name: 'a.bench'})")
+    told: list[tuple[str, str]] = []
+    for number in range(2):
+        frame = Frame(time_ns=number * 10**8, ego="hero")
+        frame.add("hero", "car", 0.0, 0.0)
+        frame.add("t", "car", 9.0, 0.0, type_name="a.taxi")
+        if number == 0:
+            frame.add("b", "prop", 5.0, 5.0, static=True, type_name="a.bench")
+        told += [(event.name, event.names["v"]) for event in monitor.step(frame)]
+
+    assert told == [("pattern 1", "car 1"), ("pattern 2", "prop 2")]

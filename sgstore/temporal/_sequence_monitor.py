@@ -552,9 +552,9 @@ class SequenceMonitor:
         way, binding, places = found
         happen = self._happen[way]
         steps = tuple(self._moment(place) for place in places)
-        bound: dict[str, Any] = binding  # of parts, some may be absent
-        known = {name: node for name, node in bound.items() if node is not None}
-        nodes = {name: node for name, node in known.items() if name in self._named}
+        bound: dict[str, Any] = binding  # of parts, some may be absent, and keys are numbered
+        known = {key: node for key, node in bound.items() if node is not None}
+        nodes = {key.partition("~")[0]: n for key, n in known.items() if key in self._named}
         names = {name: self._names.get(node, str(node)) for name, node in nodes.items()}
 
         def part(value: OverMatch) -> Any:
