@@ -40,6 +40,7 @@ QUESTIONS = [
     "MATCH (a:Car)-[e:near|visible]->(b) RETURN type(e), b ORDER BY a.speed DESC, b.kind LIMIT 9",
     "MATCH (a:Car)-[:near]->(b) RETURN *, a.speed ORDER BY a.speed DESC LIMIT 9",
     "MATCH (a:Car)-[:near]->(b) LIMIT 3",
+    "MATCH (a)-[d:follows|leads]-(b) RETURN *",
     "MATCH (a:Car)-[:near]->(b) RETURN COUNT(*) AS n",
     "MATCH (a:Car)-[:near]->(b) WHERE a.x > 1e9 RETURN COUNT(*) AS n, AVG(a.x), COUNT(DISTINCT b)",
     "MATCH (a:Car)-[:near]->(b) RETURN b.kind AS k, COUNT(*) AS n, COUNT(DISTINCT b) AS d,"

@@ -325,7 +325,8 @@ def _parted_rows(query: Query) -> Parted:
     visible = names_of(query)
     rest = list(map(quoted, visible))
     if not (result.framed or result.distinct):
-        rest = [hidden.add(value) for value in _bindings(query)]
+        told = rest if query.steps else []
+        rest = [*_bindings(query, hidden), *told]
     asked = _of_part(replace(result, columns=(*result.columns, *hidden.columns)))
 
     def merge(catalog: Catalog, values: BoundValues) -> str:
@@ -377,13 +378,19 @@ def _of_part(result: Result) -> Result:
     return replace(result, order=(), skip=0)
 
 
-def _bindings(query: Query) -> Iterator[Bound]:
-    """Order of rows of one frame: by the nodes and edges that a match is told apart by."""
+def _bindings(query: Query, hidden: _Hidden) -> Terms:
+    """Order of rows of one frame: by the nodes and edges that a match is told apart by.
+
+    A store has relations in the order of its enumeration, and tells them as texts.
+    """
     roles = {"named"} if query.result.whole else {"named", "unnamed"}
-    nodes = (key for key, node in query.scope.nodes.items() if node.role in roles)
-    yield from (NodeValue(key) for key in sorted(nodes))
-    yield from (EdgeRelation(key) for key in sorted(e.key for e in query.scope.edges if e.named))
-    yield from told_apart_by(query)
+    nodes = sorted(key for key, node in query.scope.nodes.items() if node.role in roles)
+    edges = sorted(edge.key for edge in query.scope.edges if edge.named)
+    return [
+        *(hidden.add(NodeValue(key)) for key in nodes),
+        *(f"CAST({hidden.add(EdgeRelation(key))} AS relation)" for key in edges),
+        *map(hidden.add, told_apart_by(query)),
+    ]
 
 
 def _per(result: Result, chosen: Sampling | None, hidden: _Hidden) -> Terms:
@@ -617,7 +624,7 @@ class _Grouping:
             hidden.add(owner_of(number.operand.node))
         ordered = number.word == "collect" and not number.distinct
         frame = hidden.add(_FRAME_ID) if ordered else ""
-        bindings = [hidden.add(one) for one in _bindings(self._query)] if ordered else []
+        bindings = _bindings(self._query, hidden) if ordered else []
         columns = (*self._groups.columns, *hidden.columns)
         result = Result(columns=columns, whole=False, distinct=number.distinct)
         groups = [quoted(column.name) for column in self._groups.columns]

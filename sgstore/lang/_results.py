@@ -507,6 +507,8 @@ class _RowStatement:
         moved = once and len(keys) > own
         bindings = [f"{_ROWS}.{column}" for column in columns_of(self.nodes, self.edges)]
         bindings += [_column(one) for one in self.passed]
+        if self.query.steps:  # several matches may bind the same in their last frame
+            bindings += [self._text(column.value) for column in self.result.columns]
         keys += names if once or grouped else bindings
         sample, top = self.result.sample, self.result.top
         named = self._named_traces(keys, own) if grouped else []
