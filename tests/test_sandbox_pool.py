@@ -101,8 +101,8 @@ def test_a_question_behind_a_runaway_is_answered_at_once(pool: SandboxPool) -> N
 
 
 def test_a_small_question_waits_for_none_of_the_others(town_store: Path) -> None:
-    small = {"size": 1, "small": ("why",), "worker": "sgstore.serve._worker"}
-    with SandboxPool(town_store, timeout_s=60, **small) as pool:
+    worker = "sgstore.serve._worker"
+    with SandboxPool(town_store, size=1, small=("why",), timeout_s=60, worker=worker) as pool:
         away = pool.ask({"ask": "matches", "text": NEAR, "parameters": {}}, "away")
         next(away)  # it holds the only turn
         frame = Store(town_store).file.frame("town#100").frame_id

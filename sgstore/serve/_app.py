@@ -147,11 +147,12 @@ class _Errand:
     def ask(self, question: Mapping[str, Any], _: str) -> Iterator[dict[str, Any]]:
         """Replies, as those of a sandbox."""
         path, under = self._explorer.store.file.path, self._explorer.errands
-        with Workshop(path, timeout_s=LONGEST_S, memory=1 << 30, worker=WORKER) as self._box:
+        with Workshop(path, timeout_s=LONGEST_S, memory=1 << 30, worker=WORKER) as box:
+            self._box = box
             under.add(self)
             try:
                 if not self._gone:
-                    yield from self._box.replies(question)
+                    yield from box.replies(question)
             finally:
                 under.discard(self)
 

@@ -77,7 +77,8 @@ class Guard:
         """Answer that refuses a request, or lets it in; ``None``: it may pass."""
         headers = Headers(scope=scope)
         host = headers.get("host", "")
-        if host not in {*self._hosts, host_of(*(scope.get("server") or ("", 0)))}:
+        name, port = scope.get("server") or ("", 0)
+        if host not in {*self._hosts, host_of(name, port)}:
             return PlainTextResponse("wrong host", 403)
         if headers.get("origin", f"http://{host}") != f"http://{host}":
             return PlainTextResponse("wrong origin", 403)

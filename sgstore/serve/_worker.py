@@ -136,9 +136,9 @@ def _measured(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]
             yield {"result": of.locked_clips(store, clips, Path(to), progress)}
         case {"ask": "export", "clips": clips, "to": to, "format": form}:
             yield {"result": of.exported(store, clips, Path(to), form, progress)}
-        case {"other": other, "abstraction": abstraction}:
-            with Store(other) as second:
-                yield {"result": of.differing(store, second, abstraction)}
+        case _:
+            with Store(question["other"]) as second:
+                yield {"result": of.differing(store, second, question["abstraction"])}
 
 
 QUESTIONS: Final[Mapping[str, Asked]] = {
