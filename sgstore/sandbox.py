@@ -424,6 +424,8 @@ class SandboxPool:
         How many questions are answered at a time; the others wait.
     small : collection of str
         What is asked (``ask`` of a question) that waits for none of the others: the spare one answers it.
+    first : mapping, optional
+        A question that each process is asked before it stands ready, so that it knows what others will need.
     **limits
         As :class:`Sandbox` takes them.
 
@@ -434,8 +436,15 @@ class SandboxPool:
     """
 
     def __init__(
-        self, store: str | Path, *, size: int = 2, small: Collection[str] = (), **limits: Any
+        self,
+        store: str | Path,
+        *,
+        size: int = 2,
+        small: Collection[str] = (),
+        first: Mapping[str, object] | None = None,
+        **limits: Any,
     ) -> None:
+        self._first = first
         self._changed = threading.Condition()
         self._turns = threading.BoundedSemaphore(size)
         self._small = dict.fromkeys(small, threading.BoundedSemaphore(1))
@@ -520,11 +529,18 @@ class SandboxPool:
 
     def _more(self) -> None:
         with suppress(SgstoreError):  # the first one was made, so that this is of passing nature
-            self._put(self._make())
+            self._ready(self._make())
 
     def _again(self, box: Sandbox) -> None:
         with suppress(SgstoreError):
             box.start()
+        self._ready(box)
+
+    def _ready(self, box: Sandbox) -> None:
+        """Put a process to the others that has just begun."""
+        with suppress(SgstoreError):
+            if self._first is not None:
+                box.ask(self._first)
         self._put(box)
 
     def _put(self, box: Sandbox) -> None:

@@ -59,6 +59,9 @@ _TYPES: Final = {
     ".txt": "text/plain",
 }
 WORKER: Final = "sgstore.serve._worker"
+FIRST: Final = {"ask": "rows", "text": "MATCH (e:Ego) RETURN e.id LIMIT 1", "parameters": {}}
+"""What each sandbox is asked first: the language, the catalogue and the database are loaded for it."""
+
 _NONCE: Final = "{{nonce}}"
 _SCRIPT: Final = "js/main.js"
 
@@ -238,6 +241,7 @@ class Explorer:
             tables=tables,
             worker=WORKER,
             small=("parts", "why"),
+            first=FIRST,
         )
 
     def _tables(self) -> dict[str, Path]:
