@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import sys
 import tracemalloc
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +25,7 @@ from sgstore.draw._stored import Shot, filmed, scale_of
 from sgstore.draw._view import view_of
 from sgstore.errors import ExportError, MissingExtraError, StoreError
 from sgstore.query import Store
+from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -424,6 +427,21 @@ def test_a_picture_of_a_stored_frame_has_the_camera_that_is_asked_for(
     with pytest.raises(ExportError, match="no JPEG or PNG"):
         draw_stored(opened, "town#217", tmp_path / "a.svg", camera="/ego/lidar/points")
     assert not (tmp_path / "a.svg").exists()
+
+
+@pytest.mark.parametrize(
+    ("form", "size", "reason"), [("PNG", (9000, 9000), "9000 by 9000"), ("GIF", (9, 9), "read")]
+)
+def test_a_camera_picture_is_opened_within_bounds(
+    store: Path, monkeypatch: pytest.MonkeyPatch, form: str, size: tuple[int, int], reason: str
+) -> None:
+    channel, written = "/ego/camera/front/image", io.BytesIO()
+    Image.new("RGB", size).save(written, form)
+    carried = replace(Store(store).file.carried("town#217", channel), data=written.getvalue())
+    monkeypatch.setattr(StoreFile, "carried", lambda *_: carried)
+
+    with pytest.raises(ExportError, match=reason):
+        Store(store).picture("town#217", channel)
 
 
 def test_what_a_query_matches_in_a_stored_frame_is_marked(store: Path, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from sgstore.draw._animation import animation
 from sgstore.draw._film import FilmPage
 from sgstore.draw._legend import entries_of
-from sgstore.draw._page import own_style
+from sgstore.draw._page import PICTURE_PIXELS, own_style
 from sgstore.draw._picture import (
     check_installed,
     checked,
@@ -404,18 +404,27 @@ def camera_image(store: Store, frame: int | str, channel: str) -> Image:
         Pillow is not installed.
     """
     check_installed()
-    from PIL import Image
-
     media = store.file.carried(frame, channel)
     if media.form not in _PICTURES:
         held = "no picture" if media.form == "message" else f"{media.form} video, not a picture"
         raise ExportError(
             f"{channel}: the message holds {held}; 'sgstore payload' writes it as it is"
         )
+    return _opened(media.data, channel)
+
+
+def _opened(data: bytes, channel: str) -> Image:
+    """A picture of a recording, which nobody has looked at: of forms that are meant, and of a bounded size."""
+    from PIL import Image
+
     try:
-        image = Image.open(io.BytesIO(media.data))
+        image = Image.open(io.BytesIO(data), formats=[form.upper() for form in _PICTURES])
+        if image.width * image.height > PICTURE_PIXELS:
+            raise ExportError(
+                f"{channel}: the picture has {image.width} by {image.height} pixels, more than is opened"
+            )
         image.load()
-    except (OSError, SyntaxError, ValueError) as error:
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise ExportError(f"{channel}: the picture cannot be read: {error}") from error
     return image
 
@@ -448,8 +457,6 @@ def thumbnail(file: StoreFile, frame: FrameRef, side: int = THUMBNAIL) -> bytes:
         The packages for drawing are not installed.
     """
     check_installed()
-    from PIL import Image
-
     topic = _camera_in(file, frame.trace)
     data = b""
     if topic:
@@ -460,10 +467,7 @@ def thumbnail(file: StoreFile, frame: FrameRef, side: int = THUMBNAIL) -> bytes:
             data = media.data if media.form in _PICTURES else b""
     if not data:
         data = graph_picture(file.graph(frame.frame_id), _map_in(file, frame.trace))
-    try:
-        image = Image.open(io.BytesIO(data)).convert("RGB")
-    except (OSError, SyntaxError, ValueError) as error:
-        raise ExportError(f"{topic}: the picture cannot be read: {error}") from error
+    image = _opened(data, topic).convert("RGB")
     image.thumbnail((side, side))
     small = io.BytesIO()
     image.save(small, "JPEG", quality=85)
