@@ -146,7 +146,7 @@ def deepscenario(folder: Path) -> Iterator[str]:
             picture,
             unit="case",
             title=f"DeepScenario, {title}: by risk",
-            below=rows[-3][2],
+            below=f"APFD {rows[-3][2]}",
             words=("failures found", "in order"),
         )
         kinds.append(

@@ -207,7 +207,6 @@ def prioritize(
         say(text)
     if known is not None:
         _fault_detection(found, known, given.picture)
-    out.report(found.table())
     if output is not None:
         values = parameters_of(parameters)
         with count_bar(output.name, "cases") as progress:
@@ -219,6 +218,7 @@ def prioritize(
                 progress=progress,
             )
         say_made(made, output)
+    out.report(found.table())  # last: who reads only the first rows of it has the lock all the same
 
 
 def _fault_detection(order: Prioritized, known: dict[str, bool], picture: Path | None) -> None:
