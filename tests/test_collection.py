@@ -562,6 +562,11 @@ def test_a_folder_that_is_no_collection_is_refused(tmp_path: Path) -> None:
         Collection(tmp_path)
 
 
+def test_what_is_asked_of_one_store_says_so(place: Path) -> None:
+    with pytest.raises(StoreError, match=r"a collection, .* 'sgstore collection unpack'"):
+        Store(place)
+
+
 def test_verbs_ask_collections_as_they_ask_stores(
     path: Path, place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

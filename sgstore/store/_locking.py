@@ -63,6 +63,10 @@ def refuse_special(path: Path) -> None:
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else "not a name of a file"
             raise StoreError(f"{path}: cannot be read: {reason}") from error
+        if (path / "COLLECTION.json").is_file():
+            raise StoreError(
+                f"{path}: a collection, and this asks one store: 'sgstore collection unpack' makes one"
+            )
         if not stat.S_ISREG(mode):
             what = _KINDS.get(stat.S_IFMT(mode), "no file")
             whose = "" if file == path else f"{file.name} beside it is "
