@@ -537,8 +537,8 @@ class SceneGraph:
     def to_next(self, node: int, what: str) -> float | None:
         """Distance from an entity along the lanes to the next part of the map of one sort, 0 on it; m.
 
-        ``what`` is ``junction``, ``crosswalk``, ``stop_line``, ``traffic_light``, ``stop_sign``, …; ``None`` if
-        there is none within 200 m.
+        ``what`` is ``junction``, ``roundabout``, ``crosswalk``, ``stop_line``, ``traffic_light``, …; ``None``
+        if there is none within 200 m.
         """
         return None if self.reach is None else self.reach.next(self.stretches().get(node, ()), what)
 

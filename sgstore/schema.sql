@@ -32,7 +32,7 @@
 CREATE TYPE kind AS ENUM (
   'car', 'truck', 'van', 'bus', 'motorcycle', 'bicycle', 'trailer', 'train', 'vehicle', 'person', 'animal',
   'traffic_light', 'stop_sign', 'yield_sign', 'speed_limit', 'sign', 'prop', 'building', 'pole', 'barrier', 'vegetation', 'unknown',
-  'lane', 'road', 'junction', 'crosswalk', 'off_road', 'waypoint');
+  'lane', 'road', 'junction', 'crosswalk', 'off_road', 'waypoint', 'roundabout');
 
 CREATE TYPE relation AS ENUM (
   'isIn', 'travelsTo', 'laneChange', 'opposes', 'toLeftOf', 'toRightOf', 'conflictsWith', 'controlsTrafficOf', 'mayAffect',
@@ -275,7 +275,7 @@ SELECT f.frame_id, n.node_id, n.kind, false, n.name, n.special, n.subkind, true,
 FROM inside.frame f JOIN (
   SELECT k.bucket, k.mask, k.node_id, k.kind, m.name, NULL::VARCHAR AS special, NULL::VARCHAR AS subkind, m.x, m.y, m.z, m.heading,
          m.length, m.width, NULL::FLOAT AS height,
-         CASE WHEN k.kind IN ('lane', 'road', 'junction', 'crosswalk', 'off_road', 'waypoint') THEN NULL ELSE 0::FLOAT END AS still, m.lane_type, m.road, m.section, m.lane, m.junction, m.turn, m.speed_limit, m.curvature,
+         CASE WHEN k.kind IN ('lane', 'road', 'junction', 'crosswalk', 'off_road', 'waypoint', 'roundabout') THEN NULL ELSE 0::FLOAT END AS still, m.lane_type, m.road, m.section, m.lane, m.junction, m.turn, m.speed_limit, m.curvature,
          NULL::VARCHAR AS ident, NULL::VARCHAR AS type_name
   FROM inside.bucket b JOIN inside.node k ON k.bucket = b.bucket JOIN inside.map_node m ON m.map_id = b.map_id AND m.node_id = k.node_id
   UNION ALL

@@ -79,6 +79,7 @@ class _SumoNet:
     junctions: dict[str, tuple[str, str]] = field(default_factory=dict[str, tuple[str, str]])
     phases: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
     """States of the links of each traffic light, in all phases of all programs."""
+    roundabouts: list[dict[str, str]] = field(default_factory=list[dict[str, str]])
     beside: dict[str, str] = field(default_factory=dict[str, str])
     """Lane → the lane of the opposite direction to its left."""
     depth: int = 0
@@ -95,6 +96,8 @@ class _SumoNet:
             self.edges.append(_SumoEdge(ident, function, source, target))
         elif self.depth == 2 and tag == "connection":
             self.connections.append(attributes)
+        elif self.depth == 2 and tag == "roundabout":
+            self.roundabouts.append(attributes)
         elif self.depth == 2 and tag == "junction":
             place = attributes.get("x", ""), attributes.get("y", "")
             self.junctions[attributes.get("id", "")] = place
@@ -147,6 +150,7 @@ def _lines(net: _SumoNet, broken: list[str]) -> tuple[dict[str, LaneLine], list[
     lines: dict[str, LaneLine] = {}
     crosswalks: list[PlainCrosswalk] = []
     points = 0
+    around = _around(net)
     for edge in net.edges:
         if edge.function in {"walkingarea", "connector"}:
             continue
@@ -167,6 +171,7 @@ def _lines(net: _SumoNet, broken: list[str]) -> tuple[dict[str, LaneLine], list[
                 crosswalks.append(_crosswalk(ident, sections))
                 continue
             index = int(_number(lane.get("index", ""), 0.0))
+            junction = edge.ident[1:].rpartition("_")[0] if inside else ""
             lines[ident] = LaneLine(
                 ident,
                 _type(lane),
@@ -176,13 +181,24 @@ def _lines(net: _SumoNet, broken: list[str]) -> tuple[dict[str, LaneLine], list[
                 rights=(_side(sections, left=False),),
                 road=edge.ident,
                 number=index + 1,
-                junction=edge.ident[1:].rpartition("_")[0] if inside else "",
+                junction=junction,
                 speed_limit=_speed(lane),
+                roundabout=around.get(("node", junction) if inside else ("edge", edge.ident), ""),
             )
         _set_beside(net, edge, lines)
     if len(lines) > MAX_LANES:
         raise MapError(f"{len(lines):,} lanes; a map may have {MAX_LANES:,}", element="lane")
     return _with_opposites(net, lines), crosswalks
+
+
+def _around(net: _SumoNet) -> dict[tuple[str, str], str]:
+    """Nodes and edges of roundabouts → a name of theirs; they have none, so it is that of their first node."""
+    found: dict[tuple[str, str], str] = {}
+    for one in net.roundabouts:
+        nodes = one.get("nodes", "").split()
+        for what, names in (("node", nodes), ("edge", one.get("edges", "").split())):
+            found |= {(what, name): nodes[0][:MAX_NAME] for name in names if nodes}
+    return found
 
 
 def _crosswalk(ident: str, sections: Sections) -> PlainCrosswalk:

@@ -43,7 +43,7 @@ OWN_ENTITY_KINDS: Final = (
 )
 """Kinds of entities: what has a pose and, mostly, a box. ``vehicle``: a vehicle, and no more is told of it."""
 
-MAP_KINDS: Final = ("lane", "road", "junction", "crosswalk", "off_road", "waypoint")
+MAP_KINDS: Final = ("lane", "road", "junction", "crosswalk", "off_road", "waypoint", "roundabout")
 """Kinds of the parts of a road map. ``off_road`` is a single node: whatever is not a driving lane."""
 
 EVENT_KINDS: Final = {"collision": 2, "lane_invasion": 1, "environment": 0}

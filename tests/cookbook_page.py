@@ -10,9 +10,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 from carla_recordings import Bridge, vehicle
 from library_scenes import LEFT, LIGHTS, RIGHT, SCENES, WAYS, aside, lamp
+from opendrive_maps import a_map, a_road, cubic, line
+from roundabouts import circling, driven, roundabout
 from scenes import Scene, actor, along, ego, store_of, through
 
 from sgstore.ingest import ingest
+from sgstore.opendrive import read_map
 from sgstore.query import Store
 
 if TYPE_CHECKING:
@@ -41,6 +44,28 @@ OWN: Final = {
         ego(through("s", "n"), [(0, 8), (4, 0), (9, 0), (12, 6)], start=100),
         lamp("s", (0, "red"), (8, "green")),
         seconds=14,
+    ),
+    "hill": Scene(
+        read_map(
+            a_map(
+                a_road(
+                    "1",
+                    line(400.0),
+                    elevation=cubic("elevation", 1.0, s=0)
+                    + cubic("elevation", 1.0, -0.04, s=60)
+                    + cubic("elevation", -1.0, s=110),
+                )
+            ),
+            "hill",
+        ),
+        ego(along(RIGHT), [(0, 12), (4, 12), (8, 4), (12, 4)], start=30),
+        seconds=12,
+    ),
+    "roundabout": Scene(
+        roundabout(),
+        ego(driven(), [(0, 9), (8, 5), (30, 5)], start=30),
+        actor("w", circling(-180, 3.0), 7),
+        seconds=24,
     ),
 }
 SHOWN: Final = 5

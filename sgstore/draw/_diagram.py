@@ -52,7 +52,7 @@ MOST: Final = 60
 MOST_WORDS: Final = 2
 """Relations that are written on a line, each way; the most telling come first."""
 
-_TIERS: Final[dict[str, Tier]] = {"road": "road", "junction": "junction"}
+_TIERS: Final[dict[str, Tier]] = {"road": "road", "junction": "junction", "roundabout": "junction"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ class DiagramLine:
     family : str
         ``ego``: an entity seen from the ego; ``matched``: among matched nodes; ``entity``: others among
         entities; ``light``: a signal and a lane; ``isIn``: an entity in a lane; ``map``: lane to lane;
-        ``part``: a lane in its road, a road in its junction.
+        ``part``: a lane in its road, a road in its junction or roundabout.
     """
 
     a: int

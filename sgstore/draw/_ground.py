@@ -135,11 +135,15 @@ class GroundView:
         return [o for row in rows if (o := self.outline(row)) is not None]
 
     def parts(self, node: int) -> list[int]:
-        """Rows whose outlines a node is made of: its own, or the lanes of a road or junction."""
+        """Rows whose outlines a node is made of: its own, or the lanes of a road, junction or roundabout."""
         row = -1 - node
         if not 0 <= row < len(self.outlines):
             return []
         kind, name = KINDS[self.nodes.kind[row]], self.nodes.name[row]
+        if kind == "roundabout":
+            edges = self.road_map.edges
+            roads = [int(src) for src in edges.src[edges.dst == node]]
+            return [part for road in roads for part in self.parts(road)]
         if kind in {"road", "junction"}:
             column = self.nodes.road if kind == "road" else self.nodes.junction
             return [r for r in self.of_kind("lane") if column[r] == name]

@@ -44,6 +44,7 @@ DIAGRAM_TINTS: Final[Mapping[str, str]] = {
     "waypoint": "#6f97cf",
     "road": "#2c5591",
     "junction": "#1d3a66",
+    "roundabout": "#1d3a66",
 }
 """Nodes of a diagram that are parts of the map; entities have their own colours."""
 

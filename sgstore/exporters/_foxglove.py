@@ -211,7 +211,7 @@ COLOURS: Final[dict[str, Colour]] = {
     **dict.fromkeys(
         ("car", "truck", "van", "bus", "trailer", "train", "vehicle"), (0.45, 0.5, 0.55, 1.0)
     ),
-    **dict.fromkeys(("lane", "road", "junction", "crosswalk"), (0.5, 0.5, 0.5, 1.0)),
+    **dict.fromkeys(("lane", "road", "junction", "roundabout", "crosswalk"), (0.5, 0.5, 0.5, 1.0)),
 }
 LIGHTS: Final[dict[str, Colour]] = {
     "red": (0.9, 0.1, 0.1, 1.0),

@@ -175,6 +175,7 @@ _PARTS: Final = (
         ),
     ),
     ("road", re.compile(r"(root )?road( .+)?", re.IGNORECASE)),
+    ("roundabout", re.compile(r"roundabout( .+)?", re.IGNORECASE)),
     ("junction", re.compile(r"(junction|intersection)( .+)?", re.IGNORECASE)),
     ("crosswalk", re.compile(r"crosswalk( .+)?", re.IGNORECASE)),
 )

@@ -111,8 +111,14 @@ def lanelet2_text(text: str, projection: Projection | None = None) -> str:
         reason = "; ".join(document.warnings[:2]) or "it has none: expected a Lanelet2 map"
         raise MapError(f"OpenStreetMap data without usable lanelets: {reason}")
     rules = _Rules.of(document, lanelets)
+    around = _around(document)
     lines = [
-        _line(document, ident, lanelet, _type(lanelet.element), rules.limits.get(ident, np.nan))
+        replace(
+            _line(
+                document, ident, lanelet, _type(lanelet.element), rules.limits.get(ident, np.nan)
+            ),
+            roundabout=around.get(ident, ""),
+        )
         for ident, lanelet in lanelets.items()
         if _type(lanelet.element) != CROSSWALK
     ]
@@ -210,6 +216,17 @@ def _lanelets(document: OsmDocument) -> dict[str, _Lanelet]:
         what = "expected one way to the left and one to the right, each with a length: left out"
         document.warnings.append(about_lanes(broken, what))
     return found
+
+
+def _around(document: OsmDocument) -> dict[str, str]:
+    """Lanelets of roundabouts → the regulatory element of Autoware in which they are ``internal``."""
+    return {
+        lanelet: ident[:MAX_NAME]
+        for ident, element in document.relations.items()
+        if element.tags.get("type") == "regulatory_element"
+        and element.tags.get("subtype") == "roundabout"
+        for lanelet in element.members_of("internal", "relation")
+    }
 
 
 def _turned(left: Floats, right: Floats) -> tuple[bool, bool]:

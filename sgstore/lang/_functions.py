@@ -189,7 +189,7 @@ def _entity(function: str, argument: s.Expression, names: SymbolTable) -> str:
     found = names.bind(argument)
     takes = "an entity" if function in OF_ONE else "two entities"
     if function == LANE_DIST:
-        takes += ", lanes, roads, junctions or crosswalks"
+        takes += ", lanes, roads, junctions, roundabouts or crosswalks"
     if not isinstance(found, b.NodeValue):
         form = f"{function}(a)" if function in OF_ONE else f"{function}(a, b)"
         names.session.refuse(f"{function}() takes {takes}", argument.span, f"write {form}")

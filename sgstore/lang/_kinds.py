@@ -165,7 +165,7 @@ def on_lanes() -> frozenset[str]:
     return entity_kinds() | _ON_LANES
 
 
-_ON_LANES: Final = frozenset({"lane", "road", "junction", "crosswalk"})
+_ON_LANES: Final = frozenset({"lane", "road", "junction", "roundabout", "crosswalk"})
 
 
 def _needed(expression: Bound) -> Iterator[PairNumber]:

@@ -59,6 +59,7 @@ _SHAPE: Final[_Shape] = {
         },
         "controller": {"control": {}},
         "junction": {"connection": {"laneLink": {}}},
+        "junctionGroup": {"junctionReference": {}},
     }
 }
 _TRANSPARENT: Final = {

@@ -442,7 +442,7 @@ def flow_edges(
 
 
 def road_nodes(document: Document) -> list[MapNodes]:
-    """The roads, and the junctions, in their order."""
+    """The roads, the junctions and the roundabouts, in their order."""
     every = range(len(document["road"]))
     road = MapNodes.of(
         "road",
@@ -452,7 +452,34 @@ def road_nodes(document: Document) -> list[MapNodes]:
         junction=tuple(junction_of(document, row) for row in every),
     )
     names = document["junction"].texts("id")
-    return [road, MapNodes.of("junction", names, junction=tuple(names))]
+    junction = MapNodes.of("junction", names, junction=tuple(names))
+    return [road, junction, MapNodes.of("roundabout", [*_roundabouts(document)])]
+
+
+def _roundabouts(document: Document) -> dict[str, set[str]]:
+    """Roundabouts and their junctions: groups of junctions of that type (ASAM OpenDRIVE 1.8, 12.14)."""
+    groups, members = document["junctionGroup"], document["junctionGroup/junctionReference"]
+    names, found = groups.texts("id"), dict[str, set[str]]()
+    kinds = groups.texts("type")
+    for group, junction in zip(members.parent, members.texts("junction"), strict=True):
+        if kinds[group].strip() == "roundabout":
+            found.setdefault(names[group], set()).add(junction)
+    return found
+
+
+def _in_roundabouts(document: Document) -> Iterator[tuple[int, int]]:
+    """Rows of roads and of roundabouts: those of its junctions, and those from one of these to another."""
+    ends: list[list[str]] = [[] for _ in range(len(document["road"]))]
+    for kind in ("road/predecessor", "road/successor"):
+        table = document[kind]
+        for road, link in zip(table.parent, table.attributes, strict=True):
+            if link.get("elementType") == "junction":
+                ends[road].append(link.get("elementId", ""))
+    for row, junctions in enumerate(_roundabouts(document).values()):
+        for road, at in enumerate(ends):
+            between = len(at) == 2 and junctions.issuperset(at)
+            if between or junction_of(document, road) in junctions:
+                yield road, row
 
 
 def road_types(document: Document) -> dict[str, tuple[tuple[float, str], ...]]:
@@ -473,7 +500,7 @@ def junction_types(document: Document) -> dict[str, str]:
 
 
 def containment(document: Document, road: Ints) -> list[Edge]:
-    """``isIn``: lanes in their roads, roads in their junctions. They stand in the order of their nodes.
+    """``isIn``: lanes in their roads, roads in junctions and roundabouts, in the order of their nodes.
 
     ``road``: rows of the roads of all lanes.
     """
@@ -488,10 +515,12 @@ def containment(document: Document, road: Ints) -> list[Edge]:
         if (name := junction_of(document, row)) in junctions
     ]
     roads, within = np.array(pairs, np.int64).reshape(-1, 2).T
+    round_roads, around = np.array([*_in_roundabouts(document)], np.int64).reshape(-1, 2).T
     every = np.arange(len(road))
     return [
         ("isIn", FIRST_LANE + every, first_road + road),
         ("isIn", first_road + roads, first_junction + within),
+        ("isIn", first_road + round_roads, first_junction + len(document["junction"]) + around),
     ]
 
 

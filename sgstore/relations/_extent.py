@@ -263,11 +263,11 @@ class Areas:
         inside[rows, -1 - nodes] = True
         if self.heights is not None:
             self._keep_storey(road_map, self.heights, inside)
-        # Let roads be in range where one of their lanes is, and junctions where one of their roads is.
+        # Let roads be in range where one of their lanes is, and what roads are in where one of these is.
         kind, edges = road_map.nodes.kind, road_map.edges
         within = edges.relation == RELATION_CODE["isIn"]
         child, parent = -1 - edges.src[within], -1 - edges.dst[within]
-        for name in ("road", "junction"):
+        for name in ("road", "junction", "roundabout"):
             columns = np.flatnonzero(kind == KIND_CODE[name])
             inside[np.ix_(there, columns)] = False
             of = kind[parent] == KIND_CODE[name]

@@ -38,7 +38,7 @@ def _is_in(scene: BlockScene) -> Edges:
 IS_IN = Relation(
     name="isIn",
     doc="an entity in a lane (with `overlap`, `lane_offset`, `heading_error`, `is_primary`, `along`), on a"
-    " crosswalk, or `off_road`; a lane in its road, a road in its junction",
+    " crosswalk, or `off_road`; a lane in its road, a road in its junction or roundabout",
     edges=_is_in,
     needs_map=True,
     of_map=True,

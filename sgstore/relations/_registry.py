@@ -132,13 +132,17 @@ class Keeping:
             return kept
         wanted = {name.lower() for name in lane_types}
         of_type = np.array([name.lower() in wanted for name in nodes.lane_type], np.bool_)
-        lane, road, junction = (nodes.kind == KIND_CODE[k] for k in ("lane", "road", "junction"))
-        used = of_type & lane
+        larger = np.isin(
+            nodes.kind, [KIND_CODE[k] for k in ("lane", "road", "junction", "roundabout")]
+        )
+        used = of_type & (nodes.kind == KIND_CODE["lane"])
         inside = edges.relation == RELATION_CODE["isIn"]
         child, parent = -1 - edges.src[inside], -1 - edges.dst[inside]
-        for _ in range(2):  # the roads of the lanes, then the junctions of the roads
+        for _ in range(
+            2
+        ):  # the roads of the lanes, then the junctions and roundabouts of the roads
             used[parent[used[child]]] = True
-        return kept & (used | ~(lane | road | junction))
+        return kept & (used | ~larger)
 
     def names(self, computed: Iterable[Relation], *, with_map: bool) -> set[str]:
         """The relations that graphs can hold, of those that are computed and those that come with a map."""

@@ -5,7 +5,8 @@ these thousand footprints touch, which parts of the map lie around these sixty e
 because lanes overlap in junctions and storeys lie above one another.
 
 Nodes. Every part of a map that can be a node of a scene graph has a node id below zero: ``off_road`` is
--1, then come lanes, roads, junctions, crosswalks, signals and objects, in this order. ``nodes`` lists them all.
+-1, then come lanes, roads, junctions, roundabouts, crosswalks, signals and objects, in this order. ``nodes``
+lists them all.
 """
 
 import lazy_loader

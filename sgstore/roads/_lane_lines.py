@@ -116,6 +116,8 @@ class LaneLine:
         ``None``: it lies in a junction that has no name.
     speed_limit : float
         m/s; NaN where there is none.
+    roundabout : str
+        The one that it is in; empty: none.
     """
 
     ident: str
@@ -136,6 +138,7 @@ class LaneLine:
     number: int = 0
     junction: str | None = ""
     speed_limit: float = np.nan
+    roundabout: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,6 +235,7 @@ def plain_lanes(
                 against=tuple(sorted(against)),
                 changes=tuple(_changes(network, row, beside[row], against)),
                 speed_limit=line.speed_limit,
+                roundabout=line.roundabout,
             )
         )
     return lanes, network.warnings

@@ -55,7 +55,7 @@ OF_LANES: Final = " (lanes)"
 DIGITS: Final = 4
 """Digits that are kept of a length in metres."""
 
-_NAMES: Final = ("name", "type", "road", "junction")
+_NAMES: Final = ("name", "type", "road", "junction", "roundabout")
 _POSE: Final = ("x", "y", "z", "heading")
 _RELATED: Final = ("onto", "left_beside", "right_beside", "against")
 
@@ -213,6 +213,7 @@ class _TextRow:
             against=self._related("against"),
             changes=self._stretches("changes", 3),
             speed_limit=self._speed(),
+            roundabout=self._text("roundabout"),
         )
 
     def signal(self) -> PlainSignal:

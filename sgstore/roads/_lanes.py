@@ -55,6 +55,8 @@ class PlainLane:
         Lanes that traffic may change to, from where to where along this one; m.
     speed_limit : float
         m/s; NaN where there is none.
+    roundabout : str
+        The one that its road is in; empty: none.
     """
 
     name: str
@@ -72,6 +74,7 @@ class PlainLane:
     against: tuple[int, ...] = ()
     changes: tuple[tuple[int, float, float], ...] = ()
     speed_limit: float = np.nan
+    roundabout: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +169,8 @@ def road_map_of(
     surfaces = plain_nodes(lanes, ribbons)
     roads, junctions = _road_nodes(lanes, ribbons), _junction_nodes(lanes)
     off_road = MapNodes.of("off_road", ["off_road"])
-    before = [off_road, surfaces, roads, junctions, _crosswalk_nodes(crosswalks)]
+    larger = [junctions, _roundabout_nodes(lanes)]
+    before = [off_road, surfaces, roads, *larger, _crosswalk_nodes(crosswalks)]
     nodes = chained([*before, _signal_nodes(signals), _object_nodes(objects)])
     first = sum(map(len, before))
     shapes = np.full(len(nodes), None, object)
@@ -178,7 +182,7 @@ def road_map_of(
         name=name,
         text=text,
         nodes=nodes,
-        edges=_edges(lanes, ribbons, roads, junctions, signals, first),
+        edges=_edges(lanes, ribbons, roads, larger, signals, first),
         ribbons=ribbons,
         shapes=shapes,
         lane_changes=_lane_changes(lanes),
@@ -306,6 +310,12 @@ def _junction_nodes(lanes: Sequence[PlainLane]) -> MapNodes:
     return MapNodes.of("junction", names, junction=names)
 
 
+def _roundabout_nodes(lanes: Sequence[PlainLane]) -> MapNodes:
+    return MapNodes.of(
+        "roundabout", tuple(dict.fromkeys(lane.roundabout for lane in lanes if lane.roundabout))
+    )
+
+
 def _crosswalk_nodes(crosswalks: Sequence[PlainCrosswalk]) -> MapNodes:
     middles = np.array([one.outline.mean(axis=0) for one in crosswalks]).reshape(-1, 2)
     z = np.array([one.z for one in crosswalks], np.float64)
@@ -346,16 +356,20 @@ def _edges(
     lanes: Sequence[PlainLane],
     ribbons: Ribbons,
     roads: MapNodes,
-    junctions: MapNodes,
+    larger: Sequence[MapNodes],
     signals: Sequence[PlainSignal],
     first_signal: int,
 ) -> MapEdges:
     first_road = _FIRST_LANE + len(lanes)
-    first_junction = first_road + len(roads)
     road = {name: first_road + row for row, name in enumerate(roads.name)}
-    junction = {name: first_junction + row for row, name in enumerate(junctions.name)}
+    first = first_road + len(roads)
+    junction, roundabout = (
+        {name: begin + row for row, name in enumerate(nodes.name)}
+        for nodes, begin in zip(larger, (first, first + len(larger[0])), strict=True)
+    )
     within = [(_FIRST_LANE + row, road[lane.road]) for row, lane in enumerate(lanes)]
     within += [(road[r], junction[j]) for r, j in zip(roads.name, roads.junction, strict=True) if j]
+    within += {(road[lane.road], roundabout[lane.roundabout]) for lane in lanes if lane.roundabout}
     flow = _spread([lane.onto for lane in lanes])
     crossing = [row for row, lane in enumerate(lanes) if lane.junction and lane.type in DRIVING]
     one, other = conflicts(

@@ -104,8 +104,8 @@ def turn_words(turn: Floats) -> list[str]:
 # because lanes overlap in junctions and storeys lie above one another.
 #
 # Nodes. Every part of a map that can be a node of a scene graph has a node id below zero: ``off_road`` is
-# -1, then come lanes, roads, junctions, crosswalks, signals and objects, in this order. ``nodes`` lists them
-# all.
+# -1, then come lanes, roads, junctions, roundabouts, crosswalks, signals and objects, in this order. ``nodes``
+# lists them all.
 
 OFF_ROAD: Final = -1
 """Node id of the single node that stands for whatever is not a driving lane."""
@@ -301,8 +301,9 @@ class RoadMap:
         SHA-256 of the text and the variant, in hexadecimal digits: what identifies the map.
     nodes : MapNodes
     edges : MapEdges
-        Static relations: ``isIn`` (lane → road, road → junction), ``travelsTo``, ``opposes``, ``toLeftOf``,
-        ``toRightOf``, ``laneChange``, ``conflictsWith`` among lanes, ``controlsTrafficOf`` (signal → lane).
+        Static relations: ``isIn`` (lane → road, road → junction or roundabout), ``travelsTo``, ``opposes``,
+        ``toLeftOf``, ``toRightOf``, ``laneChange``, ``conflictsWith`` among lanes, ``controlsTrafficOf``
+        (signal → lane).
     ribbons : Ribbons
         The surface of the lanes. Lane i of it, and wherever lanes are counted from 0, has node id -2 - i.
     lane_changes : LaneChanges
@@ -574,7 +575,7 @@ class RoadMap:
 
     @cached_property
     def places(self) -> MapPlaces:
-        """Places of junctions, crosswalks and signals along the lanes.
+        """Places of junctions, roundabouts, crosswalks and signals along the lanes.
 
         Of a map without sections there is none, as of :attr:`reach`.
         """
@@ -590,6 +591,7 @@ class RoadMap:
         names = {"lane": list(columns["lane"]), "road": nodes.road[lanes]}
         names["junction"] = nodes.junction[lanes]
         wholes = [made_of_lanes(self.ribbons, of, names[of], columns[of]) for of in columns]
+        wholes.append(self._on_roundabouts())
         for column in self._stop_lines.tolist():
             what[column] = STOP_LINE
         crosswalks, _ = self._crosswalks
@@ -599,6 +601,23 @@ class RoadMap:
         signals = of_signals(self.ribbons, names["junction"], what, applies, self._stops)
         return together(
             [*wholes, on_crosswalks(self.ribbons, crosswalks, shapes, z, STOREY), signals]
+        )
+
+    def _on_roundabouts(self) -> MapPlaces:
+        """Roundabouts on the lanes of their roads, all along."""
+        (lane, road), (part, whole) = self._containment
+        around = np.flatnonzero(self.nodes.kind[whole] == KIND_CODE["roundabout"])
+        of_road: dict[int, list[int]] = {}
+        for at, one in zip(part[around].tolist(), whole[around].tolist(), strict=True):
+            of_road.setdefault(at, []).append(one)
+        pairs = [
+            (one, row - 1)
+            for row, at in zip(lane.tolist(), road.tolist(), strict=True)
+            for one in of_road.get(at, ())
+        ]
+        of, lanes = np.array(pairs, np.int64).reshape(-1, 2).T
+        return MapPlaces.of(
+            of, ["roundabout"] * len(of), lanes, np.zeros(len(of)), self.ribbons.lengths[lanes]
         )
 
     @cached_property
@@ -628,7 +647,7 @@ class RoadMap:
 
     @cached_property
     def _containment(self) -> tuple[tuple[Ints, Ints], ...]:
-        """Columns of what is in something, and of what it is in: lanes in roads, then roads in junctions."""
+        """Columns of what is in something, and of what it is in: lanes in roads, then roads in others."""
         inside = self.edges.relation == RELATION_CODE["isIn"]
         child, parent = -1 - self.edges.src[inside], -1 - self.edges.dst[inside]
         lane = self.nodes.kind[child] == KIND_CODE["lane"]
