@@ -540,7 +540,8 @@ def _first_phase(
     join.texts |= {leaf: f"{PATTERN}.{quoted(column_of(leaf))}" for leaf in told}
     kinds = frozenset(told.values())
     text = masks(sql, scope, parts, given, nodes, ties, kinds)
-    if blocks or scope is sql.query.scope:
+    # How many rows several edges or a block give, the database cannot tell before it has them.
+    if blocks or (scope is sql.query.scope and (len(scope.edges) > 1 or parts.blocks)):
         given = SharedRelation(sql.share(text, "pattern"), nodes, ties)
         text = Select(["*"], [quoted(given.name)]).text()
     leader = _leader(sql, scope, parts, nodes, needed)
