@@ -266,7 +266,10 @@ def as_verdict(values: list[Any]) -> Verdict:
         trace,
         word,
         tuple(Interval(*one) for one in violations),
-        tuple(Witness(*of, tuple(Interval(*one) for one in some)) for *of, some in witnesses),
+        tuple(
+            Witness(nodes, names, holds, tuple(Interval(*one) for one in some))
+            for nodes, names, holds, some in witnesses
+        ),
         None if status is None else np.array(status, np.int8),
         reason,
         None if margin is None else Robustness(*margin),

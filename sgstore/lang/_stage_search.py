@@ -270,5 +270,5 @@ def _value(of: b.Bound, *, injective: bool) -> Evaluate:
 
 def _absent(row: Binding, nodes: Iterable[str], edges: Iterable[str]) -> bool:
     """Tell whether some of these nodes and edges are bound to nothing."""
-    bound: Mapping[str, object] = {**row.nodes, **row.edges}
-    return any(bound[key] is None for key in (*nodes, *edges))
+    bound = {**row.nodes, **row.edges}
+    return any(bound.get(key) is None for key in (*nodes, *edges))
