@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -442,3 +445,17 @@ def test_from_the_command_line(
     assert run(["select", here, "-o", str(tmp_path / "t.txt")]) == 2
     assert run(["select", here, "--stratify", "trace.name"]) == 2
     assert not np.any([path.suffix == ".txt" for path in tmp_path.iterdir()])
+
+
+@pytest.mark.parametrize("verb", ["select", "prioritize"])
+def test_a_lock_is_there_though_nobody_reads_the_rows(
+    store: Store, tmp_path: Path, verb: str
+) -> None:
+    lock = tmp_path / "first.lock"
+    command = [sys.executable, "-m", "sgstore", verb, store.file.path, "--unit", "frame"]
+    reader, writer = os.pipe()
+    os.close(reader)
+    subprocess.run([*command, "-o", lock], stdout=writer, stderr=subprocess.PIPE, check=False)
+    os.close(writer)
+
+    assert len(read_lock(lock).cases) == FRAMES

@@ -651,13 +651,14 @@ def select(
     parts = split_up(found, shares) if shares else {}
     for text in found.said:
         say(text)
+    if output is not None:
+        asked = query or "", parameters_of(parameters)
+        _lock(found, asked, parts, output, payloads=not no_payloads)
+    # Last: who reads only the first rows has the lock all the same.
     if curve or picture is not None:
         _curve(found, picture, out, printed=curve)
     else:
         out.report(split_table(found, parts, shares) if shares else listed(found))
-    if output is not None:
-        asked = query or "", parameters_of(parameters)
-        _lock(found, asked, parts, output, payloads=not no_payloads)
 
 
 def chosen_frames(
