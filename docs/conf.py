@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +33,14 @@ html_show_sphinx = False
 html_copy_source = False
 html_static_path = ["site.css"]
 html_css_files = ["site.css"]
+
+_project = tomllib.loads(Path(__file__).parents[1].joinpath("pyproject.toml").read_text("utf-8"))
+if _source := _project["project"]["urls"].get("Source"):  # the one place that tells the address
+    html_theme_options = {
+        "source_repository": _source,
+        "source_branch": "main",
+        "source_directory": "",
+    }
 
 CONTENTS = {
     "Begin": (

@@ -56,6 +56,8 @@ def test_the_wheel_holds_what_the_checkout_holds(tmp_path: Path) -> None:
     # An index shows the description where nothing lies beside it.
     assert "sgstore demo" in metadata
     assert not re.search(r"\]\((?!https?://)", metadata)
+    told = dict(re.findall(r"^Project-URL: (.+), (.+)$", metadata, re.MULTILINE))
+    assert told == packages.project()["urls"]
 
 
 def test_a_source_distribution_can_run_its_tests(tmp_path: Path) -> None:
