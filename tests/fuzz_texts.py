@@ -232,6 +232,9 @@ def make_query(draw: random.Random, path: Path) -> None:
     text = draw.choice(_queries())
     if draw.random() < 0.2:  # two halves of different ones
         text = text[: len(text) // 2] + draw.choice(_queries())[-len(text) // 2 :]
+    elif draw.random() < 0.1:  # whole: most of those that are hurt are no queries any more
+        write(path, text)
+        return
     write(path, hurt_text(text, draw))
 
 

@@ -281,7 +281,9 @@ def test_a_folder_gives_its_scenarios_and_no_other_xml(made: Path) -> None:
 
     assert recordings([made.parent]) == [made]
     made.unlink()
-    with pytest.raises(StoreError, match=r"no recording \(\.mcap, \.osi, \.osi\.zst, \.xml\)"):
+    with pytest.raises(
+        StoreError, match=r"no recording \(\.mcap, \.osi, \.osi\.zst, \.xml, \.xml\.gz\)"
+    ):
         recordings([made.parent])
 
 

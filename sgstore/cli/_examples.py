@@ -165,6 +165,10 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
         "select drives.sgstore --minimal --unit clip -o tests.lock  # few clips that keep all classes",
         "select drives.sgstore --rarest --budget 10min --unit clip  # ten minutes of the rarest",
     ),
+    "criticality": (
+        "criticality drives.sgstore -m pet -m tet  # measures of what was recorded, a row a pair",
+        "criticality drives.sgstore -m pet --most 1.5 -o close.csv  # as a table: who came close",
+    ),
     "prioritize": (
         "prioritize drives.sgstore --unit clip -o order.lock  # the most critical first",
         "prioritize drives.sgstore --outcomes runs.csv --picture found.png  # how soon failures come",

@@ -34,7 +34,10 @@ if TYPE_CHECKING:
     from sgstore.roads import RoadMap
 
 
-ENDINGS: Final = (".mcap", *_OSI_ENDINGS, *_SCENARIO_ENDINGS, *_SUMO_ENDINGS)
+ENDINGS: Final = (
+    *(".mcap", *_OSI_ENDINGS),
+    *dict.fromkeys((*_SCENARIO_ENDINGS, *_SUMO_ENDINGS)),  # both have XML
+)
 """How the names of recordings end, where a folder is searched for them; see :func:`is_recording`."""
 
 
