@@ -237,7 +237,9 @@ def test_entities_are_left_out_of_a_store_through_ingest(tmp_path: Path) -> None
 
     assert first.error is None
     assert second.error is None
-    there = f"SELECT count(*) FROM nodes JOIN entities USING (node_id) WHERE ident = '{ident}'"
+    there = (
+        f"SELECT count(*) FROM nodes JOIN entities USING (node_id) WHERE nodes.ident = '{ident}'"
+    )
     assert Store(tmp_path / "s.db").sql(there).values == [(0,)]
 
 

@@ -74,7 +74,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
 
 
 def test_what_is_absent_is_null_in_every_form(store: Store, tmp_path: Path) -> None:
-    text = "MATCH (e:Ego) OPTIONAL MATCH (v:Car) WHERE v.x - e.x > 20"
+    text = "MATCH (e:Ego) OPTIONAL MATCH (v:Car) WHERE v.x - e.x > 30"
     matches = store.find(text)
 
     assert matches.count() == len(matches.rows()) == 20

@@ -651,6 +651,7 @@ def select(
     parts = split_up(found, shares) if shares else {}
     for text in found.said:
         say(text)
+    table = split_table(found, parts, shares) if shares else listed(found)
     if output is not None:
         asked = query or "", parameters_of(parameters)
         _lock(found, asked, parts, output, payloads=not no_payloads)
@@ -658,7 +659,7 @@ def select(
     if curve or picture is not None:
         _curve(found, picture, out, printed=curve)
     else:
-        out.report(split_table(found, parts, shares) if shares else listed(found))
+        out.report(table)
 
 
 def chosen_frames(

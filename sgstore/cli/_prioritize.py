@@ -207,6 +207,7 @@ def prioritize(
         say(text)
     if known is not None:
         _fault_detection(found, known, given.picture)
+    table = found.table()
     if output is not None:
         values = parameters_of(parameters)
         with count_bar(output.name, "cases") as progress:
@@ -218,7 +219,7 @@ def prioritize(
                 progress=progress,
             )
         say_made(made, output)
-    out.report(found.table())  # last: who reads only the first rows of it has the lock all the same
+    out.report(table)  # last: who reads only the first rows of it has the lock all the same
 
 
 def _fault_detection(order: Prioritized, known: dict[str, bool], picture: Path | None) -> None:
