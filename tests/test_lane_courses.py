@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import tracemalloc
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -355,3 +356,18 @@ def test_a_monitor_tells_what_a_store_answers(
 
     assert told == sorted((row.sharpest, row.slope or 0) for row in rows)
     assert rows
+
+
+def test_a_lane_of_any_length_takes_little_memory() -> None:
+    right = np.array([[(-9e5, 9e5)[i % 2], 10.0 * i] for i in range(10)])
+    left = right + np.array([0.0, 3.5])
+    lane = PlainLane("far", "driving", "1", "", 0, 1, left, right, np.zeros(10))
+    text = lane_text([lane])
+
+    tracemalloc.start()
+    road_map = read_lane_text(text, "far")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+
+    assert told(road_map, 0, 5e5)[0] == 0
+    assert peak < 50_000_000

@@ -1,9 +1,10 @@
 """How lanes run: their curvature and slope, metre by metre.
 
-A lane is cut into equal stretches of about :data:`STRETCH`, one at least. Its curvature on a stretch is by how
-much its centre line turns from one end of it to the other, over the length; its slope is by how much it rises,
-over the length as seen from above. So neither depends on how densely a file has its points, and a fault of a
-file at one point (a piece of a road that does not go on quite as the one before ended) stays small.
+A lane is cut into equal stretches of about :data:`STRETCH`, one at least and 10,000 at most. Its curvature on
+a stretch is by how much its centre line turns from one end of it to the other, over the length; its slope is
+by how much it rises, over the length as seen from above. So neither depends on how densely a file has its
+points, and a fault of a file at one point (a piece of a road that does not go on quite as the one before
+ended) stays small.
 """
 
 from __future__ import annotations
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
 
 STRETCH: Final = 1.0
 """About how long a stretch is over which curvature and slope are means; m."""
+_MOST: Final = 10_000
+"""Stretches of a lane: of one that is longer than 10 km, they are longer, too."""
+_MOST_IN_ALL: Final = 1 << 20
+"""About so many stretches of all lanes together: a map of strangers may be of any size."""
 _DIGITS: Final = 7
 """Digits that are kept of both, so that stretches of a straight line or an arc are one."""
 
@@ -78,7 +83,9 @@ def lane_courses(ribbons: Ribbons, heights: Heights | None) -> LaneCourses:
         Lanes, and places along them, m → heights there, m. ``None``: nothing is known of any.
     """
     lengths = ribbons.lengths
-    counts = np.where(lengths > 0, np.maximum(np.rint(lengths / STRETCH), 1), 0).astype(np.int64)
+    wanted = np.clip(np.rint(lengths / STRETCH), 1, _MOST)
+    wanted = np.maximum(wanted // max(wanted.sum() / _MOST_IN_ALL, 1), 1)
+    counts = np.where(lengths > 0, wanted, 0).astype(np.int64)
     lane = np.repeat(np.arange(len(ribbons)), counts)
     number = np.arange(len(lane)) - (np.cumsum(counts) - counts)[lane]
     step = lengths[lane] / counts[lane]
