@@ -404,7 +404,8 @@ def _combined(
         most = sum(prod(len(s.domain) for s in some) for some in combinations(slots, k))
     if most > MOST:
         raise ConfigError(
-            f"{specification.name}: {most:,} combinations; {MOST:,} can be gone through"
+            f"{specification.name}: {most:,} combinations; {MOST:,} can be gone through:"
+            " combine fewer slots, as pairs: 'sgstore coverage combos --k 2'"
         )
     there = held.values(specification)
     for some in combinations(slots, k):
