@@ -18,12 +18,12 @@ from functools import cache, lru_cache
 from importlib import import_module
 from tempfile import TemporaryFile
 from typing import IO, TYPE_CHECKING, Any, Final
+from zlib import crc32
 
 from sgstore.errors import MissingExtraError, TraceError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator
-    from datetime import datetime
     from pathlib import Path
 
 TRIES: Final = 4
@@ -147,8 +147,15 @@ def _told(url: str) -> Generator[None]:
         raise TraceError(reason, path=url) from error
 
 
-def _nanoseconds(time: datetime) -> int:
-    return int(time.timestamp()) * 1_000_000_000 + time.microsecond * 1000
+def _mark(about: Any) -> tuple[int, int]:
+    """Size and time of change of an object; bytes, ns.
+
+    Object stores tell the second. What was written within it is told apart by its tag, which stands where the
+    nanoseconds would.
+    """
+    changed, tag = about["last_modified"], about["e_tag"]
+    within = crc32(tag.encode()) % 1_000_000_000 if tag else changed.microsecond * 1000
+    return about["size"], int(changed.timestamp()) * 1_000_000_000 + within
 
 
 def mark_of_url(url: str) -> tuple[int, int]:
@@ -167,8 +174,7 @@ def mark_of_url(url: str) -> tuple[int, int]:
         return status.st_size, status.st_mtime_ns
     with _told(url):
         store, name = _at(url)
-        about = object_stores().head(store, name)
-        return about["size"], _nanoseconds(about["last_modified"])
+        return _mark(object_stores().head(store, name))
 
 
 def names_below(url: str) -> Iterator[str]:
@@ -224,7 +230,7 @@ class RemoteFile(io.RawIOBase):
         self._tag = about["e_tag"]
         self._whole: IO[bytes] | None = None
         self._position = 0
-        self.mark = about["size"], _nanoseconds(about["last_modified"])
+        self.mark = _mark(about)
 
     def readable(self) -> bool:
         """Return True."""
