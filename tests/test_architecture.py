@@ -10,9 +10,9 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import networkx
 import pytest
 from check import TESTS, WHOLE, patterns_of
+from house import survey
 from slow import SECONDS
 
 from sgstore.errors import MissingExtraError
@@ -202,31 +202,11 @@ def _is_there(package: object, name: str) -> bool:
 
 
 def test_files_import_one_another_in_one_direction() -> None:
-    graph = networkx.DiGraph()
-    modules = {f"sgstore.{name_of(path).replace('/', '.')}" for path in FILES}
-    for path in FILES:
-        name = f"sgstore.{name_of(path).replace('/', '.')}"
-        for node in nodes_of(path):
-            if isinstance(node, ast.ImportFrom) and node.module:
-                targets = {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
-                graph.add_edges_from((name, target) for target in targets & modules - {name})
-    tied = [
-        {name.removeprefix("sgstore.") for name in circle}
-        for circle in networkx.strongly_connected_components(graph)
-        if len(circle) > 1
-    ]
-
-    assert tied == []
+    assert survey().circles() == []
 
 
 def test_no_two_classes_have_one_name() -> None:
-    homes: dict[str, list[str]] = {}
-    for path in FILES:
-        for node in nodes_of(path):
-            if isinstance(node, ast.ClassDef):
-                homes.setdefault(node.name, []).append(name_of(path))
-
-    assert {name: files for name, files in homes.items() if len(files) > 1} == {}
+    assert survey().twice() == {}
 
 
 def test_every_file_has_a_room_in_the_plan() -> None:

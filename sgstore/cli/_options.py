@@ -16,7 +16,7 @@ import typer
 from typer import Argument, Option
 from typer.core import TyperCommand, TyperGroup
 
-from sgstore.cli import _completion as completion
+import sgstore.cli._completion as completion
 from sgstore.cli._completion import STORE
 from sgstore.cli._output import LONG_TABLE, Format, say, talk, write_rows
 from sgstore.cli._process import set_deadline
