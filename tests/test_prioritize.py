@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 import sys
 from collections import defaultdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,8 +32,6 @@ from sgstore.selection import (
 from sgstore.selection._learn import features_of, fitted
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from sgstore.query import Store
 
 OTHERS = """src_is_ego AND dst_kind NOT IN ('traffic_light', 'stop_sign', 'yield_sign', 'speed_limit', 'sign',
@@ -155,6 +155,20 @@ def test_risk_and_diversity_together_lie_between_the_two(some: ChosenFrames) -> 
 
     assert classes(Priority.risk) <= classes(Priority.both) <= classes(Priority.diverse)
     assert risk(Priority.diverse) <= risk(Priority.both) <= risk(Priority.risk)
+
+
+def test_the_measures_of_an_order_are_those_that_the_help_and_the_page_name(
+    some: ChosenFrames, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["prioritize", "--help"]) == 0
+    page = (Path(__file__).parents[1] / "docs" / "selection.md").read_text(encoding="utf-8")
+    listed = re.search(r"The measures are `(\w+)`.*\n.* and `(\w+)`", page)
+    assert listed is not None
+
+    names = tuple(one.name for one in prioritize(some, PrioritySpec()).worst)
+
+    assert f"[default: ({', '.join(names)})]" in re.sub(r"[\s│]+", " ", capsys.readouterr().out)
+    assert listed.groups() == names
 
 
 def test_a_budget_ends_the_order(some: ChosenFrames) -> None:

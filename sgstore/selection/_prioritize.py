@@ -48,8 +48,8 @@ if TYPE_CHECKING:
     from sgstore.selection._units import Units
     from sgstore.world import Bools, Floats, Ints
 
-MEASURES: Final = ("closing_time", "dce_3s")
-"""Measures of risk by default: what happens at the closing speed, and at constant velocity."""
+MEASURES: Final = ("closing_time", "ttc_mild")
+"""Measures of risk by default: what happens at the closing speed, and by mild manoeuvres of both."""
 
 RANKED: Final = {name: one for name, one in PAIR_FUNCTIONS.items() if one.sql and one.worse}
 """Measures by which cases can be ranked, of pairs in a frame."""
