@@ -214,7 +214,7 @@ class SceneGraphGenerator:
     def _world(self, frames: FrameBlock, keys: Ints) -> _World:
         bodies = self._bodies(frames, keys)
         if len(frames) > 1:  # nobody who waits for a frame is to wait for a compiler
-            compiled.count(len(bodies))
+            compiled.count(int((np.bincount(bodies.frame) ** 2).sum()))
         rows = keys, len(frames.states), len(self._scenery)
         standing = None
         if self._survey is not None:
