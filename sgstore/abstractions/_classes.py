@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections import Counter, OrderedDict, defaultdict
 from dataclasses import dataclass, field
+from functools import lru_cache
 from hashlib import blake2b
 from typing import TYPE_CHECKING, Any, Final
 
@@ -237,8 +238,8 @@ Words = NDArray[np.uint64]
 WORK: Final = 5_000_000
 """Edges that may be looked at to put one graph in order: some seconds."""
 
-REMEMBERED: Final = 4096
-"""Graphs of an abstraction whose classes are remembered, so that one that comes again costs nothing."""
+REMEMBERED: Final = 8192
+"""Graphs whose classes are remembered, so that one that comes again costs nothing."""
 
 _A: Final = np.uint64(0x9E3779B97F4A7C15)
 _B: Final = np.uint64(0xBF58476D1CE4E5B9)
@@ -262,7 +263,7 @@ def classes_of(graphs: Labelled, work: int = WORK) -> list[str]:
 
 
 class Classes:
-    """Classes of the graphs of one abstraction, which remembers the last ones.
+    """Classes of graphs, which remembers the last ones.
 
     Parameters
     ----------
@@ -274,9 +275,9 @@ class Classes:
         self._work = work
         self._known: OrderedDict[bytes, str] = OrderedDict()
 
-    def of(self, graphs: Labelled) -> list[str]:
-        """As :func:`classes_of`."""
-        block = _Block.of(graphs)
+    def of(self, *graphs: Labelled) -> list[str]:
+        """As :func:`classes_of`, of one after another: together they take as many steps as one."""
+        block = _Block.beside([_Block.of(one) for one in graphs])
         contents = block.contents()
         fresh = {content: i for i, content in enumerate(contents) if content not in self._known}
         rows = sorted(fresh.values())
@@ -303,30 +304,31 @@ def contents_of(seen: GraphColumns) -> list[bytes]:
     own = seen.kind.astype(np.int64) * 2 + seen.is_ego
     rows = np.flatnonzero(_TOLD[seen.relation])
     sums = np.zeros((4, seen.frames), np.uint64)
-    _told(sums[:2], seen.node_frame, seen.node, own, np.zeros(1, np.int64))
-    _told(sums[:2], lanes.frame, lanes.strand, lanes.role, np.ones(1, np.int64))
-    _told(sums[:2], np.arange(seen.frames), seen.ego_lane, np.full(1, 2), np.ones(1, np.int64))
-    _told(sums[2:], seen.frame[rows], seen.src[rows], seen.relation[rows], seen.dst[rows])
+    _told(sums[:2], 0, seen.node_frame, seen.node, own)
+    _told(sums[:2], 1, lanes.frame, lanes.strand, lanes.role)
+    _told(sums[:2], 2, np.arange(seen.frames), seen.ego_lane)
+    _told(sums[2:], 3, *(of[rows] for of in (seen.frame, seen.src, seen.dst, seen.relation)))
     return [row.tobytes() for row in np.ascontiguousarray(sums.T)]
 
 
-def _told(sums: Words, frame: Ints, *columns: NDArray[Any]) -> None:
-    """Add two words for each row to the sums of its frame."""
+def _told(sums: Words, sort: int, frame: Ints, *columns: NDArray[Any]) -> None:
+    """Add two words for each row, of a sort of rows, to the sums of its frame."""
     if not len(frame):
         return
-    words = np.zeros(1, np.uint64)
-    for column, factor in zip(columns, (_A, _B, _C), strict=True):
-        words = words + column.astype(np.int64, copy=False).view(np.uint64) * factor
-    first = _mixed(words)
+    words = np.full(len(frame), sort, np.uint64)
+    for column, factor in zip(columns, (_A, _B, _C), strict=False):
+        words += column.astype(np.int64, copy=False).view(np.uint64) * factor
+    told = _mixed(words)
     starts = np.flatnonzero(np.append(True, frame[1:] != frame[:-1]))
-    for total, values in zip(sums, (first, _mixed(first * _D + words)), strict=True):
+    for total, values in zip(sums, (told, _mixed(told * _D + words)), strict=True):
         np.add.at(total, frame[starts], np.add.reduceat(values, starts))
 
 
 @dataclass(frozen=True)
 class _Block:
-    """Graphs side by side: nodes in order of their graph, edges too.
+    """Graphs side by side: nodes in order of their graph, edges in order of their ends.
 
+    Parallel edges are one: the words of its label are the sums of theirs, which tell any two apart.
     ``low`` and ``high`` are the two words of the digests of labels.
     """
 
@@ -345,25 +347,51 @@ class _Block:
     def of(cls, graphs: Labelled) -> _Block:
         words = _digests(graphs.labels)
         on_edges = _on_edges(words, graphs.bundles)
-        src = found(graphs.node_frame, graphs.node, graphs.frame, graphs.src)
-        dst = found(graphs.node_frame, graphs.node, graphs.frame, graphs.dst)
-        if len(src) and min(int(src.min()), int(dst.min())) < 0:
+        ends = np.concatenate([graphs.src, graphs.dst])
+        rows = found(graphs.node_frame, graphs.node, np.tile(graphs.frame, 2), ends)
+        if rows.min(initial=0) < 0:
             raise ValueError("an edge of an abstraction ends at what is no node of its frame")
-        order = np.argsort(_narrow(graphs.frame, graphs.frames), kind="stable")
-        label = on_edges[graphs.label[order]]
-        of_node = words[graphs.node_label]
+        src, dst = rows.reshape(2, -1)
+        key = src * len(graphs.node) + dst
+        order = np.argsort(key, kind="stable")  # most edges ascend: that is soon sorted
+        first = np.flatnonzero(np.append(True, key[order[1:]] != key[order[:-1]])[: len(key)])
+        label, alone = on_edges[graphs.label[order]], order[first]
+        low, high = label.T.copy() if len(first) == len(key) else np.add.reduceat(label, first).T
+        of_node = words[graphs.node_label].T.copy()
         return cls(
             graphs.frames,
             graphs.node_frame,
             graphs.node,
-            of_node[:, 0].copy(),
-            of_node[:, 1].copy(),
-            graphs.frame[order],
-            src[order],
-            dst[order],
-            label[:, 0].copy(),
-            label[:, 1].copy(),
+            *of_node,
+            graphs.frame[alone],
+            src[alone],
+            dst[alone],
+            low,
+            high,
         )
+
+    @classmethod
+    def beside(cls, blocks: Sequence[_Block]) -> _Block:
+        """Several blocks as one."""
+        if len(blocks) == 1:
+            return blocks[0]
+        graphs = np.cumsum([0, *(block.graphs for block in blocks)])
+        nodes = np.cumsum([0, *(len(block.node) for block in blocks)])
+        columns = [
+            (
+                b.graph + g,
+                b.node,
+                b.node_low,
+                b.node_high,
+                b.edge_graph + g,
+                b.src + n,
+                b.dst + n,
+                b.low,
+                b.high,
+            )
+            for b, g, n in zip(blocks, graphs.tolist(), nodes.tolist(), strict=False)
+        ]
+        return cls(int(graphs[-1]), *map(np.concatenate, zip(*columns, strict=True)))
 
     def contents(self) -> list[bytes]:
         """128 bits for each graph that are equal if nodes, edges and labels are the same."""
@@ -405,39 +433,15 @@ class _Block:
             self.high[edges],
         )
 
-    def simple(self) -> _Block:
-        """Parallel edges as one: the words of its label are the sums of theirs, which tell any two apart."""
-        if not len(self.src):
-            return self
-        order = _by(self.src, self.dst, len(self.graph))
-        src, dst = self.src[order], self.dst[order]
-        starts = np.flatnonzero(np.append(True, (src[1:] != src[:-1]) | (dst[1:] != dst[:-1])))
-        first = order[starts]
-        low = np.add.reduceat(self.low[order], starts)
-        high = np.add.reduceat(self.high[order], starts)
-        return _Block(
-            self.graphs,
-            self.graph,
-            self.node,
-            self.node_low,
-            self.node_high,
-            self.edge_graph[first],
-            self.src[first],
-            self.dst[first],
-            low,
-            high,
-        )
-
     def classes(self, work: int) -> list[str]:
         """The class of each graph."""
-        block = self.simple()
-        colour = _refined(block)
-        order, known = _ordered(block, colour, work)
-        return _hashed(block, order, known)
+        order, known = _ordered(self, _refined(self), work)
+        return _hashed(self, order, known)
 
 
+@lru_cache(maxsize=64)
 def _digests(labels: tuple[str, ...]) -> NDArray[np.uint64]:
-    """(L, 2): 128 bits of each label."""
+    """(L, 2): 128 bits of each label; not to be written to."""
     raw = b"".join(
         blake2b(label.encode("utf-8", "surrogatepass"), digest_size=16).digest() for label in labels
     )
@@ -447,14 +451,20 @@ def _digests(labels: tuple[str, ...]) -> NDArray[np.uint64]:
 def _on_edges(words: Words, bundles: tuple[tuple[int, ...], ...]) -> Words:
     """The words of labels as edges add them up: for each label, and from the end for each bundle."""
     words = _mixed(words)
-    sums = [words[list(bundle)].sum(axis=0, dtype=np.uint64) for bundle in reversed(bundles)]
-    return np.concatenate([words, np.array(sums, np.uint64).reshape(-1, 2)])
+    if not bundles:
+        return words
+    several = bundles[::-1]
+    starts = np.cumsum([0, *(len(bundle) for bundle in several[:-1])])
+    sums = np.add.reduceat(words[[label for bundle in several for label in bundle]], starts)
+    return np.concatenate([words, sums])
 
 
 def _mixed(words: Words) -> Words:
-    words = (words ^ (words >> _SHIFT)) * _B
-    words = (words ^ (words >> _SHIFT)) * _C
-    return words ^ (words >> _SHIFT)
+    words = words ^ (words >> _SHIFT)
+    for factor in (_B, _C):
+        words *= factor
+        words ^= words >> _SHIFT
+    return words
 
 
 def _narrow(values: Ints, bound: int) -> NDArray[Any]:

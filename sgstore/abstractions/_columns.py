@@ -245,7 +245,8 @@ class GraphColumns:
         node_frame, node = self.node_frame[kept], self.node[kept]
         rows = np.flatnonzero(_BETWEEN[self.relation])
         frame, bit = self.frame[rows], self.relation[rows].astype(np.int64)
-        a, b = (found(node_frame, node, frame, end[rows]) for end in (self.src, self.dst))
+        ends = np.concatenate([self.src[rows], self.dst[rows]])
+        a, b = found(node_frame, node, np.tile(frame, 2), ends).reshape(2, -1)
         both = np.flatnonzero((a >= 0) & (b >= 0))
         frame, bit, a, b = frame[both], bit[both], a[both], b[both]
         starts = np.searchsorted(node_frame, np.arange(self.frames + 1))
@@ -265,7 +266,7 @@ class GraphColumns:
         nodes = np.flatnonzero(number[self.node_frame] >= 0)
         edges = np.flatnonzero(number[self.frame] >= 0)
         of_nodes = ("node", "kind", "is_ego", "x", "y", "z", "heading")
-        return GraphColumns(
+        some = GraphColumns(
             frames=len(frames),
             node_frame=number[self.node_frame[nodes]],
             **{name: getattr(self, name)[nodes] for name in of_nodes},
@@ -274,6 +275,9 @@ class GraphColumns:
             ego_lane=self.ego_lane[frames],
             grounds=self.grounds,
         )
+        if self in _FOUND:
+            _FOUND[some] = _FOUND[self].taken(number)
+        return some
 
     def row_of(self, frame: Ints, node: Ints) -> Ints:
         """Rows of nodes in frames; -1 where they are not in the graph."""
@@ -299,10 +303,16 @@ def found(frames: Ints, nodes: Ints, frame: Ints, node: Ints) -> Ints:
     """Rows of (frame, node) in columns that name each once; -1 where there is none."""
     if not len(nodes):
         return np.full(len(node), -1)
+    low, span = int(nodes.min()), int(nodes.max()) - int(nodes.min()) + 1
+    here = int(frames.max()) + 1
+    if here * span <= _TABLE:
+        table = np.full((here + 1, span + 1), -1)  # what is beyond it lies at its edges
+        table[frames, nodes - low] = np.arange(len(nodes))
+        at = node - low
+        return table[np.minimum(frame, here), np.where((at < 0) | (at > span), span, at)]
     ids, column = np.unique(nodes, return_inverse=True)
-    place = np.full((int(frames.max()) + 1, len(ids)), -1)
+    place = np.full((here, len(ids)), -1)
     place[frames, column] = np.arange(len(nodes))
-    low, span = int(ids[0]), int(ids[-1]) - int(ids[0]) + 1
     if span <= _TABLE:
         table = np.zeros(span, np.int64)
         table[ids - low] = np.arange(len(ids))
@@ -614,6 +624,18 @@ class EgoLanes:
     inside: Part
     inside_lane: Part
     off_road: Part
+
+    def taken(self, number: Ints) -> EgoLanes:
+        """Those of some frames, by the new number of each; -1: it is left out."""
+
+        def some(frame: Ints, *columns: Ints) -> Part:
+            rows = np.flatnonzero(number[frame] >= 0)
+            return number[frame[rows]], *(column[rows] for column in columns)
+
+        lanes = some(self.frame, self.strand, self.role)
+        return EgoLanes(
+            *lanes, *(some(*of) for of in (self.inside, self.inside_lane, self.off_road))
+        )
 
 
 _FOUND: Final[WeakKeyDictionary[GraphColumns, EgoLanes]] = WeakKeyDictionary()

@@ -59,6 +59,8 @@ _TOGETHER: Final = 2000
 """Frames of traces whose classes one transaction brings in, about: with short traces it takes longest."""
 _REMEMBERED: Final = 4096
 """Frames whose classes are remembered."""
+_FEW_EDGES: Final = 1 << 16
+"""Edges of frames up to which all their abstractions are in memory at once."""
 
 
 class TraceClasses:
@@ -71,7 +73,8 @@ class TraceClasses:
     """
 
     def __init__(self, names: Sequence[str] = AT_INGEST) -> None:
-        self._of = [(abstraction_named(name), Classes()) for name in names]
+        self._of = [abstraction_named(name) for name in names]
+        self._classes = Classes()
         self._known: OrderedDict[bytes, list[str]] = OrderedDict()
 
     def columns(self, seen: GraphColumns, trace_id: int, seq: Ints) -> Columns:
@@ -94,14 +97,21 @@ class TraceClasses:
 
     def _named(self, seen: GraphColumns) -> list[tuple[str, ...]]:
         """For each abstraction the classes of the frames."""
-        return [tuple(classes.of(abstraction.function(seen))) for abstraction, classes in self._of]
+        # Not those of a crowd together, which would take the memory.
+        together = len(self._of) if len(seen.frame) < _FEW_EDGES else 1
+        named: list[str] = []
+        for first in range(0, len(self._of), together):
+            named += self._classes.of(
+                *(of.function(seen) for of in self._of[first : first + together])
+            )
+        return [tuple(named[i : i + seen.frames]) for i in range(0, len(named), seen.frames)]
 
     def _columns(self, named: Sequence[tuple[str, ...]], trace_id: int, seq: Ints) -> Columns:
         rows: list[tuple[str, str]] = []
         buckets: list[Ints] = []
         masks: list[Ints] = []
         bucket = trace_bucket(trace_id, seq)
-        for (abstraction, _), names in zip(self._of, named, strict=True):
+        for abstraction, names in zip(self._of, named, strict=True):
             number = {name: i for i, name in enumerate(dict.fromkeys(names))}
             code = np.array([number[name] for name in names], np.int64)
             first, mask = masks_of((bucket, code), seq % BUCKET_FRAMES)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -363,11 +363,12 @@ def as_summed(table: str, columns: Columns, texts: Sequence[str]) -> dict[str, N
     return found
 
 
+@lru_cache(maxsize=1 << 14)
 def _number(kind: str, text: str) -> int:
     """60 bits of the MD5 of a text, as the database writes it."""
     if kind == "UUID" and "-" not in text:
         text = "-".join((text[:8], text[8:12], text[12:16], text[16:20], text[20:]))
-    return int(hashlib.md5(text.encode(), usedforsecurity=False).hexdigest()[:15], 16)
+    return int.from_bytes(hashlib.md5(text.encode(), usedforsecurity=False).digest()[:8]) >> 4
 
 
 def _coded(enum: str, codes: NDArray[Any]) -> NDArray[Any]:

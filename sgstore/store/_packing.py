@@ -325,7 +325,8 @@ def unless(values: Whole, missing: Bools) -> Ints:
 
 def texts(values: Iterable[str]) -> NDArray[Any]:
     """Texts as the database takes them; empty where there is none."""
-    return np.array([plain(value) for value in values], object)
+    told = list(values)
+    return np.array(told if "".join(told).isascii() else [plain(value) for value in told], object)
 
 
 def plain(text: str) -> str:
