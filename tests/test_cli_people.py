@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import io
 import logging
+import os
 import shlex
+import shutil
 import subprocess
 import sys
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
+import pexpect
 import pytest
 import typer
 from verb_lines import verbs
@@ -17,9 +21,6 @@ from sgstore.cli import application, run
 from sgstore.cli._examples import EXAMPLES
 from sgstore.cli._output import Format, write_rows
 from sgstore.lang import parse
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 RULE = "CHECK slow: ALWAYS ego.speed < 14"
 FAST = "MATCH (e:Ego) WHERE e.speed > 9"
@@ -82,8 +83,8 @@ def completed(
     """What a shell is offered where a line ends; of fish the values without what they are."""
     monkeypatch.setenv("_SGSTORE_COMPLETE", f"complete_{shell}")
     if shell == "bash":
-        monkeypatch.setenv("COMP_WORDS", line)
-        monkeypatch.setenv("COMP_CWORD", str(len(line.split(" ")) - 1))
+        monkeypatch.setenv("COMP_WORDS", line.replace(" ", "\n"))
+        monkeypatch.setenv("COMP_CWORD", str(line.count(" ")))
     else:
         monkeypatch.setenv("_TYPER_COMPLETE_ARGS", line)
         monkeypatch.setenv("_TYPER_COMPLETE_FISH_ACTION", "get-args")
@@ -132,9 +133,47 @@ def test_times_end_where_the_trace_does_and_the_store_may_be_the_default(
     assert completed("sgstore info --trace to", "zsh", monkeypatch, capsys) == []
 
 
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_at_a_terminal_completes_what_is_typed(
+    shell: str, store: str, tmp_path: Path
+) -> None:
+    if not shutil.which(shell):
+        pytest.skip(f"{shell} is not installed")
+    paths = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    (tmp_path / ".zshrc").touch()  # else zsh asks what should be in it
+    home = {"HOME": str(tmp_path), "PATH": paths, "TERM": "dumb", "LANG": "C.UTF-8"}
+
+    def started() -> Any:
+        terminal = pexpect.spawn(
+            shell, ["-i"], env=home, encoding="utf-8", timeout=60, dimensions=(40, 400)
+        )
+        terminal.sendline("echo st''arted")
+        terminal.expect("started")
+        return terminal
+
+    terminal = started()
+    terminal.sendline("sgstore --install-completion")
+    terminal.expect("completion installed")
+    terminal.close(force=True)
+    terminal = started()
+    terminal.send(
+        "sgstore \t\x15"
+    )  # zsh loads what completes when it is first asked, and does no more
+
+    for typed, whole in (
+        (f"sgstore show {store} town@74", "town@74s"),
+        (f"sgstore payload {store} town@3s /ego/camera/front/im", "/ego/camera/front/image"),
+        ("sgstore find s -p jayw", "jaywalking"),
+    ):
+        terminal.send(f"{typed}\t")
+        terminal.expect(f"{whole} ")
+        terminal.send("\x15")  # away with the line
+    terminal.close(force=True)
+
+
 ASKED = """
 import os, sys
-os.environ.update(_SGSTORE_COMPLETE="complete_bash", COMP_WORDS="sgstore find s -p jay", COMP_CWORD="4")
+os.environ.update(_SGSTORE_COMPLETE="complete_bash", COMP_WORDS="sgstore\\nfind\\ns\\n-p\\njay", COMP_CWORD="4")
 from sgstore.cli import run
 try:
     run([])

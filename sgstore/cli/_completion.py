@@ -7,6 +7,7 @@ soon: what only the package knows is told without the database, which is opened 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -29,6 +30,9 @@ STORE_ENDINGS: Final = (".sgstore", ".duckdb", ".db")
 _ASKED: Final = "_SGSTORE_COMPLETE"
 """The variable by which a shell asks what could stand there."""
 
+_KEPT: Final = "_SGSTORE_KEPT"
+"""The variable that holds what bash keeps of the word that is being typed."""
+
 
 def words_before() -> list[str] | None:
     """The words of a command line that is to be completed, up to the one that is being typed; else ``None``.
@@ -37,11 +41,29 @@ def words_before() -> list[str] | None:
     """
     if not os.environ.get(_ASKED, "").startswith("complete"):
         return None
-    bash, other = os.environ.get("COMP_WORDS"), os.environ.get("_TYPER_COMPLETE_ARGS", "")
-    if bash is not None:
-        return bash.split()[1 : int(os.environ.get("COMP_CWORD", "0") or 0)]
+    os.environ[_KEPT] = ""
+    if (bash := os.environ.get("COMP_WORDS")) is not None:
+        return _words_of_bash(bash.split("\n"), int(os.environ.get("COMP_CWORD", "0") or 0))
+    other = os.environ.get("_TYPER_COMPLETE_ARGS", "")
     words = other.split()[1:]
     return words if other[-1:].isspace() else words[:-1]
+
+
+def _words_of_bash(words: list[str], at: int) -> list[str]:
+    """The words before the one at a place; what bash broke at ``@`` is one word again, for typer, too.
+
+    Bash takes ``town@7`` for three words, and replaces the last two by what is offered. So where that is being
+    typed, the word for typer is ``@7``, and ``town`` is kept.
+    """
+    typed = words[: at + 1]
+    if "@" in typed:
+        broken = "@" in typed[-2:]
+        typed = re.sub(r"\n@(\n|$)", "@", "\n".join(typed)).split("\n")
+        if broken:
+            os.environ[_KEPT], _, rest = typed[-1].rpartition("@")
+            typed[-1] = f"@{rest}"
+        os.environ.update(COMP_WORDS="\n".join(typed), COMP_CWORD=str(len(typed) - 1))
+    return typed[1:-1]
 
 
 def stores(ctx: typer.Context, incomplete: str) -> Offers:
@@ -79,9 +101,11 @@ def traces(ctx: typer.Context) -> Offers:
 
 def frames(ctx: typer.Context, incomplete: str) -> Offers:
     """Frames by trace and number, or by trace and time: one digit more than there is."""
+    kept = os.environ.get(_KEPT, "")
+    typed = f"{kept}{incomplete}"
     for one in _traces(ctx):
-        head = next((h for h in (f"{one.name}#", f"{one.name}@") if incomplete.startswith(h)), "")
-        digits = incomplete[len(head) :]
+        head = next((h for h in (f"{one.name}#", f"{one.name}@") if typed.startswith(h)), "")
+        digits = typed[len(head) :]
         if not head:
             for number in sorted({0, one.frames - 1}):
                 yield f"{one.name}#{number}", f"of {_about(one)}; or {one.name}@12.3s"
@@ -90,7 +114,8 @@ def frames(ctx: typer.Context, incomplete: str) -> Offers:
             last = (one.end_ns - one.start_ns) // 10**9 if by_time else one.frames - 1
             for number in filter(None, (digits, *(f"{digits}{digit}" for digit in range(10)))):
                 if number == str(int(number)) and int(number) <= last:
-                    yield f"{head}{number}{'s' * by_time}", f"of 0 … {last}{' s' * by_time}"
+                    shown = f"{head}{number}{'s' * by_time}"
+                    yield shown.removeprefix(kept), f"of 0 … {last}{' s' * by_time}"
 
 
 def presets() -> Offers:
