@@ -368,6 +368,10 @@ def test_ten_thousand_bundles_are_decided_in_half_a_second(place: Path) -> None:
     ):  # each bundle has other triples
         found = decided(whole, compile_query(text, whole.catalog, {}))
         assert set(found) == holding(*triples), text
+    every = compile_query("MATCH (a)-[:near|visible|opposes]->(b)-[:near]-()", whole.catalog, {})
+    assert (
+        len(decided(whole, every)) == 10_000
+    )  # all that they hold matters, and each holds other things
 
 
 def test_sql_is_asked_of_each_bundle_or_refused(whole: Collection, path: Path) -> None:

@@ -219,18 +219,21 @@ class Snapshot:
 
     def triples(self, name: str, matters: Callable[[Triple], bool]) -> dict[str, frozenset[Triple]]:
         """Bundle → its triples that matter, in a derived set or as they were ingested."""
-        known: dict[Triple, bool] = {}
-        found: dict[str, list[Triple]] = {}
-        for row in self.facts["triple"]:
-            if row[1] != name:
-                continue
-            triple = row[3:6]
-            wanted = known.get(triple)
-            if wanted is None:
-                wanted = known[triple] = matters(triple)
-            if wanted:
-                found.setdefault(row[0], []).append(triple)
-        return {bundle: frozenset(triples) for bundle, triples in found.items()}
+        if name not in self._triples:
+            held: dict[str, list[Triple]] = {}
+            known: dict[Triple, Triple] = {}  # one object for each, so that they are soon compared
+            for row in self.facts["triple"]:
+                if row[1] == name:
+                    triple = row[3:6]
+                    held.setdefault(row[0], []).append(known.setdefault(triple, triple))
+            self._triples[name] = {bundle: frozenset(some) for bundle, some in held.items()}
+        of_bundles = self._triples[name]
+        wanted = frozenset(filter(matters, frozenset().union(*of_bundles.values())))
+        return {bundle: held & wanted for bundle, held in of_bundles.items()}
+
+    @cached_property
+    def _triples(self) -> dict[str, dict[str, frozenset[Triple]]]:
+        return {}
 
     @cached_property
     def kinds(self) -> dict[str, tuple[frozenset[str], ...]]:

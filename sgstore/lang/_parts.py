@@ -34,7 +34,7 @@ from sgstore.lang._results import (
     with_bindings,
     with_owners,
 )
-from sgstore.lang._rewrite import FALSE, narrowed, possible, rewritten
+from sgstore.lang._rewrite import FALSE, kinds_left, possible, rewritten
 from sgstore.lang.ir import (
     Aggregate,
     BlockValue,
@@ -48,7 +48,6 @@ from sgstore.lang.ir import (
     Result,
     ReturnColumn,
     Sampling,
-    Scope,
     SortKey,
     TraceAttribute,
     WithStage,
@@ -73,6 +72,9 @@ LOG_TIME_COLUMN: Final = ":log_time_ns"
 _FRAME_ID: Final = FrameAttribute(FRAME_ATTRIBUTES["id"], Type.number)
 _LOG_TIME: Final = FrameAttribute(FRAME_ATTRIBUTES["logtimens"], Type.number)
 _TRACE_NAME: Final = TraceAttribute(TRACE_ATTRIBUTES["name"], Type.text)
+
+_WITNESSES: Final = 32
+"""Sets of triples and kinds that suffice for a match, which are remembered."""
 
 Terms = list[str]
 """Expressions of an ``ORDER BY``."""
@@ -217,7 +219,8 @@ class Pruning:
     Notes
     -----
     Triples that no edge of the pattern may be change nothing about it. Without them most parts look alike, and
-    what was decided for one is decided for all of these.
+    what was decided for one is decided for all of these. What is more never takes a match away, so a part that
+    has all that sufficed elsewhere is decided by one comparison.
     """
 
     def __init__(self, compiled: Compiled) -> None:
@@ -225,7 +228,8 @@ class Pruning:
         steps, ways = query.steps, query.ways if query.steps else ()
         self._ways = [tuple(steps[n].scope for n in way.happen) for way in ways]
         self._ways = self._ways or [tuple(query.required)]
-        self._known: dict[tuple[object, ...], bool] = {}
+        self._known: dict[frozenset[Any], bool] = {}
+        self._enough: list[frozenset[Any]] = []
         self._edges = [
             (edge, scope.kinds(edge.src), scope.kinds(edge.dst))
             for scopes in self._ways
@@ -248,19 +252,31 @@ class Pruning:
         kinds : sequence of frozenset
             Kinds that move, that are fixed, and those of the map.
         """
-        key = (held, *kinds)
-        if key not in self._known:
-            moving, fixed, mapped = kinds
-            edges = dict.fromkeys(held, 1)
-            catalog = Catalog(edges=edges, moving=moving, fixed=fixed, mapped=mapped)
-            self._known[key] = any(
-                all(_possible(scope, catalog) for scope in scopes) for scopes in self._ways
-            )
-        return self._known[key]
+        every = held.union(*kinds)
+        known = self._known.get(every)
+        if known is None:
+            known = any(enough <= every for enough in self._enough)
+            if not known and self._possible(every):
+                known = True
+                if len(self._enough) < _WITNESSES:
+                    self._enough.append(self._least(every))
+            self._known[every] = known
+        return known
 
+    def _possible(self, every: frozenset[Any]) -> bool:
+        """Tell whether there may be a match where such triples and kinds occur."""
+        triples = [one for one in every if isinstance(one, tuple)]
+        return any(
+            all(s.where != (FALSE,) and kinds_left(s, triples, every) is not None for s in scopes)
+            for scopes in self._ways
+        )
 
-def _possible(scope: Scope, catalog: Catalog) -> bool:
-    return scope.where != (FALSE,) and narrowed(scope, catalog).where != (FALSE,)
+    def _least(self, every: frozenset[Any]) -> frozenset[Any]:
+        """Triples and kinds without any of which there would be no match: who has them may have one."""
+        for one in every:
+            if self._possible(every - {one}):
+                every -= {one}
+        return every
 
 
 @dataclass(frozen=True, slots=True)

@@ -53,7 +53,7 @@ from sgstore.lang.ir import (
 from sgstore.vocabulary import KINDS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Collection, Iterable, Iterator
 
     from sgstore.lang._formulas import Leaf
 
@@ -398,16 +398,23 @@ def narrowed(scope: Scope, catalog: Catalog) -> Scope:
     A pattern whose edges do not occur at all has no match: its condition becomes false.
     """
     triples = tuple({**catalog.map_edges, **catalog.edges})
-    held = catalog.moving | catalog.fixed | catalog.mapped
+    kinds = kinds_left(scope, triples, catalog.moving | catalog.fixed | catalog.mapped)
+    if kinds is None:
+        return replace(scope, where=(FALSE,))
+    nodes = {key: replace(node, kinds=kinds[key]) for key, node in scope.nodes.items()}
+    return replace(scope, nodes=nodes, outer={key: kinds[key] for key in scope.outer})
+
+
+def kinds_left(
+    scope: Scope, triples: Collection[Triple], held: frozenset[str]
+) -> dict[str, Kinds] | None:
+    """Kinds that each node may be of where such edges and kinds occur; ``None``: there is no match."""
     kinds = {key: scope.kinds(key).only(held) for key in (*scope.nodes, *scope.outer)}
     single = [edge for edge in scope.edges if edge.high == 1]
     ways = [[*possible(e, kinds[e.src], kinds[e.dst], triples)] for e in single]
     while _pass(kinds, single, ways):
         pass
-    if not all(kinds.values()):
-        return replace(scope, where=(FALSE,))
-    nodes = {key: replace(node, kinds=kinds[key]) for key, node in scope.nodes.items()}
-    return replace(scope, nodes=nodes, outer={key: kinds[key] for key in scope.outer})
+    return kinds if all(kinds.values()) else None
 
 
 def _pass(kinds: dict[str, Kinds], edges: list[Edge], ways: list[list[Triple]]) -> bool:
@@ -425,9 +432,7 @@ def _pass(kinds: dict[str, Kinds], edges: list[Edge], ways: list[list[Triple]]) 
     return changed
 
 
-def possible(
-    edge: Edge, src: Kinds, dst: Kinds, triples: tuple[Triple, ...] | Mapping[Triple, int]
-) -> Iterator[Triple]:
+def possible(edge: Edge, src: Kinds, dst: Kinds, triples: Iterable[Triple]) -> Iterator[Triple]:
     """The triples that an edge may be, as seen from its ends: the second is what ``src`` is."""
     relations, starts, ends, both = edge.relations, src.every, dst.every, edge.both
     for triple in triples:
