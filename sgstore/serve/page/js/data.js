@@ -146,28 +146,23 @@ export function statesAt(trace, frame) {
 
 /** @type {[string, number][]} */
 let wanted = [];
-let asking = false, last = 0;
-/** @type {any} */
-let soon = 0;
-const MANY = 60, GLIMPSE = 150; // ms
+let asking = false;
+const MANY = 60;
 
 /** @param {string} trace @param {number} frame */
 export function thumbOf(trace, frame) {
   return thumbs.get(`${trace}#${frame}`) || null;
 }
 
-/** @param {[string, number][]} frames what is in sight, the first first @param {boolean} [flies] it will be out of sight at once: now and then is enough */
-export function wantThumbs(frames, flies = false) {
+/** @param {[string, number][]} frames what is in sight, the first first */
+export function wantThumbs(frames) {
   wanted = live.value ? [] : frames.filter(([trace, frame]) => !thumbs.has(`${trace}#${frame}`));
-  clearTimeout(soon);
-  const wait = flies ? last + GLIMPSE - performance.now() : 0;
-  if (wait > 0) soon = setTimeout(ask, wait); else ask();
+  ask();
 }
 
 async function ask() {
   if (asking || !wanted.length) return;
   asking = true;
-  last = performance.now();
   const side = traces.value.get(wanted[0]?.[0] || "")?.side;
   const now = wanted.filter(([trace]) => traces.value.get(trace)?.side === side).slice(0, MANY);
   wanted = wanted.filter((one) => !now.includes(one));

@@ -7,6 +7,7 @@ import { keyOf, notes, offline, open, openMatch, paints, tick, ticked, traces } 
 
 const html = htm.bind(h);
 const GAP = 12, HEAD = 32;
+const REST = 100; // ms without a jump, after which what flew past stands
 
 /** What the matches before and behind are grouped by. @param {import("./state.js").Match | undefined} match */
 const groupOf = (match) => match?.group ?? match?.trace ?? "";
@@ -33,8 +34,8 @@ function layout(found, width) {
   return { rows, height: top, across, wide, high };
 }
 
-/** @param {{match: import("./state.js").Match, x: number, y: number, wide: number, high: number}} props */
-function Tile({ match, x, y, wide, high }) {
+/** @param {{match: import("./state.js").Match, x: number, y: number, wide: number, high: number, flies: boolean}} props */
+function Tile({ match, x, y, wide, high, flies }) {
   const canvas = useRef(/** @type {HTMLCanvasElement | null} */ (null));
   const painted = useRef("");
   const waits = arrived.value, look = paints.value;
@@ -42,11 +43,10 @@ function Tile({ match, x, y, wide, high }) {
     const thumb = thumbOf(match.trace, match.first), about = traces.value.get(match.trace);
     const map = mapOf(match.trace), still = stillOf(match.trace);
     // What stands and moves first, the map when it has come.
-    const key = `${keyOf(match)} ${!!thumb} ${!!map} ${!!still} ${wide} ${look}`, ctx = canvas.current?.getContext("2d");
+    const key = `${keyOf(match)} ${!!thumb} ${!!map} ${!!still} ${wide} ${look} ${flies}`, ctx = canvas.current?.getContext("2d");
     if (!canvas.current || !ctx || painted.current === key) return;
     painted.current = key;
-    if (!thumb?.columns || !about) { // what it showed was another match
-      ctx.reset();
+    if (!thumb?.columns || !about || flies) { // what it showed was another match: it is not seen, which costs least
       delete canvas.current.dataset.painted;
       return;
     }
@@ -54,7 +54,7 @@ function Tile({ match, x, y, wide, high }) {
     paintScene(ctx, match.trace, thumb, lookAt(match.trace, thumb, nodes, width, height, 45), ratio,
       { marked: new Set(nodes), lit: new Set(), small: true });
     canvas.current.dataset.painted = "1";
-  }, [match, wide, waits, look]);
+  }, [match, wide, waits, look, flies]);
   const isOpen = open.value?.match && keyOf(open.value.match) === keyOf(match), on = ticked.value.has(keyOf(match));
   const tags = notes.value.filter((n) => n[0] === match.trace && n[1] >= match.first && n[1] <= match.last);
   const who = Object.entries(match.names).filter(([name]) => name !== "e" && name !== "ego").map(([, v]) => v).join(", ");
@@ -92,19 +92,21 @@ export function Gallery({ found, none, word = ["match", "matches"] }) {
     if (row.top + row.height < box.top - 200) low = middle + 1; else end = middle;
   }
   // As many rows each time: what leaves the sight lends its elements to what comes, for to make new ones takes most of the time.
-  const most = useRef(0), was = useRef(0), seen = /** @type {any[]} */ ([]);
+  const most = useRef(0), was = useRef(0), jumped = useRef(false), seen = /** @type {any[]} */ ([]);
   for (let i = low; i < rows.length && (seen.length < most.current || /** @type {any} */ (rows[i]).top < box.top + box.height + 200); i++) seen.push(/** @type {any} */ (rows[i]));
   most.current = Math.max(most.current, seen.length);
-  const flies = Math.abs(box.top - was.current) > high;
+  // Of a jump the pictures are asked for at once; of what goes on flying past none, until it rests.
+  const jumps = Math.abs(box.top - was.current) > high, flies = jumps && jumped.current;
   useEffect(() => {
     was.current = box.top;
-    wantThumbs(seen.flatMap((row) => found.slice(row.first, row.last).map((m) => /** @type {[string, number]} */ ([m.trace, m.first]))), flies);
-    if (!flies) return undefined;
-    const rest = setTimeout(() => setBox((one) => ({ ...one })), 150); // then all of it stands in its order
+    jumped.current = jumps;
+    if (!flies) wantThumbs(seen.flatMap((row) => found.slice(row.first, row.last).map((m) => /** @type {[string, number]} */ ([m.trace, m.first]))));
+    if (!jumps) return undefined;
+    const rest = setTimeout(() => setBox((one) => ({ ...one })), REST); // then all of it stands in its order
     return () => clearTimeout(rest);
   });
   const drawn = seen.map((row, at) => ({ row, slot: (low + at) % most.current }));
-  if (flies) drawn.sort((a, b) => a.slot - b.slot);
+  if (jumps) drawn.sort((a, b) => a.slot - b.slot);
   const now = open.value?.match;
   useEffect(() => { // what is open comes into sight
     if (!now || !place.current) return;
@@ -115,7 +117,7 @@ export function Gallery({ found, none, word = ["match", "matches"] }) {
     ${found.length || !none ? null : html`<p class="faint none">${none}</p>`}
     ${drawn.map(({ row, slot }) => (row.group
       ? html`<div class="group" key=${`g ${slot}`} style=${{ top: `${row.top}px` }}>${row.group} <span>${row.many} ${row.many === 1 ? word[0] : word[1]}</span></div>`
-      : found.slice(row.first, row.last).map((match, i) => html`<${Tile} key=${`${slot} ${i}`} match=${match} wide=${wide} high=${high}
+      : found.slice(row.first, row.last).map((match, i) => html`<${Tile} key=${`${slot} ${i}`} match=${match} wide=${wide} high=${high} flies=${flies}
           x=${GAP + i * (wide + GAP)} y=${row.top} />`)))}
   </div></section>`;
 }
