@@ -85,7 +85,8 @@ FLOOR = """seconds => new Promise(done => {  // as many boxes of one colour each
   box.style = `position: fixed; left: ${place.left}px; top: ${place.top}px; z-index: 9; overflow-y: auto;
     width: ${place.width}px; height: ${place.height}px; background: #eee`;
   inner.style = `position: relative; height: ${document.querySelector('.gallery .inner').style.height}`;
-  const across = Math.floor(place.width / (wide + 12)), rows = Math.ceil((place.height + 400) / (high + 12)) + 1;
+  const across = Math.floor(place.width / (wide + 12));
+  const rows = Math.ceil((place.height + 400) / (high + 12)) + 1;
   const boxes = Array.from({ length: across * rows }, (_, i) => {
     const one = document.createElement('div');
     one.style = `position: absolute; contain: strict; width: ${wide}px; height: ${high}px;

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import sys
+from itertools import islice
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,9 +16,10 @@ from standin_carla import StandInActor, at_red, box, transform  # noqa: E402
 
 from sgstore.config import Config  # noqa: E402
 from sgstore.errors import MissingExtraError, TraceError  # noqa: E402
-from sgstore.readers import LiveWorld, connect  # noqa: E402
+from sgstore.readers import LiveWorld, Sensor, connect  # noqa: E402
 from sgstore.readers.carla._live import LIGHTS, in_world  # noqa: E402
 from sgstore.sgg import SceneGraphGenerator  # noqa: E402
+from sgstore.temporal import opened  # noqa: E402
 from sgstore.vocabulary import VEHICLE_LIGHTS  # noqa: E402
 
 
@@ -247,3 +250,26 @@ def test_without_the_package_it_is_said_what_to_install(monkeypatch: pytest.Monk
 def test_where_no_server_answers_it_is_said_where() -> None:
     with pytest.raises(TraceError, match=r"no CARLA server answers at localhost:1\b"):
         connect("localhost", 1, timeout_s=0.2)
+
+
+def test_cameras_of_a_running_world_have_a_picture_of_each_frame(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = at_red()
+    monkeypatch.setattr(
+        "sgstore.readers.connect", lambda *_: SimpleNamespace(get_world=lambda: world)
+    )
+    camera, lidar = (
+        Sensor("front", "sensor.camera.rgb", attributes={"image_size_x": "8"}),
+        Sensor("top", "sensor.lidar.ray_cast"),
+    )
+
+    with opened("carla://localhost:2000", Config(), sensors=[camera, lidar]) as source:
+        assert source.cameras is not None
+        list(islice(source.frames, 3))
+        pictures = [source.cameras.at(seq, "front") for seq in range(4)]
+
+        assert source.cameras.topics == ("front",)
+        assert [picture and picture.form for picture in pictures] == ["png", "png", "png", None]
+    attached = {actor.type_id: actor.gone for actor in world.actors if actor.parent is not None}
+    assert attached == {camera.type: True, lidar.type: True}

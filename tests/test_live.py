@@ -51,7 +51,7 @@ async def told(run: LiveRun) -> list[tuple[str, Any]]:
 def watched() -> tuple[LiveRun, list[MonitorEvent], list[tuple[str, Any]]]:
     events: list[MonitorEvent] = []
     with opened(str(RECORDING), Config()) as source:
-        run = LiveRun("town", source.road_map)
+        run = LiveRun("town", source.road_map, source.cameras)
 
         def tell(event: MonitorEvent) -> None:
             events.append(event)
@@ -128,6 +128,41 @@ def test_graphs_and_why_not_are_those_of_a_store(watched: Any, open_town: Store)
         assert run.why("pattern", seq)["failed"] == why["failed"]
     with pytest.raises(StoreError, match="not kept; those from #0 on are"):
         run.graph(FRAMES)
+
+
+def test_curves_are_those_of_a_store(watched: Any, open_town: Store) -> None:
+    run, events, _ = watched
+    nodes = next(event for event in events if event.kind == "found").nodes
+    e, v = nodes["e"], nodes["v"]
+    (trace,) = open_town.traces()
+    asked = [(name, v, None) for name in ("speed", "heading", "accel", "steer")]
+    asked += [(name, e, v) for name in ("gap", "ttc", "bearing", "closing_speed")]
+    for attribute, node, other in asked:
+        _, mine = unpacked(run.series(attribute, node, other))
+        of = open_town.file.series(trace.trace_id, attribute, node, other)
+        known = dict(zip(of["seq"].tolist(), zip(of["t"], of["value"], strict=True), strict=True))
+        curve = dict(
+            zip(mine["seq"].tolist(), zip(mine["t"], mine["value"], strict=True), strict=True)
+        )
+        kept = {seq: told for seq, told in known.items() if seq < FRAMES}
+        assert len(kept) > 10
+        assert (
+            other is not None or curve.keys() == kept.keys()
+        )  # the view of pairs has near ones alone
+        for seq, told in kept.items():
+            assert curve[seq] == pytest.approx(told, abs=1e-5, nan_ok=True)
+    with pytest.raises(StoreError, match="no number 'wings' of a node; there are x, y"):
+        run.series("wings", v)
+
+
+def test_pictures_are_those_of_a_store(watched: Any, open_town: Store) -> None:
+    run = watched[0]
+    (topic,) = run.about()["traces"][0]["cameras"]
+    for seq in (0, 31, FRAMES - 1):
+        assert run.picture(seq, topic)[0] == open_town.file.carried(f"town#{seq}", topic).data
+    assert run.picture(100_000, topic)[0] == b""
+    with pytest.raises(StoreError, match="no camera 'other'"):
+        run.picture(0, "other")
 
 
 def test_a_part_over_time_is_not_known(open_town: Store) -> None:

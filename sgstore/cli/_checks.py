@@ -51,6 +51,7 @@ if TYPE_CHECKING:
 
     from sgstore.collection import PartedChecks
     from sgstore.matches import Interval
+    from sgstore.readers import Sensor
     from sgstore.temporal import CheckRun, FrameSource, Monitor, MonitorEvent, Verdict
 
 PANEL: Final = "Rules over time"
@@ -256,6 +257,12 @@ def _span(interval: Interval, returned: Sequence[str]) -> dict[str, Any]:
 # The verb that watches: checks and patterns over a recording as if it were live, or a running simulator ----
 
 
+SensorFile = Annotated[
+    Path | None,
+    Option("--sensors", help="With --serve, of a CARLA: cameras for its ego, as record has them."),
+]
+
+
 @app.command(rich_help_panel=PANEL)
 def monitor(
     trace: Annotated[
@@ -277,6 +284,7 @@ def monitor(
     as_json: AsJson = False,
     serve: Annotated[bool, Option("--serve", help="Show a page of it while it goes on.")] = False,
     port: Annotated[int, Option("--port", min=0, max=65535, help="Of the page; 0: any.")] = 0,
+    sensors: SensorFile = None,
     *,
     statements: Statements,
     reading: ReadingOptions,
@@ -295,7 +303,8 @@ def monitor(
     settings = reading.settings() or Config()
     tell = _as_json if as_json else _for_people
     longest = seconds_of(duration, "--duration") if duration else None
-    with opened(trace, settings, road_map=reading.road_map, ego=ego) as source:
+    cameras = _sensors(sensors, shown=serve and trace.startswith("carla://"))
+    with opened(trace, settings, road_map=reading.road_map, ego=ego, sensors=cameras) as source:
         watch = partial(
             Monitor,
             joined([*chain.from_iterable(asked.values())]),
@@ -321,6 +330,16 @@ def monitor(
     return LOSS if losses else 0
 
 
+def _sensors(file: Path | None, *, shown: bool) -> list[Sensor]:
+    """The sensors that a file lists; ``shown``: a page will show what they see."""
+    from sgstore.readers import load_sensors
+
+    if file is not None and not shown:
+        told = "--sensors is for the page of a running CARLA: carla://HOST:PORT --serve"
+        raise typer.BadParameter(told)
+    return [] if file is None else load_sensors(file)
+
+
 def _watched_on_a_page(
     watch: Callable[..., Monitor],
     source: FrameSource,
@@ -331,7 +350,7 @@ def _watched_on_a_page(
     """A monitor that has watched, beside a page that shows it; and the verdicts, when both have ended."""
     from sgstore.serve import LiveRun, paced, serve_live
 
-    page = LiveRun(source.name, source.road_map)
+    page = LiveRun(source.name, source.road_map, source.cameras)
 
     def told(event: MonitorEvent) -> None:
         tell(event)

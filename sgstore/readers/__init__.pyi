@@ -9,6 +9,9 @@ from ._blocks import EntityTable as EntityTable
 from ._blocks import FrameRows as FrameRows
 from ._base import FramesTrace as FramesTrace
 from ._base import TraceMessage as TraceMessage
+from ._cameras import Cameras as Cameras
+from ._cameras import LiveCameras as LiveCameras
+from ._cameras import RecordedCameras as RecordedCameras
 from ._media import Media as Media
 from ._media import picture_form as picture_form
 from ._media import png as png
@@ -43,12 +46,14 @@ from .osi._schema import descriptors as descriptors
 from .osi._schema import message_class as message_class
 
 __all__ = [
+    "Cameras",
     "CommonRoadFile",
     "DERIVED",
     "ENDINGS",
     "EntityTable",
     "FrameRows",
     "FramesTrace",
+    "LiveCameras",
     "LiveWorld",
     "Media",
     "MessageDecoder",
@@ -57,6 +62,7 @@ __all__ = [
     "OsiFile",
     "POSE",
     "READERS",
+    "RecordedCameras",
     "RecordingFile",
     "RecordingReader",
     "Sensor",

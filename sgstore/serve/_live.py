@@ -14,8 +14,9 @@ import threading
 import time
 from collections import OrderedDict, deque
 from dataclasses import asdict
+from functools import partial
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import numpy as np
 from starlette.applications import Starlette
@@ -24,20 +25,23 @@ from starlette.routing import Route
 
 from sgstore.errors import QueryNameError, SgstoreError, StoreError
 from sgstore.lang import Binding, FrameView, ScopeSearch, parts_of, why_not
+from sgstore.pair_numbers import PAIR_FUNCTIONS
 from sgstore.serve._app import given_file, page_of, told
 from sgstore.serve._guard import Guard
-from sgstore.serve._reads import clean, drawn_map, told_graph
+from sgstore.serve._reads import clean, drawn_map, shown_picture, told_graph
 from sgstore.serve._requests import Fields
 from sgstore.serve._wire import as_json, packed
 from sgstore.vocabulary import KIND_CODE, KINDS, LIGHT_STATE_CODE, LIGHT_STATES
+from sgstore.world import INPUTS, POSE
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
 
     from starlette.requests import Request
 
     from sgstore.graph import SceneGraph
     from sgstore.lang.ir import Query
+    from sgstore.readers import Cameras
     from sgstore.roads import RoadMap
     from sgstore.step import Frame
     from sgstore.temporal import FrameTime, Monitor, MonitorEvent, Verdict
@@ -64,6 +68,12 @@ _STATES: Final = {
     **dict.fromkeys(("kind", "ego", "light"), np.uint8),
 }
 _NO_LIGHT: Final = len(LIGHT_STATES)
+
+OF_NODE: Final = (*POSE, *INPUTS, "speed", "accel")
+OF_PAIR: Final = tuple(PAIR_FUNCTIONS)
+"""Numbers that have a curve."""
+
+W = TypeVar("W", "WatchedMatch", "WatchedCurve")
 
 
 class NotKeptError(SgstoreError):
@@ -135,6 +145,51 @@ class WatchedMatch:
         }
 
 
+class WatchedCurve:
+    """An attribute of an entity, or a number of two, frame by frame.
+
+    Parameters
+    ----------
+    attribute : str
+        As the views ``nodes`` and ``pairs`` call it.
+    node : int
+    other : int, optional
+
+    Raises
+    ------
+    StoreError
+        There is no such number.
+    """
+
+    def __init__(self, attribute: str, node: int, other: int | None) -> None:
+        known = OF_NODE if other is None else OF_PAIR
+        if attribute not in known:
+            told = f"no number {attribute!r} of {'a node' if other is None else 'two'}"
+            raise StoreError(f"{told}; there are {', '.join(known)}")
+        self._attribute, self._node, self._other = attribute, node, other
+        self._told: deque[tuple[int, float, float]] = deque(maxlen=MOST_FRAMES)
+        self._seen = -1
+
+    def look(self, views: Iterable[FrameView]) -> None:
+        """Look at the frames that were not looked at yet."""
+        for view in views:
+            seq, about = view.frame["seq"], view.nodes.get(self._node)
+            if seq <= self._seen or about is None:
+                continue
+            self._seen = seq
+            if self._other is None:
+                value = about.get(self._attribute)
+            else:
+                value = view.pair(self._attribute, self._node, self._other)
+            self._told.append((seq, view.frame["t"], math.nan if value is None else float(value)))
+
+    def columns(self) -> dict[str, Any]:
+        """Numbers of frames, their times (s), values; as :meth:`sgstore.store.StoreFile.series` has them."""
+        types = {"seq": np.uint32, "t": np.float64, "value": np.float32}
+        told = zip(*self._told, strict=True) if self._told else ((), (), ())
+        return {name: np.array(c, types[name]) for name, c in zip(types, told, strict=True)}
+
+
 class LiveRun:
     """What a page that follows a monitor is sent.
 
@@ -143,10 +198,13 @@ class LiveRun:
     name : str
         Of the recording, or of the world.
     road_map : RoadMap, optional
+    cameras : Cameras, optional
+        They know the pictures of the frames.
     """
 
-    def __init__(self, name: str, road_map: RoadMap | None) -> None:
+    def __init__(self, name: str, road_map: RoadMap | None, cameras: Cameras | None = None) -> None:
         self.name = name
+        self._cameras = cameras
         self._map = drawn_map(road_map)
         self._has_map = road_map is not None
         self._lock = threading.Lock()
@@ -159,7 +217,7 @@ class LiveRun:
         self._still: dict[int, list[Any]] = {}
         self._events: list[dict[str, Any]] = []
         self._origin: tuple[float, float] | None = None
-        self._watched: OrderedDict[tuple[Any, ...], WatchedMatch] = OrderedDict()
+        self._watched: OrderedDict[tuple[Any, ...], WatchedMatch | WatchedCurve] = OrderedDict()
 
     # What the monitor tells ------------------------------------------------------------------------
 
@@ -257,7 +315,8 @@ class LiveRun:
         """What the page is told first, as of a store with one trace."""
         trace = {"name": self.name, "frames": 0, "seconds": 0.0, "period": 0.0, "map": ""}
         trace |= {"map_key": "live" * self._has_map, "origin": self._origin or (0.0, 0.0)}
-        trace |= {"ego": "", "cameras": [], "answers": []}
+        cameras = [] if self._cameras is None else [*self._cameras.topics]
+        trace |= {"ego": "", "cameras": cameras, "answers": []}
         monitor = self._monitor
         names = monitor.names if monitor is not None else ()
         checks = [*monitor.status] if monitor is not None else []
@@ -280,16 +339,47 @@ class LiveRun:
         QueryNameError
             There is no such pattern, or it has no such variable.
         """
+        query, key = self._query(name), (name, *sorted(nodes.items()))
         with self._lock:
-            query = self._query(name)
-            key = (name, *sorted(nodes.items()))
-            if key not in self._watched:
-                self._watched[key] = WatchedMatch(query, nodes)
-                self._watched[key].look(self._views)
-            self._watched.move_to_end(key)
-            while len(self._watched) > WATCHED:
-                self._watched.popitem(last=False)
-            return {"trace": self.name, **self._watched[key].lanes(self._gone)}
+            watched = self._watch(key, partial(WatchedMatch, query, nodes))
+            return {"trace": self.name, **watched.lanes(self._gone)}
+
+    def series(self, attribute: str, node: int, other: int | None = None) -> bytes:
+        """An attribute over the frames whose graphs are kept, as the explorer gives it; it is followed on.
+
+        Raises
+        ------
+        StoreError
+            There is no such number.
+        """
+        with self._lock:
+            make = partial(WatchedCurve, attribute, node, other)
+            columns = self._watch((attribute, node, other), make).columns()
+        return packed({"trace": self.name, "attribute": attribute}, columns)
+
+    def _watch(self, key: tuple[Any, ...], make: Callable[[], W]) -> W:
+        """Return what is followed under a key, the last ones that were asked for."""
+        if key not in self._watched:
+            self._watched[key] = make()
+            self._watched[key].look(self._views)
+        self._watched.move_to_end(key)
+        while len(self._watched) > WATCHED:
+            self._watched.popitem(last=False)
+        return cast("W", self._watched[key])
+
+    def picture(self, seq: int, topic: str) -> tuple[bytes, str]:
+        """Picture of a camera at a frame, and its type; empty where there is none.
+
+        Raises
+        ------
+        StoreError
+            There is no such camera.
+        ExportError
+            The message holds no picture that a browser shows.
+        """
+        if self._cameras is None or topic not in self._cameras.topics:
+            raise StoreError(f"no camera {topic!r}")
+        return shown_picture(self._cameras.at(seq, topic), topic)
 
     def graph(self, seq: int) -> dict[str, Any]:
         """The scene graph of a frame, as the explorer gives it.
@@ -389,6 +479,19 @@ def live_application(run: LiveRun, token: str, hosts: tuple[str, ...], cookie: s
         about = fields.text("text"), fields.whole("seq")
         return JSONResponse(await asyncio.to_thread(run.why, *about))
 
+    async def series(request: Request) -> Response:
+        fields = await Fields.of(request)
+        other = fields.whole("other") if fields.has("other") else None
+        asked = fields.text("attribute"), fields.whole("node"), other
+        found = await asyncio.to_thread(run.series, *asked)
+        return Response(found, media_type="application/octet-stream")
+
+    async def picture(request: Request) -> Response:
+        fields = await Fields.of(request)
+        asked = fields.whole("seq"), fields.text("channel")
+        data, kind = await asyncio.to_thread(run.picture, *asked)
+        return Response(data, media_type=kind)
+
     async def live(_: Request) -> Response:
         return StreamingResponse(run.messages(), media_type="text/event-stream")
 
@@ -401,6 +504,8 @@ def live_application(run: LiveRun, token: str, hosts: tuple[str, ...], cookie: s
         Route("/api/parts", told(parts), methods=["POST"]),
         Route("/api/frame", told(frame), methods=get),
         Route("/api/why", told(why), methods=["POST"]),
+        Route("/api/series", told(series), methods=get),
+        Route("/api/picture", told(picture), methods=get),
         Route("/api/live", told(live), methods=get),
     ]
     return Guard(Starlette(routes=routes), token, hosts, cookie)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from sgstore.graph import SceneGraph
     from sgstore.lang import Catalog
     from sgstore.query import Store
+    from sgstore.readers import Media
     from sgstore.roads import RoadMap
     from sgstore.serve._requests import Fields
     from sgstore.store import StoredTrace
@@ -214,10 +215,7 @@ class Reads:
         ExportError
             The message holds no picture that a browser shows.
         """
-        media = self._store.file.carried(self.frame_id(trace, seq), channel)
-        if media.form not in _PICTURES:
-            raise ExportError(f"{channel}: the message holds {media.form}, no picture")
-        return media.data, _PICTURES[media.form]
+        return shown_picture(self._store.file.carried(self.frame_id(trace, seq), channel), channel)
 
     def words(self, _: Fields) -> Read:
         """Words of the language, for completion."""
@@ -253,6 +251,15 @@ def _among(traces: Mapping[str, StoredTrace], name: str) -> StoredTrace:
     if name not in traces:
         raise StoreError(f"no trace {name!r} in the store")
     return traces[name]
+
+
+def shown_picture(media: Media | None, channel: str) -> tuple[bytes, str]:
+    """A picture as a browser shows it, and its type; empty where there is none."""
+    if media is None:
+        return b"", "application/octet-stream"
+    if media.form not in _PICTURES:
+        raise ExportError(f"{channel}: the message holds {media.form}, no picture")
+    return media.data, _PICTURES[media.form]
 
 
 def drawn_map(road_map: RoadMap | None) -> bytes:

@@ -5,9 +5,10 @@ Frames come from a recording, as if it were live, or from a running CARLA.
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from sgstore.lang import Need
     from sgstore.lang.ir import BoundCheck, Query
     from sgstore.lang.syntax import Statement
+    from sgstore.readers import Cameras, Sensor
     from sgstore.roads import RoadMap
     from sgstore.step import Frame
     from sgstore.temporal._robustness import Robustness
@@ -72,6 +74,8 @@ class FrameSource:
         What could not be read.
     live : bool
         Whether frames come in their time.
+    cameras : Cameras, optional
+        They know the pictures of the frames that were read.
     """
 
     name: str
@@ -80,11 +84,17 @@ class FrameSource:
     warnings: list[str] = field(default_factory=list[str])
     losses: list[str] = field(default_factory=list[str])
     live: bool = False
+    cameras: Cameras | None = None
 
 
 @contextmanager
 def opened(
-    source: str, config: Config, *, road_map: Path | None = None, ego: str = ""
+    source: str,
+    config: Config,
+    *,
+    road_map: Path | None = None,
+    ego: str = "",
+    sensors: Sequence[Sensor] = (),
 ) -> Generator[FrameSource]:
     """A recording, or ``carla://host:port``.
 
@@ -96,27 +106,34 @@ def opened(
         For a recording that carries no map of its own, as ingest takes it.
     ego : str
         Id, role or name of the ego; empty: as the recording says.
+    sensors : sequence of Sensor
+        Of a running simulator: attached to the ego while it is open; what its cameras see can be asked for.
 
     Raises
     ------
     TraceError
-        It cannot be read, or there is no server.
+        It cannot be read, there is no server, or no ego to carry sensors.
     MapError
         The map cannot be read.
     """
     if source.startswith(LIVE):
-        yield _live(source, ego)
+        with _live(source, ego, sensors) as told:
+            yield told
         return
+    from sgstore.readers import RecordedCameras  # with it the media of messages are loaded
+
     path = Path(source)
     with open_trace(path, ego=ego or config.ego) as trace:
         found, warnings = Maps(road_map, config.signs).of(trace.info)
         on_map(trace, found)
-        told = FrameSource(path.stem, found, iter(()), warnings)
+        cameras = RecordedCameras(trace.info.path, trace.info.channels)
+        told = FrameSource(path.stem, found, iter(()), warnings, cameras=cameras)
         told.losses += [loss.reason for loss in lost_lanes(trace.info, found)]
 
         def frames() -> Iterator[Frame]:
             yield from replayed(
-                trace.blocks(), recorded_events(c.schema for c in trace.info.channels)
+                cameras.followed(trace.blocks()),
+                recorded_events(c.schema for c in trace.info.channels),
             )
             told.warnings += trace.report.warnings
             told.losses += [loss.reason for loss in trace.report.losses]
@@ -125,9 +142,12 @@ def opened(
         yield told
 
 
-def _live(source: str, ego: str) -> FrameSource:
+@contextmanager
+def _live(source: str, ego: str, sensors: Sequence[Sensor]) -> Generator[FrameSource]:
     from sgstore.readers import (
+        LiveCameras,
         LiveWorld,
+        Sensors,
         connect,  # a large package: only for who asks
     )
 
@@ -137,18 +157,25 @@ def _live(source: str, ego: str) -> FrameSource:
     except ValueError as error:
         raise TraceError(f"{source}: {error}; expected {LIVE}host:port") from error
     live = LiveWorld(connect(host, port).get_world(), ego)
-    told = FrameSource(live.map_name, live.road_map, iter(()), live=True)
+    with ExitStack() as stack:
+        cameras = None
+        if sensors:
+            attached = stack.enter_context(Sensors(live.world, live.find_ego(), [*sensors]))
+            cameras = LiveCameras(attached, sensors)
+        told = FrameSource(live.map_name, live.road_map, iter(()), live=True, cameras=cameras)
 
-    def frames() -> Iterator[Frame]:
-        while True:
-            live.world.wait_for_tick()
-            frame = live.frame()
-            frame.recorded = frozenset()  # its sensors are not asked
-            told.warnings[:] = live.warnings
-            yield frame
+        def frames() -> Iterator[Frame]:
+            for seq in count():
+                live.world.wait_for_tick()
+                frame = live.frame()
+                frame.recorded = frozenset()  # its sensors tell no events
+                told.warnings[:] = live.warnings
+                if cameras is not None:
+                    cameras.take(seq, frame.time_ns)
+                yield frame
 
-    told.frames = frames()
-    return told
+        told.frames = frames()
+        yield told
 
 
 # The loop of a monitor: frame in, graph made, questions asked, checks and patterns told ---------

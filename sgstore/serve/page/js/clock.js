@@ -41,12 +41,13 @@ function lanesWanted(now, query) {
   return { text: query, parameters: parametersOf(query), trace: now.trace, seq: Math.round(seq.peek()), binding: now.binding };
 }
 
-/** Ask for the lanes again, of a monitor that goes on. */
-export async function refreshLanes() {
-  const now = open.value, body = now && lanesWanted(now, "");
-  if (!body) return;
-  const found = await api.json("api/parts", body).catch(() => null);
+/** Ask for the lanes and for the curve again, of a monitor that goes on. */
+export async function refresh() {
+  const now = open.value, body = now && lanesWanted(now, ""), curve = series.value;
+  const found = body && (await api.json("api/parts", body).catch(() => null));
   if (found && open.value === now) lanes.value = found;
+  const more = curve && (await api.columns(curve.path).catch(() => null));
+  if (more && series.value === curve) series.value = { ...curve, columns: more.columns };
 }
 
 let turn = 0, answered = /** @type {any} */ (null);
@@ -146,11 +147,11 @@ export function nextMatch(direction) {
 /** @param {string} attribute @param {number} node @param {number} [other] */
 export async function showSeries(attribute, node, other) {
   const trace = open.value?.trace;
-  if (!trace) return;
+  if (!trace || (offline.value && !live.value)) return;
   try {
     const body = { trace, attribute, node, ...(other === undefined ? {} : { other }) };
-    const { columns } = await api.columns(api.address("api/series", body));
-    series.value = { attribute, node, other, columns, label: `${attribute} · ${nameOf(trace, node)}${other === undefined ? "" : ` → ${nameOf(trace, other)}`}` };
+    const path = api.address("api/series", body), { columns } = await api.columns(path);
+    series.value = { path, attribute, node, other, columns, label: `${attribute} · ${nameOf(trace, node)}${other === undefined ? "" : ` → ${nameOf(trace, other)}`}` };
   } catch (error) { say(reasonOf(error)); }
 }
 

@@ -186,6 +186,9 @@ async function ask() {
 
 // Pictures of cameras, asked for ahead ---------------------------------------------------------------------------
 
+/** Pictures that are under way: of a monitor few, so that what comes late does not come ever later. */
+let fetching = 0;
+
 /** The picture at a frame, or the last one before it that is there.
  * @param {string} trace @param {string} channel @param {number} frame @param {number} ahead frames a picture, 0: none */
 export function pictureAt(trace, channel, frame, ahead) {
@@ -193,7 +196,7 @@ export function pictureAt(trace, channel, frame, ahead) {
   if (!about) return null;
   for (let i = 0; i <= (ahead ? AHEAD : 0); i++) {
     const at = frame + i * Math.max(ahead, 1);
-    if (at < about.frames) fetchPicture(trace, channel, at);
+    if (at < about.frames && !(live.value && fetching > 2)) fetchPicture(trace, channel, at);
   }
   for (let i = 0; i < 8; i++) {
     const found = pictures.get(`${trace}\n${channel}\n${frame - i}`);
@@ -206,7 +209,9 @@ export function pictureAt(trace, channel, frame, ahead) {
 /** @param {string} trace @param {string} channel @param {number} seq */
 function fetchPicture(trace, channel, seq) {
   known(pictures, `${trace}\n${channel}\n${seq}`, async () => {
-    const data = await api.blob(api.address("api/picture", { trace, channel, seq }));
+    fetching++;
+    const data = await api.blob(api.address("api/picture", { trace, channel, seq })).finally(() => { fetching--; });
+    if (!data.size) throw new Error("no picture of this frame is kept");
     return { image: await createImageBitmap(data), seq };
   });
   if (pictures.size > PICTURES) {

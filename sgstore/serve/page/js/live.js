@@ -2,7 +2,7 @@
 // A monitor that runs: the scene of each frame as it comes, what checks and patterns become, lanes of what was found.
 import { batch, effect, h, htm, render, signal } from "../vendor/core.js";
 import * as api from "./api.js";
-import { frame, range, refreshLanes } from "./clock.js";
+import { frame, range, refresh } from "./clock.js";
 import { feed, feedStill, keepThumb } from "./data.js";
 import { Gallery } from "./gallery.js";
 import { Keys, keys } from "./keys.js";
@@ -115,7 +115,7 @@ function Live() {
     ${toast.value ? html`<div class="toast" role="status">${toast.value}</div>` : null}`;
 }
 
-for (const sign of ["x", "c"]) keys.splice(keys.findIndex(([one]) => one === sign), 1);
+keys.splice(keys.findIndex(([one]) => one === "x"), 1);
 keys.push(["l", "follow what comes", { l: follow }]);
 
 async function run() {
@@ -128,7 +128,7 @@ async function run() {
   // Whoever looks at another frame does not follow; whoever plays to the end does again.
   effect(() => { const at = frame.value, last = span.peek()[1]; if (at !== last) following.value = false; else if (playing.peek()) follow(); });
   effect(() => { if (!open.value && store.value) open.value = { trace: store.value.store, match: null, binding: null }; });
-  setInterval(() => { if (open.value?.match && !ended.value) refreshLanes(); }, 500);
+  setInterval(() => { if (!ended.value) refresh(); }, 500);
 }
 
 api.json("api/store").then(run, (error) => { const place = document.getElementById("app"); if (place) place.textContent = reasonOf(error); });

@@ -2,7 +2,7 @@
 // The whole trace in time: matches, a lane for each part of the pattern, tags, values; drag to go there.
 import { h, htm, useRef } from "../vendor/core.js";
 import { frame, goTo, holdsAt, lanes, range, series } from "./clock.js";
-import { keyOf, lit, matches, notes, open, playing, traces } from "./state.js";
+import { keyOf, lit, live, matches, notes, open, playing, traces } from "./state.js";
 
 const html = htm.bind(h);
 
@@ -23,22 +23,21 @@ export function Bars({ spans, kind, height = 21 }) {
     <line class="cursor" x1=${frame.value + 0.5} x2=${frame.value + 0.5} y1="0" y2=${height} vector-effect="non-scaling-stroke" /></svg>`;
 }
 
-/** @param {{frames: number}} props */
-function Series({ frames }) {
-  const { columns, label } = series.value;
+function Series() {
+  const { columns, label } = series.value, [from, to] = range.value;
   let low = Infinity, high = -Infinity;
   for (const v of columns.value) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); }
   if (high === low) { high += 1; low -= 1; }
   let path = "", pen = false, now = NaN;
   columns.value.forEach((/** @type {number} */ v, /** @type {number} */ i) => {
-    if (columns.seq[i] === frame.value) now = v;
+    if (columns.seq[i] === frame.value || (live.value && columns.seq[i] < frame.value)) now = v; // of a monitor the last that came
     if (!Number.isFinite(v)) { pen = false; return; }
     path += `${pen ? "L" : "M"}${columns.seq[i]} ${(48 - ((v - low) / (high - low)) * 42).toFixed(2)}`;
     pen = true;
   });
   return html`<div class="lane tall"><div class="label" title=${label}>${label}<br /><b>${Number.isFinite(now) ? now.toFixed(2) : "–"}</b>
       <span class="faint"> ${Number.isFinite(low) ? `${low.toFixed(1)} … ${high.toFixed(1)}` : "never known"}</span></div>
-    <svg viewBox=${`0 0 ${frames} 54`} preserveAspectRatio="none" aria-hidden="true"><path class="series" d=${path} vector-effect="non-scaling-stroke" />
+    <svg viewBox=${`${from} 0 ${to - from + 1} 54`} preserveAspectRatio="none" aria-hidden="true"><path class="series" d=${path} vector-effect="non-scaling-stroke" />
       <line class="cursor" x1=${frame.value + 0.5} x2=${frame.value + 0.5} y1="0" y2="54" vector-effect="non-scaling-stroke" /></svg></div>`;
 }
 
@@ -61,7 +60,7 @@ export function Timeline() {
         <${Bars} spans=${lane.spans} kind=${() => "bar-hold"} /></div>`;
     })}
     ${tags.length ? html`<div class="lane"><div class="label">${tags.length} ${tags.length === 1 ? "tag" : "tags"}</div><${Bars} spans=${tags.map((n) => [n[1], n[1] + frames / 200])} kind=${() => "bar-tag"} /></div>` : null}
-    ${series.value ? html`<${Series} frames=${frames} />` : null}
+    ${series.value ? html`<${Series} />` : null}
     <div class="lane" style=${{ height: "15px" }}><div class="label"></div><div class="row" style=${{ justifyContent: "space-between" }}>
       ${ticks.map((share) => html`<span class="faint" style=${{ fontSize: "10.5px" }}>${(from * about.period + share * (about.seconds - from * about.period)).toFixed(1)} s</span>`)}</div></div>
   </div>`;
