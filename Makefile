@@ -93,7 +93,7 @@ EDGES := commonroad coverage coverage_docs crime criticality_recorded derive der
   draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap export_scenarios export_rerun export_viewers exports exports_docs timeline \
   assistant notebook carla_live collection collection_landing collection_ray collection_remote collection_spark importing junit lang_sgl pytest_plugin record sample \
   cli_people docs_house docs_queries lang_docs packaging views_page library cookbook textmate tck \
-  lanelet2 autoware sumo lane_courses roundabouts fuzz mutants serve live report parts sandbox_pool sequences shrink
+  lanelet2 autoware sumo lane_courses roundabouts zones fuzz mutants serve live report parts sandbox_pool sequences shrink
 tests-of = $(foreach name,$(1),tests/test_$(name).py)
 
 # A file of tests at a time in each process: what its tests share is made once. The longest come first
@@ -175,7 +175,7 @@ maps: $(VENV)/.base
 
 # Files of tests that try more where SGSTORE_LONG is set (tests/thorough.py).
 LONG := collection collection_landing collection_ray collection_remote commonroad collection_spark temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \
-  lang_after lang_attributes lang_counting lang_match lang_oracle lang_parts lang_subgraphs doors frozen importing ingest_data ingest_hardship library \
+  lang_after lang_attributes lang_counting lang_match lang_oracle lang_parts lang_subgraphs doors frozen importing ingest_data ingest_hardship library zones \
   export_scenarios monitor union store_verify notebook assistant online parts serve sgg_traces step_expressions store_transactions tolerance lane_places lane_courses roundabouts criticality_recorded crime
 oracle: $(VENV)/.dev
 	$(BIN)/python tests/oracle_temporal.py 100000

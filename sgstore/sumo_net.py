@@ -297,7 +297,7 @@ def _type(lane: dict[str, str]) -> str:
         seen |= classes
         if allowed and allowed <= seen:
             return kind
-    return "driving"
+    return "entry" if lane.get("acceleration") in {"1", "true"} else "driving"
 
 
 def _shape(text: str) -> Floats:

@@ -40,7 +40,7 @@ TESTS = {
     "geometry": "geometry",
     "ingest": "ingest ingest_*",
     "lang": "lang_* cookbook textmate tck union second_match sql_patterns needs notes library library_data"
-    " like tolerance",
+    " zones like tolerance",
     "map_files": "cli_map lanelet2 sumo",
     "importing": "importing openlabel",
     "markup": "opendrive_document lanelet2",

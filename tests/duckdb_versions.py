@@ -20,6 +20,7 @@ REPOSITORY = Path(__file__).parents[1]
 VERSIONS = {"2": "1.5.0", "1": "2.0.0"}
 """The version to compare with, by the first digit of the one that is installed."""
 
+VALUES = {"s": "1", "zone": "'merge'"}
 LABELS = {"j": "Junction", "l": "Lane"}
 """Of the parameters of the library's predicates; the others are vehicles."""
 
@@ -58,9 +59,9 @@ def questions() -> list[str]:
     found += [question.pattern for question in QUESTIONS]
     for name, predicate in predicates().items():
         arguments = [p.name for p in predicate.parameters]
-        nodes = ", ".join(f"({a}:{LABELS.get(a, 'Vehicle')})" for a in arguments if a != "s")
+        nodes = ", ".join(f"({a}:{LABELS.get(a, 'Vehicle')})" for a in arguments if a not in VALUES)
         nodes = nodes or "(:Ego)"
-        given = ", ".join("1" if a == "s" else a for a in arguments)
+        given = ", ".join(VALUES.get(a, a) for a in arguments)
         found.append(f"MATCH {nodes} WHERE {name}({given}) RETURN FRAMES")
     return list(dict.fromkeys(found))
 

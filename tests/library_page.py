@@ -182,14 +182,15 @@ PARTS: Final = (
         "Rules of regulations and of research",
         "Safe distances of RSS, UN Regulation 157 (automated lane keeping), the interstate and intersection "
         "rules of CommonRoad, and disturbances of ISO 34502, of the ego and every other vehicle. A parameter "
-        "is changed by `k=v`, and `ROBUSTNESS` behind the text of a rule says by how much it is kept. The "
+        "is changed by `k=v` (the 24 disturbances of ISO 34502 are eight on three kinds of road: `zone=main`, "
+        "`merge`, `departure`), and `ROBUSTNESS` behind the text of a rule says by how much it is kept. The "
         "drawings show scenes that violate them.\n\n"
         "**What is not there**: of R_I2 the case of a broad lane marking between the two (maps keep where "
         "lanes may be changed, not how lines are painted); of R_IN2 the turn on red; R_IN3 to R_IN5, which "
         "ask for the priority of two turns; R_IN6, whose text we could not find; of UN R157 what "
         "depends on the state of the system (transition "
-        "demand, minimal risk manoeuvre); of ISO 34502 16 of 24 disturbances, whose formulas we could not "
-        "find, and of its cut-out (2) only a sketch; IEEE 2846, which names quantities and no limits.",
+        "demand, minimal risk manoeuvre); of ISO 34502 the cut-out (2) follows a sketch; "
+        "IEEE 2846, which names quantities and no limits.",
     ),
 )
 
@@ -225,7 +226,10 @@ def _entry(one: NamedPattern) -> list[str]:
     lines = ["", f"### {one.name}", "", one.sentence, "", "```", one.text, "```", ""]
     if one.parameters:
         lines += ["| parameter | default | meaning |", "| --- | --- | --- |"]
-        lines += [f"| `{p.name}` | {p.default} | {p.meaning} |" for p in one.parameters.values()]
+        lines += [
+            f"| `{p.name}` | {' or '.join(p.choices) or p.default} | {p.meaning} |"
+            for p in one.parameters.values()
+        ]
         lines.append("")
     return [*lines, f"Source: {one.source}", "", "```", drawing(SCENES[one.name][0]), "```"]
 

@@ -90,10 +90,12 @@ def test_a_predicate_of_the_library_can_be_asked(name: str) -> None:
     definition = predicates()[name]
     arguments = [parameter.name for parameter in definition.parameters]
     labels = {"j": "Junction", "l": "Lane"}
+    values = {"s": "1", "zone": "'merge'"}
     nodes = (
-        ", ".join(f"({a}:{labels.get(a, 'Vehicle')})" for a in arguments if a != "s") or "(:Ego)"
+        ", ".join(f"({a}:{labels.get(a, 'Vehicle')})" for a in arguments if a not in values)
+        or "(:Ego)"
     )
-    arguments = ["1" if argument == "s" else argument for argument in arguments]
+    arguments = [values.get(argument, argument) for argument in arguments]
     connection = duckdb.connect()
     connection.execute(SCHEMA)
 

@@ -9,7 +9,8 @@ They lie in ``library/*.sgql``. An entry is a head, which is comments, and the t
 
 A line that begins with ``--`` and three blanks goes on with the one before; comments behind a text are about
 the file. ``$limit`` stands for the value of the parameter, which has the type of its default: a number, a
-duration, a text, true or false. Predicates have no such parameters, and every query may use them by name.
+duration, a text, true or false. A text may be one of several, ``'any'|'main'``, the first by default.
+Predicates have no such parameters, and every query may use them by name.
 
 Files are read when a name is first asked for, and a text is parsed when a query uses it.
 """
@@ -19,7 +20,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import field, replace
 from difflib import get_close_matches
 from functools import cache, partial
 from importlib import resources
@@ -53,7 +54,8 @@ LIBRARY: Final = (
 """Names of the files, in the order in which they are listed."""
 
 _HEAD: Final = re.compile(rf"-- ({'|'.join(KINDS_OF_PATTERNS)}) (\w+): (\S.*)")
-_PARAMETER: Final = re.compile(r"-- param (\w+) = ('[^']*'|[^\s:]+): (\S.*)")
+_PARAMETER: Final = re.compile(r"-- param (\w+) = ('[^']*'(?:\|'[^']*')*|[^\s:]+): (\S.*)")
+_CHOICE: Final = re.compile(r"'[^']*'|[^'|]+")
 _SOURCE: Final = re.compile(r"-- source: (\S.*)")
 _MORE: Final = re.compile(r"--   \s*(\S.*)")
 _DURATION: Final = re.compile(r"\d+(\.\d+)?(ms|s|min|frames)")
@@ -76,12 +78,15 @@ class PatternParameter:
         As it stands in a query: ``1.5s``.
     meaning : str
         With its unit.
+    choices : tuple of str
+        Texts of which it is one, as they stand in a query; empty: any value of its type.
     """
 
     name: str
     type: str
     default: str
     meaning: str
+    choices: tuple[str, ...] = ()
 
     def written(self, value: object) -> str:
         """A value as it stands in a query.
@@ -89,11 +94,13 @@ class PatternParameter:
         Raises
         ------
         QueryError
-            It is of another type.
+            It is of another type, or none of the choices.
         """
         text = _WRITTEN[self.type](value)
-        if text is None:
+        if text is None or (self.choices and text not in self.choices):
             expected = f"expected a {self.type} such as {self.default}"
+            if self.choices:
+                expected = f"expected one of {', '.join(self.choices)}"
             raise QueryError(f"parameter '{self.name}' cannot be {value!r}", hint=expected)
         return text
 
@@ -356,10 +363,11 @@ class _LibraryEntry:
         if found := _MORE.fullmatch(line):
             self._go_on(found[1])
         elif found := _PARAMETER.fullmatch(line):
-            name, default, self.last = found[1], found[2], found[1]
+            name, (default, *others), self.last = found[1], _CHOICE.findall(found[2]), found[1]
             if name in self.parameters or (kind := _type_of(default)) is None:
                 return False
-            self.parameters[name] = PatternParameter(name, kind, default, found[3])
+            choices = (default, *others) if others else ()
+            self.parameters[name] = PatternParameter(name, kind, default, found[3], choices)
         elif (found := _SOURCE.fullmatch(line)) and "source" not in self.head:
             self.head["source"], self.last = found[1], "source"
         else:
@@ -371,10 +379,7 @@ class _LibraryEntry:
             self.head[self.last] += f" {text}"
         else:
             known = self.parameters[self.last]
-            meaning = f"{known.meaning} {text}"
-            self.parameters[self.last] = PatternParameter(
-                known.name, known.type, known.default, meaning
-            )
+            self.parameters[self.last] = replace(known, meaning=f"{known.meaning} {text}")
 
     def finished(self, library: str) -> NamedPattern:
         lines = list(self.lines)

@@ -15,6 +15,8 @@ PART_DIST: Final = "part_dist"
 NEXT_PARTS: Final[Mapping[str, str]] = {
     "to_junction": "junction",
     "to_roundabout": "roundabout",
+    "to_merge_zone": "merge_zone",
+    "to_departure_zone": "departure_zone",
     "to_crosswalk": "crosswalk",
     "to_stop_line": "stop_line",
     "to_traffic_light": "traffic_light",

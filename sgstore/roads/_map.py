@@ -26,6 +26,7 @@ from sgstore.roads._places import (
     together,
 )
 from sgstore.roads._ribbons import LanePoints, Ribbons, lane_polygons, waypoints
+from sgstore.roads._zones import zones
 from sgstore.vocabulary import DRIVING, ENTITY_KINDS, KIND_CODE, KINDS, RELATION_CODE, SIGNALS
 
 if TYPE_CHECKING:
@@ -575,7 +576,7 @@ class RoadMap:
 
     @cached_property
     def places(self) -> MapPlaces:
-        """Places of junctions, roundabouts, crosswalks and signals along the lanes.
+        """Places of junctions, roundabouts, zones, crosswalks and signals along the lanes.
 
         Of a map without sections there is none, as of :attr:`reach`.
         """
@@ -591,7 +592,7 @@ class RoadMap:
         names = {"lane": list(columns["lane"]), "road": nodes.road[lanes]}
         names["junction"] = nodes.junction[lanes]
         wholes = [made_of_lanes(self.ribbons, of, names[of], columns[of]) for of in columns]
-        wholes.append(self._on_roundabouts())
+        wholes += [self._on_roundabouts(), self._on_zones()]
         for column in self._stop_lines.tolist():
             what[column] = STOP_LINE
         crosswalks, _ = self._crosswalks
@@ -618,6 +619,25 @@ class RoadMap:
         of, lanes = np.array(pairs, np.int64).reshape(-1, 2).T
         return MapPlaces.of(
             of, ["roundabout"] * len(of), lanes, np.zeros(len(of)), self.ribbons.lengths[lanes]
+        )
+
+    def _on_zones(self) -> MapPlaces:
+        """Merge and departure zones on the lanes that they are on."""
+        lanes = slice(1, 1 + self._lanes)
+        pairs = {
+            name: (-2 - self.edges.src[on], -2 - self.edges.dst[on])
+            for name in ("travelsTo", "toLeftOf", "toRightOf", "opposes")
+            for on in [
+                (self.edges.relation == RELATION_CODE[name]) & (self.edges.src > -2 - self._lanes)
+            ]
+        }
+        one, other = np.concatenate([pairs["toLeftOf"], pairs["toRightOf"]], axis=1)
+        against = {*zip(*(column.tolist() for column in pairs["opposes"]), strict=True)}
+        same = [pair not in against for pair in zip(one.tolist(), other.tolist(), strict=True)]
+        nodes, beside = self.nodes, (one[same], other[same])
+        lengths = self.ribbons.lengths
+        return zones(
+            nodes.lane_type[lanes], nodes.junction[lanes], lengths, pairs["travelsTo"], beside
         )
 
     @cached_property
