@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sgstore.lang._catalog import DisplayUnit
 from sgstore.lang._formulas import Leaf, leaves, nested
 from sgstore.lang._kinds import Profile
-from sgstore.lang._rewrite import counted_block
+from sgstore.lang._rewrite import counted_block, is_lasting
 from sgstore.lang.ir import (
     BlockValue,
     Bound,
@@ -218,7 +218,12 @@ def _late(scope: Scope, parts: Phases, query: Query, catalog: Catalog) -> Iterat
     bound_nodes = {key for edge in scope.edges for key in (edge.src, edge.dst)}
     bound_nodes |= {key for one in parts.happened for key in one.nodes}
     compared = {key for condition in parts.rest for key in nodes_of(condition)}
-    alone = scope is query.scope and len(scope.nodes) == 1
+    whole = scope is query.scope
+    alone = whole and len(scope.nodes) == 1
+    if whole:
+        told = (leaf for value in query.result.values for leaf in leaves(value))
+        fleeting = (leaf for leaf in told if not is_lasting(leaf, scope, catalog))
+        compared |= {key for leaf in fleeting for key in nodes_of(leaf)}
     spoken_of = blocked(query)
     for key in scope.nodes:
         profile = Profile.of(scope.kinds(key), catalog)
