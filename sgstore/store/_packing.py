@@ -100,7 +100,7 @@ def trace_of(frame_id: Ints) -> Ints:
 def seq_of(frame_id: Ints) -> Ints:
     """Numbers of frames in their traces."""
     bucket = (frame_id >> FRAME_BITS) & ((1 << BUCKET_BITS) - 1)
-    return bucket * BUCKET_FRAMES + frame_id % (1 << FRAME_BITS)
+    return bucket * BUCKET_FRAMES + (frame_id & ((1 << FRAME_BITS) - 1))
 
 
 def begins(frame_id: Ints) -> Bools:

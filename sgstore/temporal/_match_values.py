@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.lang import expression
+from sgstore.lang import Column, expression
 from sgstore.lang import ir as b
 from sgstore.temporal._windows import exact, rounded
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.lang import Column
     from sgstore.world import Bools, Ints
 
     Objects = NDArray[np.object_]
@@ -130,22 +129,53 @@ class Stretches:
         counts = self.last - self.first + 1
         starts = np.cumsum(counts) - counts
         frames = np.arange(int(counts.sum())) - np.repeat(starts - self.first, counts)
-        values, known = _numbers(column, np.repeat(self.rows, counts), frames)
-        if word in {"avg", "sum"}:
-            return _summed(word, values, known & np.isfinite(values), starts)
-        sign = 1.0 if word in {"min", "argmin"} else -1.0
-        values = np.where(known, sign * values, np.inf)
-        some = np.logical_or.reduceat(known, starts)
-        best = np.minimum.reduceat(values, starts)
-        if at is None:
-            found = (sign * best).astype(object)
-        else:
-            hit = known & (values == np.repeat(best, counts))
-            places = np.where(hit, frames, np.iinfo(np.int64).max)
-            place = np.minimum.reduceat(places, starts)
-            found = picked(at, self.rows, np.where(some, place, self.first))
-        found[~some] = None
-        return found
+        rows = np.repeat(self.rows, counts)
+        told = None if at is None else Column(*_at(at, rows, frames))
+        return over_rows(word, Column(*_at(column, rows, frames)), starts, told)
+
+
+def over_rows(word: str, column: Column, starts: Ints, at: Column | None = None) -> Objects:
+    """The number that each part of some rows makes of a value; ``None``: nothing is known.
+
+    Parameters
+    ----------
+    word : str
+        One of :data:`sgstore.lang.ir.OF_MATCH`.
+    column : Column
+        (R,), or (1, R).
+    starts : (M,) int64
+        The first row of each part; the next part begins where it ends, and none is empty.
+    at : Column, optional
+        Of ``argmin`` and ``argmax``: what is told of the row that they find.
+
+    Returns
+    -------
+    (M,) object
+    """
+    values, known = np.ravel(column.values), np.ravel(column.known)
+    counts = np.diff(starts, append=len(values))
+    if word in {"first", "last"}:
+        return _told(values, known, starts if word == "first" else starts + counts - 1)
+    values = np.asarray(values, np.float64)
+    known = known & ~np.isnan(values)
+    if word in {"avg", "sum"}:
+        return _summed(word, values, known & np.isfinite(values), starts)
+    if not len(starts):
+        return np.zeros(0, np.object_)
+    sign = 1.0 if word in {"min", "argmin"} else -1.0
+    values = np.where(known, sign * values, np.inf)
+    some = np.logical_or.reduceat(known, starts)
+    best = np.minimum.reduceat(values, starts)
+    if at is None:
+        found = (sign * best).astype(object)
+    else:
+        hit = known & (values == np.repeat(best, counts))
+        places = np.where(hit, np.arange(len(values)), len(values))
+        place = np.minimum.reduceat(places, starts)
+        place = np.where(some, place, starts)
+        found = _told(np.ravel(at.values), np.ravel(at.known), place)
+    found[~some] = None
+    return found
 
 
 def picked(column: Column, rows: Ints, frames: Ints) -> Objects:
@@ -158,15 +188,13 @@ def picked(column: Column, rows: Ints, frames: Ints) -> Objects:
     rows, frames : (M,) int64
     """
     values, known = _at(column, rows, frames)
-    found = values.astype(object)
-    found[~known] = None
+    return _told(values, known, slice(None))
+
+
+def _told(values: Any, known: Any, places: Any) -> Objects:
+    found = values[places].astype(object)
+    found[~known[places]] = None
     return found
-
-
-def _numbers(column: Column, rows: Ints, frames: Ints) -> tuple[Any, Bools]:
-    values, known = _at(column, rows, frames)
-    numbers = np.asarray(values, np.float64)
-    return numbers, known & ~np.isnan(numbers)
 
 
 def _at(column: Column, rows: Ints, frames: Ints) -> tuple[Any, Bools]:

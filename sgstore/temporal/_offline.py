@@ -367,10 +367,8 @@ def read(
     TooMuchError
         They are more than memory may hold.
     """
-    about = {row[0]: row[1:] for row in file.rows(TRACES).values}
-    chosen, left = traces_of(whole, catalog)
-    asked = (set(about) if chosen is None else chosen) - left
-    found = _clocks(file, about, asked, window, gaps)
+    about = chosen_traces(file, whole, catalog)
+    found = _clocks(about, frame_times(file, window), gaps)
     rows, memory = 0, file.memory
     for name, ask in asks.items():
         narrower = _narrowed(ask, found.values())
@@ -405,33 +403,77 @@ def _no_rows(ask: Ask) -> TimedRelation:
     return TimedRelation.of(np.zeros(0, np.int64), keys)
 
 
-def _clocks(
-    file: StoreFile,
-    about: Mapping[int, Sequence[Any]],
-    asked: set[int],
-    window: Window | None,
-    gaps: str,
-) -> dict[int, TraceReader]:
+def chosen_traces(file: StoreFile, query: Query, catalog: Catalog) -> dict[int, tuple[Any, ...]]:
+    """The traces that a query asks, and can ask, by id: name, start (ns) and period (ns)."""
+    chosen, left = traces_of(query, catalog)
+    return {
+        row[0]: tuple(row[1:])
+        for row in file.rows(TRACES).values
+        if row[0] not in left and (chosen is None or row[0] in chosen)
+    }
+
+
+def frame_times(file: StoreFile, window: Window | None) -> dict[str, Ints]:
+    """Ids, numbers, times and log times of the frames of a window, in order of the ids."""
     low, high = (window.low << 6, window.high << 6) if window else (0, (1 << 63) - 1)
     sql, values = CLOCK, (low, high)
     if window and window.traces is not None:
         sql, values = CLOCK_OF_TRACES, (low, high, list(window.traces))
-    clock = {name: np.ma.getdata(c) for name, c in file.arrays(sql, values).items()}
-    ids = clock["frame_id"].astype(np.int64)
+    found = file.arrays(sql, values).items()
+    return {name: np.ma.getdata(column).astype(np.int64) for name, column in found}
+
+
+def _clocks(
+    about: Mapping[int, Sequence[Any]], clock: Mapping[str, Ints], gaps: str
+) -> dict[int, TraceReader]:
+    ids = clock["frame_id"]
     found: dict[int, TraceReader] = {}
     for trace_id, rows in _by_trace(ids):
-        if trace_id not in asked:
+        if trace_id not in about:
             continue
         name, start, period = about[trace_id]
-        numbers, times, logs = (
-            clock[column][rows].astype(np.int64) for column in ("seq", "time_ns", "log_time_ns")
-        )
+        numbers, times, logs = (clock[column][rows] for column in ("seq", "time_ns", "log_time_ns"))
         longest, tolerance = longest_step_ns(period), tolerance_ns(period)
-        ticks = Clock.of(_ascending(times), numbers, period, longest, tolerance)
+        ticks = Clock.of(ascending(times), numbers, period, longest, tolerance)
         if gaps == "bridge":
             ticks = replace(ticks, runs=np.zeros_like(ticks.runs))
         found[trace_id] = TraceReader(trace_id, name, ids[rows], numbers, times, logs, start, ticks)
     return found
+
+
+def arrays_of(
+    file: StoreFile,
+    catalog: Catalog,
+    ask: Ask,
+    window: Window | None,
+    values: Sequence[Bound],
+    most: int,
+) -> tuple[Ints, Keys, list[Any]]:
+    """The rows in which a pattern holds, in any order: ids of frames, its bindings, and values of each.
+
+    Of a signal the relations of its edges come behind the nodes.
+
+    Raises
+    ------
+    TooMuchError
+        They are more than so many.
+    """
+    bound = {*ask.variables, *ask.edges}
+    statement = relation(ask.query, catalog, window, values, bound, most + 1)
+    *before, last = statement.steps()
+    arrays = file.arrays(*last, given=before)
+    ids = np.ma.getdata(arrays["frame_id"]).astype(np.int64)
+    if len(ids) > most:
+        held = (one.name for one in catalog.traces if window is None or one.extent[0] in window)
+        raise TooMuchError(
+            f"{ask_text(ask)} holds for more than {most:,} combinations of nodes and frames of"
+            f" {', '.join(held)}, more than memory may take",
+            hint="say more of its nodes: a label, an edge between them, a condition; or allow more memory",
+        )
+    columns = [np.ma.getdata(arrays[key]).astype(np.int64) for key in ask.variables]
+    columns += [np.searchsorted(words(), np.ma.getdata(arrays[k]).astype(str)) for k in ask.edges]
+    keys = np.stack(columns, axis=1) if columns else np.zeros((len(ids), 0), np.int64)
+    return ids, keys, [arrays[f":{n}"] for n in range(len(values))]
 
 
 def _relate(
@@ -450,21 +492,7 @@ def _relate(
             trace.relations[name] = TimedRelation.of(every, np.zeros((len(trace), 0), np.int64))
         return 0
     asked = () if ask.value is None else (ask.value,)
-    bound = {*ask.variables, *ask.edges}
-    statement = relation(ask.query, catalog, window, asked, bound, most + 1)
-    *before, last = statement.steps()
-    arrays = file.arrays(*last, given=before)
-    ids = np.ma.getdata(arrays["frame_id"]).astype(np.int64)
-    if len(ids) > most:
-        raise TooMuchError(
-            f"{ask_text(ask)} holds for more than {most:,} combinations of nodes and frames of"
-            f" {', '.join(trace.name for trace in found.values())}, more than memory may take",
-            hint="say more of its nodes: a label, an edge between them, a condition; or allow more memory",
-        )
-    columns = [np.ma.getdata(arrays[key]).astype(np.int64) for key in ask.variables]
-    columns += [np.searchsorted(words(), np.ma.getdata(arrays[k]).astype(str)) for k in ask.edges]
-    keys = np.stack(columns, axis=1) if columns else np.zeros((len(ids), 0), np.int64)
-    values = [arrays[":0"]] if asked else []
+    ids, keys, values = arrays_of(file, catalog, ask, window, asked, most)
     told = len(ask.columns)
     order = np.lexsort((*keys.T[told:][::-1], ids))
     keys = keys[:, :told]
@@ -490,7 +518,7 @@ def _by_trace(ids: Ints) -> Iterable[tuple[int, slice]]:
     return [(int(owners[a]), slice(int(a), int(z))) for a, z in zip(starts, ends, strict=True)]
 
 
-def _ascending(times: Ints) -> Ints:
+def ascending(times: Ints) -> Ints:
     """Times that ascend, where a recording's stand still or go back: a nanosecond later than the one before."""
     ticks = np.arange(len(times))
     return np.maximum.accumulate(times - ticks) + ticks if len(times) else times

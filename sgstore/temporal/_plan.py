@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from sgstore.lang.ir import BoundCheck, BoundHold, BoundStep, Length, StepLink, StepWay
 
 
-_CONNECTIVES: Final = frozenset({"AND", "OR", "NOT", "XOR", "IMPLIES"})
+CONNECTIVES: Final = frozenset({"AND", "OR", "NOT", "XOR", "IMPLIES"})
 _KNOWN: Final = frozenset({"IS NULL", "IS NOT NULL"})
 FALSE: Final = b.Value(value=False, type=Type.boolean)
 TRUE: Final = b.Value(value=True, type=Type.boolean)
@@ -194,7 +194,7 @@ class Plan:
             case b.Tense(word=word, operands=operands):
                 bound = f.Bound(expression.low, expression.high, expression.frames)
                 return f.TEMPORAL[word](*map(self.quantity, operands), bound)
-            case b.Operation(word=word, operands=operands) if word in _CONNECTIVES:
+            case b.Operation(word=word, operands=operands) if word in CONNECTIVES:
                 return f.LOGIC[word](*map(self.quantity, operands))
             case b.Operation(word=word, operands=operands) if _has_margin(expression):
                 test = self.test(_MARGINS[word](*operands))
@@ -236,7 +236,7 @@ class Plan:
                 return f.TEMPORAL[word](*map(self.formula, operands), bound)
             case b.SignalCall(word="exists_now", operand=operand):
                 return self.present(next(iter(b.nodes_of(operand))))
-            case b.Operation(word=word) if word in _CONNECTIVES:
+            case b.Operation(word=word) if word in CONNECTIVES:
                 return self._logic(expression)
             case _:
                 return self._lapsing(self.test(expression).name, self._things(expression))
@@ -245,7 +245,7 @@ class Plan:
         match expression:
             case b.Operation("AND", operands):
                 return f.And(tuple(map(self.formula, self._merged(operands))))
-            case b.Operation(word, operands) if word in _CONNECTIVES:
+            case b.Operation(word, operands) if word in CONNECTIVES:
                 return f.LOGIC[word](*map(self.formula, operands))
             case b.Value(value=value):
                 return f.TruthConstant(value is True)
@@ -527,7 +527,7 @@ def _two_valued(expression: b.Bound, *, outermost: bool = True) -> b.Bound:  # n
         case b.Operation("OR", operands) if outermost:
             parts = tuple(_two_valued(operand) for operand in operands)
             return b.Operation("OR", parts, Type.boolean)
-        case b.Operation(word, operands) if word in _CONNECTIVES:
+        case b.Operation(word, operands) if word in CONNECTIVES:
             parts = tuple(_two_valued(operand, outermost=False) for operand in operands)
             return b.Operation(word, parts, Type.boolean)
         case b.BlockValue(word="EXISTS") | b.LabelTest():

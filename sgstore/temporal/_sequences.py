@@ -33,6 +33,7 @@ from sgstore.temporal._plan import (
     tied_in_steps,
     way_text,
 )
+from sgstore.temporal._runs import RunFinder
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -403,6 +404,8 @@ class Finder:
         self._tied = frozenset({*self._kept, *tied_in_steps(query)[0]})
         self._steps = asks_of_steps(query, query.steps, self._tied)
         self._edges = tuple(edge.key for edge in query.scope.edges)
+        about = file, catalog, query, self._plan, self._steps[0], self._named(0)
+        self._runs = None if query.spans else RunFinder(*about)
 
     def __call__(self, places: tuple[Bound, ...], window: Window | None) -> ExternalRelation:
         """The matches in a window, or in the whole traces that it is a part of.
@@ -413,16 +416,14 @@ class Finder:
             What is worked out for each match.
         window : Window or None
         """
-        found = self.readers(window, places)
         parts: list[_Part] = []
-        for trace in found:
-            for part in self._find(trace, places) if len(trace) else ():
-                parts.append(part)
-                if sum(len(one[0]) for one in parts) > MOST_MATCHES:
-                    raise TooMuchError(
-                        f"{trace.name} has more than {MOST_MATCHES:,} matches, more than memory may take",
-                        hint="say more of its nodes: a label, an edge between them, a condition",
-                    )
+        for name, part in self._parts(places, window):
+            parts.append(part)
+            if sum(len(one[0]) for one in parts) > MOST_MATCHES:
+                raise TooMuchError(
+                    f"{name} has more than {MOST_MATCHES:,} matches, more than memory may take",
+                    hint="say more of its nodes: a label, an edge between them, a condition",
+                )
         first = [frame for part in parts for frame in part[0].tolist()]
         last = [frame for part in parts for frame in part[1].tolist()]
         width = len(self._kept) + len(self._edges)
@@ -432,6 +433,18 @@ class Finder:
         many = len(places) + self._query.spans * 2
         values = [[item for part in parts for item in part[3][n]] for n in range(many)]
         return ExternalRelation(first, last, nodes, edges, values)
+
+    def _parts(
+        self, places: tuple[Bound, ...], window: Window | None
+    ) -> Iterator[tuple[str, _Part]]:
+        """The matches in a window, each part with the name of a trace that it is of."""
+        if self._runs is not None and self._runs.fits(places):
+            for first, last, keys, values in self._runs.found(places, _whole(window)):
+                yield "a trace", (first, last, self._ordered(self._named(0), keys), values)
+            return
+        for trace in self.readers(window, places):
+            for part in self._find(trace, places) if len(trace) else ():
+                yield trace.name, part
 
     def readers(
         self, window: Window | None, places: tuple[Bound, ...] = ()
@@ -444,13 +457,9 @@ class Finder:
         places : tuple of Bound
             What is worked out for each match.
         """
-        if window is not None:
-            high = ((window.high - 1) >> BUCKET_BITS) + 1
-            low = window.low >> BUCKET_BITS << BUCKET_BITS
-            window = Window(low, high << BUCKET_BITS, window.traces)
         ordered = sorted(self._steps, key=lambda ask: len(ask.after))
         about = self._file, self._catalog, self._query, self._asks_of(places, ordered)
-        return traces(*about, gaps=self._query.gaps, within=window)
+        return traces(*about, gaps=self._query.gaps, within=_whole(window))
 
     def matches(self, trace: TraceReader) -> bool:
         """Tell whether there is a match in some frames of a trace, as if they were all."""
@@ -734,6 +743,14 @@ class Finder:
     def _ordered(self, names: tuple[str, ...], keys: Keys) -> Keys:
         """Bindings with the columns in the order of the query's nodes and edges."""
         return keys[:, [names.index(name) for name in (*self._kept, *self._edges)]]
+
+
+def _whole(window: Window | None) -> Window | None:
+    """The whole traces that a window is a part of."""
+    if window is None:
+        return None
+    high = ((window.high - 1) >> BUCKET_BITS) + 1
+    return Window(window.low >> BUCKET_BITS << BUCKET_BITS, high << BUCKET_BITS, window.traces)
 
 
 def _chunks(starts: Ints, size: int) -> Iterator[tuple[int, int, slice]]:

@@ -1,0 +1,455 @@
+"""Runs of a pattern of one frame, and values over them, in many traces at once.
+
+All rows, a binding in a frame each, stand in one line: by traces, bindings and frames. So the work does not
+grow with the number of traces, and a value over a run is read with the rows of the pattern, and of no others.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.lang import Column, extents
+from sgstore.lang import ir as b
+from sgstore.matches import Windows
+from sgstore.records import dataclass
+from sgstore.store import seq_of, trace_of
+from sgstore.temporal._match_values import over_rows, picked
+from sgstore.temporal._offline import (
+    EDGE_BYTES,
+    ROW_BYTES,
+    arrays_of,
+    ascending,
+    chosen_traces,
+    frame_times,
+)
+from sgstore.temporal._plan import CONNECTIVES
+from sgstore.temporal._signals import Clock, SignalValues
+from sgstore.temporal._windows import over_columns
+from sgstore.world import longest_step_ns, tolerance_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from sgstore.lang import Catalog, Window
+    from sgstore.store import StoreFile
+    from sgstore.temporal._plan import Ask, Plan, Test
+    from sgstore.world import Bools, Ints
+
+    Keys = NDArray[np.int64]
+
+FIRST_WINDOW: Final = 4096
+"""Buckets of the first window: 245,760 frames."""
+
+ROWS_EACH: Final = 4
+"""Rows in arrays that are read at a time for one of those that :class:`Windows` counts."""
+
+VALUE_BYTES: Final = 20
+"""Memory that a value of a row takes beside its binding; bytes."""
+
+LARGE: Final = 1e12
+"""Sums over windows of greater numbers are worked out one by one, so that they are rounded once."""
+
+
+RunsTold = tuple["Ints", "Ints", "Keys", list[list[Any]]]
+"""Runs: ids of their first and last frames, their nodes and edges, and the values of each place."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameLine:
+    """The frames of many traces in one line.
+
+    Attributes
+    ----------
+    ids, times : (F,) int64
+        In order of ``frame_id``; times ascend within a trace; ns.
+    owners : (F,) int64
+        The place of the trace of each.
+    begins : (F,) bool
+        Whether a trace begins with it, or what follows a gap.
+    traces, starts : (T,) int64
+        Ids of the traces, and the first frame of each.
+    periods, tolerances : (T,) int64
+        Of the traces; ns.
+    """
+
+    ids: Ints
+    times: Ints
+    owners: Ints
+    begins: Bools
+    traces: Ints
+    starts: Ints
+    periods: Ints
+    tolerances: Ints
+
+    @classmethod
+    def read(
+        cls, file: StoreFile, query: b.Query, catalog: Catalog, window: Window | None
+    ) -> FrameLine:
+        """Frames of the traces that a query asks, of those in a window."""
+        about = chosen_traces(file, query, catalog)
+        frames = frame_times(file, window)
+        rows = np.isin(trace_of(frames["frame_id"]), [*about])
+        if not rows.all():
+            frames = {name: column[rows] for name, column in frames.items()}
+        ids, times, numbers = (frames[name] for name in ("frame_id", "time_ns", "seq"))
+        starts = np.flatnonzero(np.diff(trace_of(ids), prepend=-1))
+        traces, counts = trace_of(ids[starts]), np.diff(starts, append=len(ids))
+        owners = np.repeat(np.arange(len(traces)), counts)
+        for low, high in zip(starts.tolist(), (starts + counts).tolist(), strict=True):
+            times[low:high] = ascending(times[low:high])
+        periods = [about[trace][2] for trace in traces.tolist()]
+        longest = np.array([longest_step_ns(period) for period in periods])
+        begins = np.diff(numbers, prepend=-2) != 1
+        begins[1:] |= np.diff(times) > longest[owners[1:]]
+        begins[starts] = True
+        tolerances = np.array([tolerance_ns(period) for period in periods], np.int64)
+        return cls(
+            ids, times, owners, begins, traces, starts, np.array(periods, np.int64), tolerances
+        )
+
+    def places(self, ids: Ints) -> Ints:
+        """(R,) the place of each of some frames; -1 of those that are not here."""
+        if not len(self.ids):
+            return np.full(len(ids), -1)
+        traces = trace_of(ids)
+        first = np.flatnonzero(np.diff(traces, prepend=-1))
+        owners = np.searchsorted(self.traces, traces[first])
+        start = self.starts[np.minimum(owners, len(self.traces) - 1)]
+        found = np.repeat(start, np.diff(first, append=len(ids))) + seq_of(ids)
+        np.minimum(found, len(self.ids) - 1, out=found)
+        elsewhere = np.flatnonzero(self.ids[found] != ids)
+        if len(elsewhere):  # of a trace that is not asked, or of one without some of its frames
+            wanted = ids[elsewhere]
+            there = np.minimum(np.searchsorted(self.ids, wanted), len(self.ids) - 1)
+            found[elsewhere] = np.where(self.ids[there] == wanted, there, -1)
+        return found
+
+
+@dataclass(frozen=True)
+class BindingRows:
+    """Rows of bindings in frames, by traces, bindings and frames; each once.
+
+    Attributes
+    ----------
+    line : FrameLine
+    frames : (R,) int64
+        The place of the frame of each row in the line.
+    keys : (R, n) int64
+    fresh : (R,) bool
+        Whether a binding begins with it.
+    values : dict of Bound to Column
+        (1, R).
+    """
+
+    line: FrameLine
+    frames: Ints
+    keys: Keys
+    fresh: Bools
+    values: Mapping[b.Bound, Column]
+
+    @classmethod
+    def of(
+        cls, line: FrameLine, ids: Ints, keys: Keys, values: Mapping[b.Bound, Column]
+    ) -> BindingRows:
+        """From rows in any order, of which those are left out whose traces are not asked."""
+        frames = line.places(ids)
+        known = frames >= 0
+        if not known.all():
+            frames, keys = frames[known], keys[known]
+            values = {name: _rows(value, known) for name, value in values.items()}
+        owners = line.owners[frames]
+        order = _order([owners, *keys.T, frames])
+        frames, keys, owners = frames[order], keys[order], owners[order]
+        fresh = np.ones(len(order), np.bool_)
+        fresh[1:] = np.diff(owners) != 0
+        for key in keys.T:
+            fresh[1:] |= key[1:] != key[:-1]
+        found = cls(line, frames, keys, fresh, {n: _rows(v, order) for n, v in values.items()})
+        again = ~fresh
+        again[1:] &= np.diff(frames) == 0
+        return found.only(~again) if again.any() else found
+
+    def only(self, rows: Bools) -> BindingRows:
+        """Some of the rows."""
+        owners = np.cumsum(self.fresh)[rows]
+        fresh = np.diff(owners, prepend=0) != 0
+        values = {name: _rows(value, rows) for name, value in self.values.items()}
+        return BindingRows(self.line, self.frames[rows], self.keys[rows], fresh, values)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @cached_property
+    def starts(self) -> Ints:
+        """The first row of each run: of frames that follow one another, with the same binding."""
+        follows = np.diff(self.frames, prepend=-2) == 1
+        return np.flatnonzero(self.fresh | ~follows | self.line.begins[self.frames])
+
+    def held(self, hold: b.BoundHold) -> BindingRows:
+        """The rows of the runs that last as long as is asked."""
+        if not len(self):
+            return self
+        counts = np.diff(self.starts, append=len(self))
+        first, last = self.frames[self.starts], self.frames[self.starts + counts - 1]
+        owners = self.line.owners[first]
+        length = counts
+        if not hold.length.frames:
+            length = self.line.times[last] - self.line.times[first]
+            length = length + (self.line.periods[owners] if hold.inclusive else 0)
+        tolerances: Any = self.line.tolerances[owners]
+        return self.only(np.repeat(hold.fits(length, tolerances), counts))
+
+
+class RowValues(SignalValues):
+    """The values of the tests of a plan, a row of bindings in frames each: (1, R).
+
+    Parameters
+    ----------
+    rows : BindingRows
+    """
+
+    def __init__(self, rows: BindingRows) -> None:
+        nothing = np.zeros(0, np.int64)
+        super().__init__(Clock(nothing, nothing, 0))
+        self._rows = rows
+
+    def signal(self, signal: Ask) -> Column:
+        """The values of a signal: (1, R)."""
+        assert signal.value is not None  # noqa: S101 - it is no atom
+        return self._rows.values[signal.value]
+
+    def course(self, course: b.SignalCall, test: Test) -> Column:
+        """The value of a window: (1, R)."""
+        column = self.signal(test.signals[course.operand])
+        first = self.window_starts(course)
+        if course.word in {"sum_over", "avg_over"}:
+            known = column.known & np.isfinite(column.values)
+            if np.abs(column.values[known]).max(initial=0) > LARGE:
+                return _one_by_one(course.word, column.values[0], known[0], first)
+        return over_columns(course.word, column, first)
+
+    def window_starts(self, course: b.SignalCall) -> Ints:
+        """(R,) the first row of the window of a course at each row."""
+        rows, line = self._rows, self._rows.line
+        here = np.arange(len(rows))
+        stretch = np.cumsum(line.begins)[rows.frames]
+        begun = rows.fresh | (np.diff(stretch, prepend=0) != 0)
+        begun = np.maximum.accumulate(np.where(begun, here, 0))
+        if course.frames:
+            at, guess = rows.frames, here - (course.by - 1)
+            limit = at - (course.by - 1)
+        else:
+            owners = line.owners[rows.frames]
+            at, room = line.times[rows.frames], course.by + line.tolerances
+            limit = at - room[owners]
+            guess = here - (room // np.maximum(line.periods, 1))[owners]
+        # Where no frame is missing, and a clock goes evenly, the window has as many rows as frames.
+        found = np.maximum(guess, begun)
+        early = (found == begun) | (at[found - 1] < limit)
+        wrong = np.flatnonzero((at[found] < limit) | ~early)
+        found[wrong] = _earliest(at, limit[wrong], begun[wrong], wrong)
+        return found
+
+
+class RunFinder:
+    """Finder of the runs of a pattern of one frame in a store.
+
+    Parameters
+    ----------
+    file : StoreFile
+        It stays as it is while this is used.
+    catalog : Catalog
+    query : Query
+        Of one step.
+    plan : Plan
+        Of its further conditions, and of values over its runs.
+    ask : Ask
+        The pattern.
+    named : tuple of str
+        The nodes and edges that a match tells.
+    """
+
+    def __init__(
+        self,
+        file: StoreFile,
+        catalog: Catalog,
+        query: b.Query,
+        plan: Plan,
+        ask: Ask,
+        named: tuple[str, ...],
+    ) -> None:
+        self._file, self._catalog, self._query = file, catalog, query
+        self._plan, self._ask, self._named = plan, ask, named
+        scope = ask.query.scope
+        bare = not (scope.edges or scope.where) and {*scope.nodes} == {*ask.variables}
+        self._window_nodes = {*ask.variables} if bare else None
+
+    def fits(self, places: Sequence[b.Bound]) -> bool:
+        """Tell whether rows of the pattern are enough to tell where it holds, and some values."""
+        step = self._query.steps[0]
+        if self._query.spans or step.absent or self._query.gaps != "break" or self._ask.everywhere:
+            return False
+        if any(isinstance(one, b.Operation) and one.word in CONNECTIVES for one in step.when):
+            return False  # where what is unknown is false
+        asked = [*step.when, *(value for place in places for value in _values(place))]
+        return all(map(self._is_of_rows, asked))
+
+    def _is_of_rows(self, value: b.Bound) -> bool:
+        match value:
+            case b.SignalCall(word=word, operand=operand) if word in b.WINDOWS:
+                plain = not b.is_temporal(operand) and self._is_of_rows(operand)
+                return plain and b.nodes_of(operand) == self._window_nodes
+            case b.Operation(operands=operands) if b.is_temporal(value):
+                return all(map(self._is_of_rows, operands))
+            case b.StepTime():
+                return False
+            case _:
+                plain = not (b.is_temporal(value) or b.edges_of(value) or [*b.blocks_of(value)])
+                return plain and b.nodes_of(value) <= {*self._ask.variables}
+
+    def found(self, places: Sequence[b.Bound], within: Window | None) -> Iterator[RunsTold]:
+        """The runs in whole traces; not more of these at a time than memory may hold.
+
+        Parameters
+        ----------
+        places : sequence of Bound
+            What is worked out for each run.
+        within : Window or None
+        """
+        asked = [one for one in extents(self._catalog) if within is None or one[0] in within]
+        steps = Windows(asked, first=FIRST_WINDOW, whole_traces=True)
+        for window in steps:
+            for told, rows in steps.parts(window or within, partial(self._found, places)):
+                steps.rows += rows // ROWS_EACH
+                yield told
+
+    def _found(self, places: Sequence[b.Bound], window: Window | None) -> tuple[RunsTold, int]:
+        """The runs in a window, and how many rows were read."""
+        step = self._query.steps[0]
+        tests = {one: self._plan.test(one) for one in step.when}
+        tests |= {one: self._plan.test(one) for place in places for one in _values(place)}
+        rows = self._read(tests.values(), window)
+        many = len(rows)
+        values = RowValues(rows)
+        found = {one: _whole(values.test(test), len(rows)) for one, test in tests.items()}
+        rows = replace(rows, values=found)
+        for one in step.when:
+            rows = rows.only(rows.values[one].true[0])
+        rows = self._projected(rows)
+        rows = rows if step.hold is None else rows.held(step.hold)
+        columns = rows.values
+        counts = np.diff(rows.starts, append=len(rows))
+        told: list[Any] = []
+        for place in places:
+            if isinstance(place, b.OverMatch):
+                at = None if place.at is None else columns[place.at]
+                over = over_rows(place.word, columns[place.operand], rows.starts, at)
+                told.append(np.repeat(over, counts))
+            else:
+                here = np.arange(len(rows))
+                told.append(picked(columns[place], np.zeros_like(here), here))
+        return self._parts(rows, told), many
+
+    def _parts(self, rows: BindingRows, told: list[Any]) -> RunsTold:
+        """Runs in which all that is told stays the same, and ids of frames follow one another."""
+        ids = rows.line.ids[rows.frames]
+        new = np.diff(ids, prepend=-2) != 1
+        new[rows.starts] = True
+        for column in told:
+            new[1:] |= column[1:] != column[:-1]
+        first = np.flatnonzero(new)
+        last = np.append(first[1:], len(ids))[: len(first)] - 1
+        values = [column[first].tolist() for column in told]
+        return ids[first], ids[last], rows.keys[first], values
+
+    def _projected(self, rows: BindingRows) -> BindingRows:
+        """Rows of what is told of a match alone."""
+        if self._named == self._ask.columns:
+            return rows
+        columns = [self._ask.columns.index(name) for name in self._named]
+        ids = rows.line.ids[rows.frames]
+        return BindingRows.of(rows.line, ids, rows.keys[:, columns], rows.values)
+
+    def _read(self, tests: Collection[Test], window: Window | None) -> BindingRows:
+        """The rows of the pattern, with all that tests need of them."""
+        signals = {signal.name: signal for test in tests for signal in test.signals.values()}
+        asked = [signal.value for signal in signals.values() if signal.value is not None]
+        line = FrameLine.read(self._file, self._query, self._catalog, window)
+        size = ROW_BYTES + EDGE_BYTES * len(self._ask.edges) + VALUE_BYTES * len(asked)
+        most = self._file.memory // size
+        ids, keys, found = arrays_of(self._file, self._catalog, self._ask, window, asked, most)
+        asks = signals.values()
+        values = {ask.value: _column(one) for ask, one in zip(asks, found, strict=True)}
+        return BindingRows.of(line, ids, keys, values)
+
+
+def _values(place: b.Bound) -> tuple[b.Bound, ...]:
+    """The values of frames that a place is made of."""
+    if not isinstance(place, b.OverMatch):
+        return (place,)
+    return (place.operand,) if place.at is None else (place.operand, place.at)
+
+
+def _column(told: Any) -> Column:
+    """(1, R) what the database tells of rows."""
+    values, known = np.ma.getdata(told), ~np.ma.getmaskarray(told)
+    if values.dtype.kind in "iuf":
+        values = values.astype(np.float64)
+        known &= ~np.isnan(values)
+    return Column(values[None], known[None])
+
+
+def _rows(column: Column, rows: Any) -> Column:
+    return Column(column.values[:, rows], column.known[:, rows])
+
+
+def _whole(column: Column, rows: int) -> Column:
+    """A column with a value for each row."""
+    shape = 1, rows
+    return Column(np.broadcast_to(column.values, shape), np.broadcast_to(column.known, shape))
+
+
+def _order(columns: Sequence[Ints]) -> Ints:
+    """The order of rows by some columns, the first of them first."""
+    if not len(columns[0]):
+        return np.zeros(0, np.int64)
+    code, size = np.zeros(len(columns[0]), np.int64), 1
+    for column in columns:
+        low = int(column.min())
+        many = int(column.max()) - low + 1
+        size *= many
+        if size >= 1 << 62:
+            return np.lexsort(columns[::-1])
+        if many > 1:
+            code *= many
+            code += column
+            code -= low
+    return np.argsort(code, kind="stable")  # a merge of the runs in which a store has its rows
+
+
+def _earliest(at: Ints, limit: Ints, low: Ints, high: Ints) -> Ints:
+    """The first places, from ``low`` on, where ascending numbers reach a limit, as they do at ``high``."""
+    low, high = low.copy(), high.copy()
+    while np.any(low < high):
+        middle = (low + high) // 2
+        reached = at[middle] >= limit
+        low, high = np.where(reached, low, middle + 1), np.where(reached, middle, high)
+    return low
+
+
+def _one_by_one(word: str, values: Any, known: Bools, first: Ints) -> Column:
+    """Sums, or averages, of the values known in windows."""
+    count = np.concatenate(([0], np.cumsum(known)))
+    some = values[known].tolist()
+    ends = zip(count[first].tolist(), count[1:].tolist(), strict=True)
+    total = np.array([math.fsum(some[low:high]) for low, high in ends])
+    many = count[1:] - count[first]
+    total = total / np.maximum(many, 1) if word == "avg_over" else total
+    return Column(total[None], (many > 0)[None])
