@@ -1,4 +1,4 @@
-"""Tables as dataclasses, a column in each field: some of the rows, and several tables as one.
+"""Tables as dataclasses, a column in each field: some of the rows, several tables as one; and their order.
 
 A column is an array or a tuple. What is neither is the same for all rows, and is that of the first table.
 """
@@ -45,3 +45,12 @@ def _chained(parts: list[Any]) -> Any:
     if isinstance(parts[0], tuple):
         return tuple(chain(*parts))
     return np.concatenate(parts) if isinstance(parts[0], np.ndarray) else parts[0]
+
+
+def ascending(numbers: NDArray[np.int64]) -> NDArray[np.intp]:
+    """The stable order of numbers that are not below zero, by 16 bits at a time, which numpy sorts by radix."""
+    order = np.argsort(numbers.astype(np.uint16), kind="stable")
+    for shift in range(16, int(numbers.max(initial=0)).bit_length(), 16):
+        digits = (numbers[order] >> shift).astype(np.uint16)
+        order = order[np.argsort(digits, kind="stable")]
+    return order

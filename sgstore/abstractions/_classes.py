@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from sgstore.abstractions._columns import ego_lanes, found
 from sgstore.abstractions._subsets import OF_JUNCTION
+from sgstore.columns import ascending
 from sgstore.vocabulary import MOST_RELATIONS, RELATION_CODE
 
 if TYPE_CHECKING:
@@ -353,7 +354,7 @@ class _Block:
             raise ValueError("an edge of an abstraction ends at what is no node of its frame")
         src, dst = rows.reshape(2, -1)
         key = src * len(graphs.node) + dst
-        order = np.argsort(key, kind="stable")  # most edges ascend: that is soon sorted
+        order = ascending(key)
         first = np.flatnonzero(np.append(True, key[order[1:]] != key[order[:-1]])[: len(key)])
         label, alone = on_edges[graphs.label[order]], order[first]
         low, high = label.T.copy() if len(first) == len(key) else np.add.reduceat(label, first).T
@@ -467,17 +468,6 @@ def _mixed(words: Words) -> Words:
     return words
 
 
-def _narrow(values: Ints, bound: int) -> NDArray[Any]:
-    """Small numbers in a type that sorts by radix."""
-    return values.astype(np.uint16) if bound <= 1 << 16 else values
-
-
-def _by(first: Ints, second: Ints, bound: int) -> NDArray[np.intp]:
-    """The order of pairs of numbers below a bound."""
-    order = np.argsort(_narrow(second, bound), kind="stable")
-    return order[np.argsort(_narrow(first, bound)[order], kind="stable")]
-
-
 def _sums(owner: Ints, values: Words, count: int) -> Words:
     """Sums of values by owner, modulo 2⁶⁴; owners ascend."""
     total = np.zeros(count, np.uint64)
@@ -499,7 +489,7 @@ def _refined(block: _Block) -> Words:
     np.add.at(colour, block.src[loops], _mixed(block.low[loops] + _D))
     rows = np.flatnonzero(~loops)
     src, dst = block.src[rows], block.dst[rows]
-    out_label, back = block.low[rows], np.argsort(_narrow(dst, nodes), kind="stable")
+    out_label, back = block.low[rows], ascending(dst)
     src_back, dst_back, in_label = src[back], dst[back], out_label[back] * _D
     size = np.bincount(block.graph, minlength=block.graphs)
     cells = _cells(block, colour)
@@ -605,7 +595,7 @@ def _hashed(block: _Block, order: Ints, known: Bools) -> list[str]:
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
     nodes = np.stack([block.node_low[order], block.node_high[order]], axis=1).astype("<u8")
-    sorted_edges = _by(place[block.src], place[block.dst], len(order))
+    sorted_edges = ascending(place[block.src] * len(order) + place[block.dst])
     node_ends = np.searchsorted(block.graph, np.arange(block.graphs + 1))
     edge_ends = np.searchsorted(block.edge_graph[sorted_edges], np.arange(block.graphs + 1))
     start = node_ends[block.edge_graph[sorted_edges]]

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.columns import ascending
 from sgstore.errors import StoreError
 from sgstore.quoting import quoted
 from sgstore.store._packing import FRAME_BITS, MISSING, packed
@@ -188,7 +189,7 @@ def in_order(table: str, columns: Columns, texts: Sequence[str]) -> Columns:
     if not keys or len(keys[0]) < 2:
         return columns
     number = packed(keys)
-    order = np.lexsort(keys[::-1]) if number is None else np.argsort(number, kind="stable")
+    order = np.lexsort(keys[::-1]) if number is None else ascending(number)
     if table not in MASKS:
         return {name: values[order] for name, values in columns.items()}
     ranked = keys if number is None else [number]

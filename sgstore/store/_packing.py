@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from sgstore.arrays import np
-from sgstore.columns import taken
+from sgstore.columns import ascending, taken
 from sgstore.world import BUCKET_FRAMES, GAP, KEPT, TOLERANCE_NS, TOLERANCE_SHARE, number, turned
 
 if TYPE_CHECKING:
@@ -111,14 +111,14 @@ def begins(frame_id: Ints) -> Bools:
     return found
 
 
-def masks_of(keys: Sequence[Whole], bits: Ints) -> tuple[NDArray[np.intp], Ints]:
+def masks_of(keys: Sequence[Whole], bits: Whole) -> tuple[NDArray[np.intp], Ints]:
     """Rows with equal keys become one, with the bits of all of them.
 
     Parameters
     ----------
     keys : sequence of (N,) int
         Columns of the key, the most significant first.
-    bits : (N,) int64
+    bits : (N,) int
         0 … 59.
 
     Returns
@@ -128,15 +128,15 @@ def masks_of(keys: Sequence[Whole], bits: Ints) -> tuple[NDArray[np.intp], Ints]
     mask : (M,) int64
     """
     if not len(bits):
-        return np.zeros(0, np.intp), bits
+        return np.zeros(0, np.intp), np.zeros(0, np.int64)
     number = packed(keys)
     if number is None:  # ids that are far apart: their ranks instead
         number = np.unique(np.stack(keys), axis=1, return_inverse=True)[1].reshape(-1)
-    # Edges come in long runs that ascend: merging them is cheap.
-    order = np.argsort(number, kind="stable")
+    order = ascending(number)
     ranked = number[order]
     starts = np.flatnonzero(np.append(True, ranked[1:] != ranked[:-1]))
-    return order[starts], np.bitwise_or.reduceat(np.left_shift(1, bits[order]), starts)
+    masks = np.left_shift(np.int64(1), bits[order])
+    return order[starts], np.bitwise_or.reduceat(masks, starts)
 
 
 def packed(keys: Sequence[NDArray[Any]]) -> Ints | None:
@@ -230,13 +230,15 @@ def edge_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds) -> Iterator
 
 
 def _edge_columns(graph: GraphBlock, edges: Edges, trace_id: int, kinds: NodeKinds) -> Columns:
-    seq, ego = graph.frames.seq[edges.frame], graph.frames.ego[edges.frame]
+    seq, ego = graph.frames.seq, graph.frames.ego
     # Without an ego it is -1, and so is a node of the map.
-    of_ego = ((edges.src == ego) * 2 + (edges.dst == ego)) * (ego >= 0)
-    bucket = trace_bucket(trace_id, seq)
+    of = np.where(ego < 0, MISSING, ego).astype(edges.src.dtype)[edges.frame]
+    of_ego = (edges.src == of).view(np.int8) * np.int8(2) + (edges.dst == of)
+    # In few bytes, for there are many edges; of buckets there are few in a block.
+    bucket = (seq // BUCKET_FRAMES - seq[0] // BUCKET_FRAMES).astype(np.int32)[edges.frame]
+    bit = (seq % BUCKET_FRAMES).astype(np.int8)[edges.frame]
     # Kinds follow from the nodes: the table is sorted by them when it is published.
-    keys = (edges.relation, of_ego, bucket, edges.src, edges.dst)
-    first, mask = masks_of(keys, seq % BUCKET_FRAMES)
+    first, mask = masks_of((edges.relation, of_ego, bucket, edges.src, edges.dst), bit)
     src, dst = edges.src[first], edges.dst[first]
     return {
         "relation": edges.relation[first],
@@ -244,7 +246,7 @@ def _edge_columns(graph: GraphBlock, edges: Edges, trace_id: int, kinds: NodeKin
         "dst_is_ego": of_ego[first] % 2 == 1,
         "src_kind": kinds.of(src),
         "dst_kind": kinds.of(dst),
-        "bucket": bucket[first],
+        "bucket": trace_bucket(trace_id, seq[edges.frame[first]]),
         "src": src,
         "dst": dst,
         "mask": mask,
