@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,7 @@ from sgstore.roads import (
     RoadMap,
 )
 from sgstore.sgg import SceneGraphGenerator
+from sgstore.step import Frame
 from sgstore.vocabulary import KIND_CODE, RELATION_CODE, RELATIONS
 from sgstore.world import Entities, Floats, FrameBlock, Ints, MessageRefs, States
 
@@ -137,6 +139,24 @@ class Recording:
 def frames(*of: list[Thing], ego: str = "ego") -> FrameBlock:
     """One block of frames."""
     return Recording(ego).block(*of)
+
+
+def frame_of(*things: Thing, ego: str | None = "ego", time_ns: int = 0) -> Frame:
+    """The same things as a frame for a graph online."""
+    frame = Frame(time_ns, ego)
+    for of in things:
+        frame.add(
+            *(of.name, of.kind, of.x, of.y, of.z),
+            heading=math.degrees(of.heading),
+            length=of.length,
+            width=of.width,
+            height=of.height,
+            vx=of.vx,
+            vy=of.vy,
+            static=of.static,
+            map_ref=of.map_ref,
+        )
+    return frame
 
 
 def graph_of(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from builders import Recording, thing
+from builders import Recording, frame_of, thing
 from graph_blocks import trace_info
 from opendrive_maps import (
     a_map,
@@ -33,7 +33,6 @@ from sgstore.opendrive import read_map
 from sgstore.query import Store
 from sgstore.roads import PlainLane, lane_text, read_lane_text
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.step import Frame
 from sgstore.store import StoreFile
 from sgstore.temporal import Monitor
 from sgstore.world import TraceReport
@@ -340,16 +339,7 @@ def test_a_monitor_tells_what_a_store_answers(
     events: list[MonitorEvent] = []
     monitor = Monitor(text, road_map, WIDE, on_event=events.append)
     for number, things in enumerate(of_frames):
-        frame = Frame(number * 100_000_000, "ego")
-        for one in things:
-            frame.add(
-                *(one.name, one.kind, one.x, one.y, one.z),
-                heading=math.degrees(one.heading),
-                length=one.length,
-                width=one.width,
-                height=one.height,
-            )
-        monitor.step(frame)
+        monitor.step(frame_of(*things, time_ns=number * 100_000_000))
     monitor.finish()
     told = sorted((e.values["sharpest"], e.values["slope"] or 0) for e in events)
     rows = store.find(f"{text}, v.id, INTERVALS").rows()

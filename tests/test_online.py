@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import networkx as nx
 import numpy as np
 import pytest
-from builders import PaperMap, Patch, Recording, Thing, thing
+from builders import PaperMap, Patch, Recording, Thing, frame_of, thing
 from thorough import LONG
 
 from sgstore import step as stepping
@@ -41,23 +41,6 @@ STREET = PaperMap(
 
 def generator(road_map: PaperMap | None = STREET, **settings: Any) -> SceneGraphGenerator:
     return SceneGraphGenerator(road_map, Config(**settings))
-
-
-def frame_of(*things: Thing, ego: str | None = "ego", time_ns: int = 0) -> Frame:
-    frame = Frame(time_ns, ego)
-    for of in things:
-        frame.add(
-            *(of.name, of.kind, of.x, of.y, of.z),
-            heading=math.degrees(of.heading),
-            length=of.length,
-            width=of.width,
-            height=of.height,
-            vx=of.vx,
-            vy=of.vy,
-            static=of.static,
-            map_ref=of.map_ref,
-        )
-    return frame
 
 
 def named(graph: SceneGraph) -> set[tuple[str, str, str]]:
