@@ -35,10 +35,11 @@ from sgstore.selection import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from sgstore.coverage import ChosenFrames
 
+Size = tuple[str, float, float]
 STRATEGIES: Final = {"random": "random strategy", "rl_based": "reinforcement learning"}
 SIZES: Final = {
     "Ego": ("car", 4.7, 1.9),
@@ -50,6 +51,8 @@ SIZES: Final = {
     "Hatchback": ("car", 4.2, 1.8),
 }
 """Kind, length and width of each model, which the data do not tell; m."""
+ONE_SIZE: Final = {model: (kind, 4.5, 1.8) for model, (kind, *_) in SIZES.items()}
+"""The same, if all vehicles were cars of one size."""
 
 SPLITS: Final = 10
 TIES: Final = 20
@@ -57,14 +60,14 @@ PERSON: Final = ("person", 0.5, 0.5)
 BESIDE: Final = {"closing_time": ("closing_time",), "dce_3s": ("dce_3s",), "wttc": ("wttc",)}
 
 
-def graph_of(number: int, run: dict[str, Any]) -> dict[str, Any]:
+def graph_of(number: int, run: dict[str, Any], sizes: Mapping[str, Size] = SIZES) -> dict[str, Any]:
     """The first way-point of a run as a node-link graph; Unity's axes, y up, turned clockwise from z."""
     nodes: list[dict[str, Any]] = []
     for name, (model, role) in run["o"].items():
         _, vx, vz, vy, x, z, y, turned = run["t"][name][0]
         ego = role == "Ego"
         kind, length, width = (
-            SIZES["Ego"] if ego else PERSON if role == "Pedestrian" else SIZES[model]
+            sizes["Ego"] if ego else PERSON if role == "Pedestrian" else sizes[model]
         )
         about = {"id": "ego" if ego else f"{number} {name}", "kind": kind, "is_ego": ego}
         about |= {"x": x, "y": y, "z": z, "heading": 90 - turned, "vx": vx, "vy": vy, "vz": vz}
@@ -72,7 +75,9 @@ def graph_of(number: int, run: dict[str, Any]) -> dict[str, Any]:
     return {"graph": {"name": f"run {number}"}, "nodes": nodes, "edges": []}
 
 
-def written(data: Path, strategy: str, folder: Path, every: int) -> tuple[Path, dict[str, bool]]:
+def written(
+    data: Path, strategy: str, folder: Path, every: int, sizes: Mapping[str, Size] = SIZES
+) -> tuple[Path, dict[str, bool]]:
     """A file of graphs, one for each run, and which of them failed."""
     graphs, failed = folder / f"{strategy}.jsonl", {}
     with lzma.open(data / f"{strategy}.jsonl.xz", "rt") as lines, graphs.open("w") as file:
@@ -80,7 +85,7 @@ def written(data: Path, strategy: str, folder: Path, every: int) -> tuple[Path, 
             if number % every:
                 continue
             run = json.loads(line)
-            file.write(json.dumps(graph_of(number, run)) + "\n")
+            file.write(json.dumps(graph_of(number, run, sizes)) + "\n")
             failed[f"run {number}"] = run["lab"][0] == "True"
     return graphs, failed
 
