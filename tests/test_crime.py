@@ -31,8 +31,8 @@ or by its own definition and one of these causes:
   acceleration and jerk, is free of all that was recorded later; ours are closed forms. ``steers``: TTR is TTS.
 * ``circles``: who walks is a circle of half its radius in DCE, and a box here.
 * ``set``: of the other one a set of places is told, where it may be, and no trajectory, which we do not read.
-* ``tie``: the gap is the least twice, to a tenth of a millimetre. ``left over``: the loop is empty, and what
-  was found before is told once more.
+* ``tie``: the gap is the least twice, to a tenth of a millimetre. ``told again``: the loop is empty, and the
+  step that was found for the pair at the step before is told once more, though it is past.
 * ``stands``: in WTTC what is a static obstacle does not accelerate. ``first root``: of the roots of WTTC's
   quartic the first one that is listed, and not the least; never 0.
 * ``speed as vx``: of states that tell no more than place, orientation, speed and acceleration, the velocity is
@@ -48,6 +48,7 @@ import math
 import os
 from collections import Counter
 from functools import cache, partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 from xml.etree import ElementTree as ET
@@ -149,6 +150,8 @@ class Case(NamedTuple):
     told: dict[str, float]
     given: dict[str, Any]
     step: int
+    before: tuple[int, float] | None = None
+    """Another step of both that was asked for right before, and what was told then."""
 
     @property
     def states(self) -> tuple[Floats, Floats]:
@@ -174,8 +177,13 @@ class Case(NamedTuple):
 
 def cases(measure: str) -> Iterator[Case]:
     with lzma.open(GOLDEN, "rt", encoding="utf-8") as lines:
-        rows = [json.loads(line) for line in lines]
-    for stem, ego, other, step, told, given in some([row for row in rows if measure in row[4]], 7):
+        rows = [row for line in lines if measure in (row := json.loads(line))[4]]
+    before = {
+        tuple(row[:4]): (last[3], last[4][measure])
+        for last, row in pairwise(rows)
+        if last[:3] == row[:3]
+    }
+    for stem, ego, other, step, told, given in some(rows, 7):
         scenario = known(stem)
         a = from_step(scenario.tracks[str(ego)], step * scenario.step)
         if other is None:
@@ -185,7 +193,8 @@ def cases(measure: str) -> Iterator[Case]:
             b = Track(a.times, np.repeat(scenario.standing[str(other)][None], len(a), axis=0))
         else:
             b = from_step(scenario.tracks[str(other)], step * scenario.step)
-        yield Case(scenario, (str(ego), str(other)), Encounter(a, b), told, given, step)
+        last = before.get((stem, ego, other, step))
+        yield Case(scenario, (str(ego), str(other)), Encounter(a, b), told, given, step, last)
 
 
 Judge: TypeAlias = "Callable[[Case], str]"
@@ -237,7 +246,9 @@ def ttce(case: Case) -> str:
     theirs, early = case.told["TTCE"], shorter(case)
     tries = [("equal", first(ttce_recorded(case.encounter)))]
     tries += [("last step", first(ttce_recorded(early)))]
-    tries += [] if len(early.a) else [("left over", theirs)]
+    if case.before is not None and not len(early.a):
+        step, told = case.before
+        tries += [("told again", told - (case.step - step) * case.scenario.step)]
     tries += [("set", theirs)] if case.ids[1] in case.scenario.sets else []
     if (found := cause(theirs, *tries)) != "unexplained":
         return found

@@ -65,7 +65,7 @@ def zones(
         [bool(junction) for junction in within],
         lengths.tolist(),
         _related(len(types), flow, traffic),
-        _related(len(types), flow[::-1], traffic),
+        _related(len(types), (flow[1], flow[0]), traffic),
         _groups(_related(len(types), beside, traffic)),
     )
     onward = lanes.reaches(_LEADING[MERGE_ZONE])
