@@ -207,7 +207,6 @@ def prioritize(
         say(text)
     if known is not None:
         _fault_detection(found, known, given.picture)
-    table = found.table()
     if output is not None:
         values = parameters_of(parameters)
         with count_bar(output.name, "cases") as progress:
@@ -219,7 +218,8 @@ def prioritize(
                 progress=progress,
             )
         say_made(made, output)
-    out.report(table)  # last: who reads only the first rows of it has the lock all the same
+    # Last: who reads only the first rows has the lock all the same.
+    out.write(found.columns, found.rows())
 
 
 def _fault_detection(order: Prioritized, known: dict[str, bool], picture: Path | None) -> None:

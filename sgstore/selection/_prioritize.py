@@ -41,7 +41,7 @@ from sgstore.selection._units import Budget, SelectionUnit, numbers_of_frames, u
 from sgstore.store import trace_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from sgstore.coverage import ChosenFrames
     from sgstore.locks import Lock
@@ -56,6 +56,12 @@ RANKED: Final = {name: one for name, one in PAIR_FUNCTIONS.items() if one.sql an
 
 LATER: Final = {name: one for name, one in RECORDED.items() if one.worse}
 """Those of what was recorded later, too."""
+
+
+_TOLD: Final = 1 << 15
+"""Units whose reasons are made together."""
+
+_OWN: Final = "of its class"
 
 
 class Priority(StrEnum):
@@ -202,54 +208,56 @@ class Prioritized:
     chance: Floats = field(default_factory=lambda: np.zeros(0))
     names: list[str] = field(default_factory=list[str])
 
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns of :meth:`rows`."""
+        likely = ["probability"] * bool(len(self.chance))
+        return ("place", "unit", "risk", *likely, *(one.name for one in self.worst), "reason")
+
+    def rows(self) -> Iterator[tuple[Any, ...]]:
+        """The units in order, with the reasons: made some thousand at a time, as they are asked for."""
+        store, units = self.units.chosen.store, self.units
+        sql = "SELECT trace_id, node_id, kind FROM entities"
+        kinds = {tuple(one): kind for *one, kind in store.file.rows(sql).values}
+        times = _times(units) if self.worst else np.zeros(0)
+        coded = self.code[self.picked] if len(self.code) else np.full(len(self.picked), UNKNOWN)
+        turns = _turns(coded)
+        many = np.bincount(self.code[self.code != UNKNOWN]) if len(self.code) else np.zeros(0)
+        of = [f"with {one}" for one in self.names]
+        for start in range(0, len(self.picked), _TOLD):
+            part = self.picked[start : start + _TOLD]
+            traces = trace_of(units.first[part]).tolist()
+            columns = [one.value[part].tolist() for one in self.worst]
+            risk = self.risk[part].tolist() if len(self.risk) else [None] * len(part)
+            told = [_reasons(one, part, traces, kinds, times) for one in self.worst]
+            if len(self.chance):
+                columns.insert(0, self.chance[part].tolist())
+                told.insert(0, [f"fails with probability {one:.2g}" for one in columns[0]])
+            if len(self.code):
+                here = slice(start, start + _TOLD)
+                classes = zip(coded[here].tolist(), turns[here].tolist(), strict=True)
+                told.append(
+                    [
+                        ""
+                        if code == UNKNOWN
+                        else _of_class(turn, many[code], units.unit, of[code] if of else _OWN)
+                        for code, turn in classes
+                    ]
+                )
+            said = ("; ".join(filter(None, one)) for one in zip(*told, strict=True))
+            known = [[None if v != v else v for v in one] for one in columns]  # noqa: PLR0124 - NaN
+            names = names_of_units(units, part)
+            places = range(start + 1, start + 1 + len(part))
+            for *row, reason in zip(places, names, risk, *known, said, strict=True):
+                yield (*row, reason or "nothing is known of it")
+
     def reasons(self) -> list[str]:
         """Reasons for the place of each unit, in the order of :attr:`picked`."""
-        store = self.units.chosen.store
-        rows = np.array([one.row[self.picked] for one in self.worst], np.int64)
-        times = _times(self.units, self.units.frame_id[np.unique(rows)])
-        kinds = {
-            (trace, node): kind
-            for trace, node, kind in store.file.rows(
-                "SELECT trace_id, node_id, kind FROM entities"
-            ).values
-        }
-        traces = trace_of(self.units.first)
-        seen: dict[int, int] = {}
-        many = np.bincount(self.code[self.code >= 0]) if len(self.code) else np.zeros(0, np.int64)
-        told: list[str] = []
-        for unit in self.picked.tolist():
-            likely = [f"fails with probability {self.chance[unit]:.2g}"] if len(self.chance) else []
-            parts = likely + [
-                _reason(
-                    one,
-                    unit,
-                    kinds.get((int(traces[unit]), int(one.other[unit]))),
-                    times,
-                    self.units,
-                )
-                for one in self.worst
-                if not np.isnan(one.value[unit])
-            ]
-            code = int(self.code[unit]) if len(self.code) else UNKNOWN
-            if code != UNKNOWN:
-                seen[code] = seen.get(code, 0) + 1
-                of = f"with {self.names[code]}" if self.names else "of its class"
-                parts.append(_of_class(seen[code], int(many[code]), self.units.unit, of))
-            told.append("; ".join(parts) or "nothing is known of it")
-        return told
+        return [row[-1] for row in self.rows()]
 
     def table(self) -> ReportTable:
-        """The units in order: ``place``, ``unit``, ``risk``, the measures, ``reason``."""
-        names = names_of_units(self.units, self.picked)
-        columns = [one.value[self.picked].tolist() for one in self.worst]
-        known = [[None if v != v else v for v in column] for column in columns]  # noqa: PLR0124 - NaN
-        risk = self.risk[self.picked].tolist() if len(self.risk) else [None] * len(names)
-        if len(self.chance):
-            known.insert(0, self.chance[self.picked].tolist())
-        rows = zip(range(1, len(names) + 1), names, risk, *known, self.reasons(), strict=True)
-        likely = ["probability"] * bool(len(self.chance))
-        head = ("place", "unit", "risk", *likely, *(one.name for one in self.worst), "reason")
-        return ReportTable(head, list(rows), self.said)
+        """All of :meth:`rows` at once: ``place``, ``unit``, ``risk``, the measures, ``reason``."""
+        return ReportTable(self.columns, list(self.rows()), self.said)
 
 
 def prioritize(
@@ -364,15 +372,19 @@ def _places(total: Floats, rank: Ints) -> Ints:
 
 def _in_rounds(order: Ints, code: Ints) -> Ints:
     """Units of an order in rounds: the first ones of each class, the second ones, and so on."""
-    place = np.empty(len(order), np.int64)
-    place[order] = np.arange(len(order))
-    by_class = np.lexsort((place, code))
-    fresh = np.append(True, np.diff(code[by_class]) != 0)
-    begins = np.maximum.accumulate(np.where(fresh, np.arange(len(order)), 0))
-    turn = np.empty(len(order), np.int64)
-    turn[by_class] = np.arange(len(order)) - begins
-    turn[code == UNKNOWN] = len(order)  # of no class: they bring none
-    return np.lexsort((place, turn))
+    turn = _turns(code[order])
+    turn[code[order] == UNKNOWN] = len(order) + 1  # of no class: they bring none
+    return order[np.argsort(turn, kind="stable")]
+
+
+def _turns(code: Ints) -> Ints:
+    """(n,): how many of the same class have come so far, each itself included."""
+    order = np.argsort(code, kind="stable")
+    fresh = np.append(True, np.diff(code[order]) != 0)[: len(code)]
+    places = np.arange(len(code))
+    turn = np.empty(len(code), np.int64)
+    turn[order] = places - np.maximum.accumulate(np.where(fresh, places, 0)) + 1
+    return turn
 
 
 def _together(*orders: Ints) -> Ints:
@@ -490,27 +502,35 @@ def _worst_of(units: Units, name: str, frames: Floats, who: Ints) -> WorstValues
     return WorstValues(name, np.where(unknown, np.nan, _sign(name) * least), row, who[row])
 
 
-def _times(units: Units, frame_id: Ints) -> dict[int, float]:
-    """Seconds since their traces began, of some frames."""
-    if not len(frame_id):
-        return {}
+def _times(units: Units) -> Floats:
+    """(N,): seconds since their traces began, of the frames of units."""
     found = units.chosen.store.file.arrays("SELECT frame_id, t FROM frames ORDER BY frame_id")
-    known = found["frame_id"].astype(np.int64)
-    at = np.searchsorted(known, frame_id)
-    return dict(zip(frame_id.tolist(), found["t"][at].astype(np.float64).tolist(), strict=True))
+    at = np.searchsorted(found["frame_id"].astype(np.int64), units.frame_id)
+    return found["t"].astype(np.float64)[at]
 
 
-def _reason(
-    worst: WorstValues, unit: int, kind: str | None, times: Mapping[int, float], units: Units
-) -> str:
-    time = times[int(units.frame_id[worst.row[unit]])]
-    if worst.name not in RANKED | LATER:
-        return f"{worst.name} is {worst.value[unit]:.3g} at {time:.1f} s"
-    measure = (RANKED | LATER)[worst.name]
-    of = "" if measure.unit == "ratio" else f" {measure.unit}"
-    return (
-        f"{worst.name} {worst.value[unit]:.3g}{of} with {kind} {worst.other[unit]} at {time:.1f} s"
-    )
+def _reasons(
+    worst: WorstValues,
+    part: Ints,
+    traces: Sequence[int],
+    kinds: Mapping[tuple[Any, ...], str],
+    times: Floats,
+) -> list[str]:
+    """What a measure says of each unit; nothing where it is not known."""
+    values, when = worst.value[part].tolist(), times[worst.row[part]].tolist()
+    name = worst.name
+    if name not in RANKED | LATER:
+        told = zip(values, when, strict=True)
+        return ["" if v != v else f"{name} is {v:.3g} at {t:.1f} s" for v, t in told]  # noqa: PLR0124 - NaN
+    unit = (RANKED | LATER)[name].unit
+    of = "" if unit == "ratio" else f" {unit}"
+    whom = worst.other[part].tolist()
+    return [
+        ""
+        if v != v  # noqa: PLR0124 - NaN
+        else f"{name} {v:.3g}{of} with {kinds.get((trace, other))} {other} at {t:.1f} s"
+        for v, t, other, trace in zip(values, when, whom, traces, strict=True)
+    ]
 
 
 def _of_class(turn: int, many: int, unit: str, of: str) -> str:
