@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from IPython.core.interactiveshell import InteractiveShell
+from traitlets.config import Config
 
 
 def cells_of(path: Path) -> list[str]:
@@ -41,6 +42,7 @@ def watched(shell: InteractiveShell) -> dict[str, Any]:
 def main() -> int:
     shell = InteractiveShell.instance(history_load_length=0)
     shell.history_manager.enabled = False
+    shell.config.IPKernelApp = Config()  # by which packages, DuckDB among them, know Jupyter
     for formatter in shell.display_formatter.formatters.values():
         formatter.enabled = True  # as a notebook has it; a terminal shows plain texts
     held = watched(shell)

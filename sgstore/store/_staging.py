@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
@@ -517,7 +518,8 @@ def scratch(spill: Path, *, memory: int = 0, threads: int = 1) -> DuckDBPyConnec
         "autoinstall_known_extensions": False,
     }
     connection = duckdb.connect(":memory:", config=config)
-    connection.execute("SET enable_progress_bar = false")  # on stdout, where Python is interactive
+    with suppress(duckdb.InvalidInputException):  # Jupyter without ipywidgets has none, and refuses
+        connection.execute("SET enable_progress_bar = false")  # where Python is interactive
     without_faults(connection)
     return connection
 
