@@ -1,4 +1,4 @@
-"""Merge and departure zones: where drawn maps have them, and the disturbances of ISO 34502 in them."""
+"""Merge and departure zones, the disturbances of ISO 34502 in them, and broad markings beside lanes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import commonroad_scenarios as commonroad
 import pytest
 from lanelet2_maps import LaneletMap
 from library_scenes import ENTRY, EXIT, SCENES, WAYS, on
-from opendrive_maps import a_map, a_road, lane, line, link, section
+from opendrive_maps import a_map, a_road, lane, line, link, mark, section
 from scenes import APART, Scene, along, ego, store_of
 from thorough import some
 
@@ -245,3 +245,90 @@ def test_who_is_on_no_lane_is_in_no_zone_that_is_known(tmp_path: Path) -> None:
 
     assert len(store.find("MATCH (e:Ego) WHERE NOT known(in_merge_zone(e))").rows()) == 6
     assert store.find("MATCH (e:Ego) WHERE in_zone(e, 'main')").rows() == []
+
+
+# Broad markings ---------------------------------------------------------------------------------------------
+
+
+def bold(drives: str = "RHT", *, centre: bool = False) -> RoadMap:
+    """Two lanes to each side; the markings between those of a side are broad from x = 100 to 200."""
+    marks = (mark("solid"), mark("solid", s=100, weight="bold"), mark("solid", s=200))
+    lanes = [lane(0, *(marks if centre else (mark("broken"),)))]
+    lanes += [lane(n, *(marks if abs(n) == 1 and not centre else ())) for n in (-1, -2, 1, 2)]
+    return read_map(a_map(a_road("1", line(400.0), sections=section(*lanes), rule=drives)), "bold")
+
+
+def broad(road_map: RoadMap) -> set[tuple[str, str, float, float]]:
+    names = road_map.nodes.name
+    return {
+        (names[-1 - at], what.removeprefix("broad_line_"), round(start), round(end))
+        for _, what, at, start, end in road_map.places.rows()
+        if what.startswith("broad_line")
+    }
+
+
+def test_broad_markings_are_beside_the_lanes_that_were_drawn_with_them() -> None:
+    ends = {
+        -1: (100, 200),
+        1: (200, 300),
+    }  # along the lanes: those to the left are driven against s
+    assert broad(bold()) == {
+        (f"1/0/{sign * number}", side, *ends[sign])
+        for sign in (1, -1)
+        for number, side in ((1, "right"), (2, "left"))
+    }
+    assert broad(bold(centre=True)) == {(f"1/0/{sign}", "left", *ends[sign]) for sign in (1, -1)}
+    assert broad(bold("LHT")) == {
+        (f"1/0/{sign * number}", side, *ends[-sign])
+        for sign in (1, -1)
+        for number, side in ((1, "left"), (2, "right"))
+    }
+
+
+def test_broad_lines_of_lanelets_and_of_commonroad_are_read(tmp_path: Path) -> None:
+    m = LaneletMap()
+    ways = [
+        m.way([(0, y), (100, y)], type=kind)
+        for y, kind in ((7.0, "line_thin"), (3.5, "line_thick"), (0.0, "curbstone"))
+    ]
+    left, right = m.lanelet(ways[0], ways[1]), m.lanelet(ways[1], ways[2])
+    assert broad(read_map(lanelet2_text(m.text()), "b.osm")) == {
+        (left, "right", 0, 100),
+        (right, "left", 0, 100),
+    }
+
+    text = commonroad.scenario().replace("dashed", "broad_dashed", 1)
+    (tmp_path / "c.xml").write_text(text, encoding="utf-8")
+    with open_trace(tmp_path / "c.xml") as trace:
+        found = broad(read_map(trace.info.map_text, "commonroad"))
+    assert found == {("1", "left", 0, 80)}
+
+
+def test_who_passes_on_the_right_of_a_broad_marking_keeps_the_rule(tmp_path: Path) -> None:
+    roads = {"bold": bold(), "thin": WAYS}
+    scene, _ = SCENES["r_i2_passing_on_the_right"]
+    traces = {name: [on(scene, road)] for name, road in roads.items()}
+    traces["bold"] = [
+        Scene(
+            roads["bold"],
+            *(replace(a, start=a.start + 105) for a in scene.actors),
+            seconds=scene.seconds,
+            rate=scene.rate,
+        )
+    ]
+    store = store_of(tmp_path / "s.db", traces)
+    text = pattern_named("r_i2_passing_on_the_right").text
+    verdicts = {one.trace: one.verdict for one in store.check(text)}
+    told: list[str] = []
+    monitor = Monitor(text, roads["bold"], on_event=lambda event: told.append(event.kind))
+    ids = store.file.arrays("SELECT frame_id FROM frames WHERE trace = 'bold' ORDER BY 1", [])
+    for graph in store.file.graphs(ids["frame_id"]):
+        monitor.look([graph])
+    monitor.finish()
+
+    assert verdicts == {"bold": "true", "thin": "false"}
+    assert "violated" not in told
+    crossed = "MATCH (e:Ego), (v:Vehicle) WHERE right_of_broad_line(e) AND left_of_broad_line(v)"
+    assert {row.trace for row in store.find(f"{crossed} RETURN trace.name AS trace").rows()} == {
+        "bold"
+    }

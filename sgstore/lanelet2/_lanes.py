@@ -290,7 +290,7 @@ def _border(document: OsmDocument, way: str, line: Floats, *, turned: bool) -> B
     elif any(sides):
         crossed = (sides[1] in _YES, sides[2] in _YES)
     to_left, to_right = crossed[::-1] if turned else crossed
-    return Border(line, to_left, to_right, way)
+    return Border(line, to_left, to_right, way, broad=tags.get("type") == "line_thick")
 
 
 def speed_of(text: str) -> float:

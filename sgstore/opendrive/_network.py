@@ -16,7 +16,16 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from sgstore.opendrive._document import last_before
-from sgstore.roads import STOREY, LaneChanges, MapNodes, conflicts, mean_widths, turn_words, turned
+from sgstore.roads import (
+    STOREY,
+    LaneChanges,
+    MapNodes,
+    broad_lines,
+    conflicts,
+    mean_widths,
+    turn_words,
+    turned,
+)
 from sgstore.vocabulary import DRIVING, TRAFFIC
 
 if TYPE_CHECKING:
@@ -24,7 +33,7 @@ if TYPE_CHECKING:
 
     from sgstore.opendrive._document import Document, ElementTable
     from sgstore.opendrive._lanes import LaneTable
-    from sgstore.roads import Edge, Ribbons
+    from sgstore.roads import Edge, MapPlaces, Ribbons
     from sgstore.world import Bools, Floats, Ints
 
 
@@ -619,6 +628,43 @@ def _marks(document: Document, lanes: LaneTable) -> Callable[[int, int], list[_S
         ]
 
     return between
+
+
+def read_broad_lines(document: Document, lanes: LaneTable, ribbons: Ribbons) -> MapPlaces:
+    """Markings of the weight ``bold``: at the outer border of one lane, at the inner one of the next."""
+    kind = "road/laneSection/lane/roadMark"
+    table, offsets = document[kind], document.rough_numbers(kind, "sOffset").tolist()
+    columns = table.parent, offsets, table.texts("type", "none"), table.texts("weight")
+    records: dict[int, list[tuple[float, bool]]] = {}
+    for raw, offset, mark, weight in zip(*columns, strict=True):
+        if np.isfinite(offset):
+            bold = weight.strip().lower() == "bold" and mark.strip().lower() != "none"
+            records.setdefault(int(raw), []).append((offset, bold))
+    names = zip(lanes.section.tolist(), lanes.ident.tolist(), strict=True)
+    row_of = {name: row for row, name in enumerate(names)}
+    rows: list[tuple[int, bool, float, float]] = []
+    for raw, marks in records.items():
+        own, centre = int(lanes.row[raw]), int(lanes.centre[raw])
+        section = centre if own < 0 else int(lanes.section[own])
+        ident = 0 if own < 0 else int(lanes.ident[own])
+        outer = (1, -1) if ident == 0 else (ident + (1 if ident > 0 else -1),)
+        beside = [(own, False)] * (own >= 0)
+        beside += [(row_of[section, one], True) for one in outer if (section, one) in row_of]
+        start, end = float(lanes.sections.start[section]), float(lanes.sections.end[section])
+        cuts = [min(max(start + offset, start), end) for offset, _ in sorted(marks)] + [end]
+        for (_, bold), first, last in zip(sorted(marks), cuts, cuts[1:], strict=False):
+            for row, inner in beside if bold and last > first else ():
+                # Inside is left of a lane that is driven on its road's right.
+                left = inner == ((lanes.ident[row] < 0) == lanes.forward[row])
+                rows.append((row, bool(left), first, last))
+    lane = np.array([row[0] for row in rows], np.int64)
+    ends = np.sort(
+        [ribbons.along_at(lane, np.array([row[i] for row in rows], np.float64)) for i in (2, 3)],
+        axis=0,
+    )
+    return broad_lines(
+        [(row[0], row[1], *along) for row, along in zip(rows, ends.T.tolist(), strict=True)]
+    )
 
 
 def _along(ribbons: Ribbons, lane: Ints, to: Ints, ends: Floats) -> LaneChanges:

@@ -37,6 +37,7 @@ from sgstore.opendrive._network import (
     junction_types,
     lane_nodes,
     neighbours,
+    read_broad_lines,
     read_lane_changes,
     road_nodes,
     road_types,
@@ -185,6 +186,7 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
         stops=(signal, lane, ribbons.along_at(lane, s)),
         stop_lines=signals.stop_lines(first_signal),
         courses=lane_courses(every, heights(document, lanes, every)),
+        broad_lines=read_broad_lines(document, lanes, ribbons),
         variant=signals.told,
     )
 

@@ -17,6 +17,8 @@ NEXT_PARTS: Final[Mapping[str, str]] = {
     "to_roundabout": "roundabout",
     "to_merge_zone": "merge_zone",
     "to_departure_zone": "departure_zone",
+    "to_broad_line_left": "broad_line_left",
+    "to_broad_line_right": "broad_line_right",
     "to_crosswalk": "crosswalk",
     "to_stop_line": "stop_line",
     "to_traffic_light": "traffic_light",

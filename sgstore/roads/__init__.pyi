@@ -50,6 +50,7 @@ from ._map import summary as summary
 from ._map import turn_words as turn_words
 from ._map import within as within
 from ._places import MapPlaces as MapPlaces
+from ._places import broad_lines as broad_lines
 from ._ribbons import LanePoints as LanePoints
 from ._ribbons import Ribbons as Ribbons
 from ._ribbons import conflicts as conflicts
@@ -85,6 +86,7 @@ __all__ = [
     "STOREY",
     "Sections",
     "about_lanes",
+    "broad_lines",
     "conflicts",
     "cross_sections",
     "edges_of",

@@ -81,12 +81,15 @@ class Border:
         that is not known.
     ident : str
         What the lanes that it bounds call it; empty: nothing.
+    broad : bool
+        Whether it is a broad marking.
     """
 
     line: Floats
     to_left: bool | None = None
     to_right: bool | None = None
     ident: str = ""
+    broad: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,6 +220,7 @@ def plain_lanes(
         sections = network.sections[row]
         sections = sections if line.forward else sections.turned_round()
         left, right = beside[row] if line.forward else beside[row][::-1]
+        bounds = (line.lefts, line.rights) if line.forward else (line.rights, line.lefts)
         against = set(_against(network, row, left | right))
         lanes.append(
             PlainLane(
@@ -236,6 +240,11 @@ def plain_lanes(
                 changes=tuple(_changes(network, row, beside[row], against)),
                 speed_limit=line.speed_limit,
                 roundabout=line.roundabout,
+                broad=tuple(
+                    side
+                    for side, borders in zip(("left", "right"), bounds, strict=True)
+                    if borders and all(border.broad for border in borders)
+                ),
             )
         )
     return lanes, network.warnings

@@ -140,6 +140,7 @@ def _fields(lane: PlainLane) -> dict[str, Any]:
     fields["changes"] = [
         [to, round(start, DIGITS), round(end, DIGITS)] for to, start, end in lane.changes
     ]
+    fields["broad"] = list(lane.broad)
     if math.isfinite(lane.speed_limit):
         fields["speed_limit"] = lane.speed_limit
     return {key: value for key, value in fields.items() if value not in ("", [])}
@@ -214,6 +215,7 @@ class _TextRow:
             changes=self._stretches("changes", 3),
             speed_limit=self._speed(),
             roundabout=self._text("roundabout"),
+            broad=self._sides("broad"),
         )
 
     def signal(self) -> PlainSignal:
@@ -290,6 +292,12 @@ class _TextRow:
             raise self._wrong(key, f"at most {MAX_RELATED} numbers of lanes")
         if not all(type(v) is int and 0 <= v < self._lanes for v in values):
             raise self._wrong(key, f"numbers of lanes, 0 to {self._lanes - 1}")
+        return tuple(values)
+
+    def _sides(self, key: str) -> tuple[str, ...]:
+        values = self._fields.get(key, [])
+        if values not in ([], ["left"], ["right"], ["left", "right"]):
+            raise self._wrong(key, "some of left and right")
         return tuple(values)
 
     def _stretches(self, key: str, numbers: int) -> tuple[tuple[int, float, float], ...]:

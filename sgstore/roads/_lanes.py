@@ -16,6 +16,7 @@ import shapely
 from sgstore.columns import chained
 from sgstore.roads._courses import lane_courses
 from sgstore.roads._map import STOREY, LaneChanges, MapEdges, MapNodes, RoadMap, turn_words
+from sgstore.roads._places import broad_lines
 from sgstore.roads._ribbons import Ribbons, conflicts, mean_widths, turned, wrapped
 from sgstore.vocabulary import DRIVING, RELATION_CODE
 
@@ -57,6 +58,8 @@ class PlainLane:
         m/s; NaN where there is none.
     roundabout : str
         The one that its road is in; empty: none.
+    broad : tuple of str
+        ``left``, ``right``: sides on which a broad marking bounds it.
     """
 
     name: str
@@ -75,6 +78,7 @@ class PlainLane:
     changes: tuple[tuple[int, float, float], ...] = ()
     speed_limit: float = np.nan
     roundabout: str = ""
+    broad: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,6 +195,13 @@ def road_map_of(
         stop_lines=np.array([first + r for r, s in enumerate(signals) if s.is_stop_line], np.int64),
         # Formats of lanes as lines have 0 where a point has no height.
         courses=lane_courses(ribbons, ribbons.height if ribbons.z.any() else None),
+        broad_lines=broad_lines(
+            [
+                (row, side == "left", 0.0, float(length))
+                for row, (lane, length) in enumerate(zip(lanes, ribbons.lengths, strict=True))
+                for side in lane.broad
+            ]
+        ),
     )
 
 

@@ -289,6 +289,8 @@ class RoadMap:
     stop_lines : (n,) int64, optional
         Columns of the signals that are painted stop lines.
     courses : LaneCourses, optional
+    broad_lines : MapPlaces, optional
+        Broad markings beside lanes.
     variant : str, optional
         In what it differs from the map that the text alone describes.
 
@@ -341,10 +343,12 @@ class RoadMap:
         stops: tuple[Ints, Ints, Floats] | None = None,
         stop_lines: Ints | None = None,
         courses: LaneCourses | None = None,
+        broad_lines: MapPlaces | None = None,
         variant: str = "",
     ) -> None:
         self.name = name
         self.text = text
+        self._broad_lines = broad_lines or MapPlaces.none()
         self.digest = hashlib.sha256((text + variant).encode("utf-8", "surrogatepass")).hexdigest()
         self.nodes = nodes
         self.edges = edges
@@ -576,7 +580,7 @@ class RoadMap:
 
     @cached_property
     def places(self) -> MapPlaces:
-        """Places of junctions, roundabouts, zones, crosswalks and signals along the lanes.
+        """Places of junctions, roundabouts, zones, broad lines, crosswalks and signals along the lanes.
 
         Of a map without sections there is none, as of :attr:`reach`.
         """
@@ -592,7 +596,7 @@ class RoadMap:
         names = {"lane": list(columns["lane"]), "road": nodes.road[lanes]}
         names["junction"] = nodes.junction[lanes]
         wholes = [made_of_lanes(self.ribbons, of, names[of], columns[of]) for of in columns]
-        wholes += [self._on_roundabouts(), self._on_zones()]
+        wholes += [self._on_roundabouts(), self._on_zones(), self._broad_lines]
         for column in self._stop_lines.tolist():
             what[column] = STOP_LINE
         crosswalks, _ = self._crosswalks

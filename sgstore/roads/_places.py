@@ -28,6 +28,10 @@ STOP_LINE: Final = "stop_line"
 """What a signal is called that is a line painted on the road."""
 
 
+BROAD_LINES: Final = ("broad_line_left", "broad_line_right")
+"""What a broad marking is called that bounds a lane to its left, and to its right, as its traffic sees it."""
+
+
 @dataclass(frozen=True, slots=True)
 class MapPlaces:
     """Stretches of lanes on which parts of a map lie, ordered by part, lane and start; shape (n,).
@@ -72,6 +76,13 @@ class MapPlaces:
         order = np.lexsort((end, start, lane, part))
         told = tuple(what[int(row)] for row in order)
         return cls(part[order], told, lane[order], start[order], end[order])
+
+
+def broad_lines(rows: Sequence[tuple[int, bool, float, float]]) -> MapPlaces:
+    """Broad markings beside lanes: the lane, whether it is to its left, and from where to where along it; m."""
+    lane = np.array([row[0] for row in rows], np.int64)
+    start, end = (np.array([row[i] for row in rows], np.float64) for i in (2, 3))
+    return MapPlaces.of(lane + 1, [BROAD_LINES[not row[1]] for row in rows], lane, start, end)
 
 
 def made_of_lanes(

@@ -66,6 +66,8 @@ _CROSSED: Final = {
 }
 """Markings → whether traffic may cross them."""
 
+_BROAD: Final = {"broad_dashed", "broad_solid"}
+
 _MPH: Final = 0.44704
 _KMH: Final = 1 / 3.6
 _ZONE: Final = "274.1"
@@ -171,6 +173,7 @@ def _evened(left: Floats, right: Floats) -> tuple[Floats, Floats]:
 def _line(scenario: TrafficScenario, lanelet: Lanelet, left: Floats, right: Floats) -> LaneLine:
     kind = _lane_type(lanelet)
     crossed = [_CROSSED.get(marking) for marking in lanelet.markings]
+    broad = [marking in _BROAD for marking in lanelet.markings]
     junction = scenario.junction_of.get(lanelet.ident, "")
     unnamed = not junction and "intersection" in lanelet.types
     return LaneLine(
@@ -178,8 +181,8 @@ def _line(scenario: TrafficScenario, lanelet: Lanelet, left: Floats, right: Floa
         kind,
         (left + right) / 2,
         both=bool({"vehicle", "car"} & {*lanelet.both_ways}),
-        lefts=(Border(left, crossed[0], crossed[0]),),
-        rights=(Border(right, crossed[1], crossed[1]),),
+        lefts=(Border(left, crossed[0], crossed[0], broad=broad[0]),),
+        rights=(Border(right, crossed[1], crossed[1], broad=broad[1]),),
         sections=Sections(left[:, :2], right[:, :2], (left[:, 2] + right[:, 2]) / 2),
         before=tuple(Joint(name, END) for name in lanelet.before),
         after=tuple(Joint(name, START) for name in lanelet.after),
