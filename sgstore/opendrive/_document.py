@@ -122,7 +122,10 @@ class ElementTable:
 
     def texts(self, name: str, default: str = "") -> list[str]:
         """A column of texts; ``default`` where the attribute is absent."""
-        return [attributes.get(name, default) for attributes in self.attributes]
+        try:
+            return [attributes[name] for attributes in self.attributes]
+        except KeyError:
+            return [attributes.get(name, default) for attributes in self.attributes]
 
 
 class Document:

@@ -90,14 +90,19 @@ def lane_courses(ribbons: Ribbons, heights: Heights | None) -> LaneCourses:
     number = np.arange(len(lane)) - (np.cumsum(counts) - counts)[lane]
     step = lengths[lane] / counts[lane]
     start, end = number * step, (number + 1) * step
+    # Where a stretch ends the next begins: places are the starts, and behind the last of a lane its end.
+    last = np.flatnonzero(number == counts[lane] - 1)
+    at_lane = np.insert(lane, last + 1, lane[last])
+    at = np.insert(start, last + 1, end[last])
+    row = np.arange(len(lane)) + np.searchsorted(last, np.arange(len(lane)))
     turn = np.cumsum(ribbons.bends)
-    turn = np.concatenate((np.zeros(1), turn[:-1]))
-    first, last = (ribbons.between(lane, along, turn) for along in (start, end))
-    curvature = np.round((last - first) / step, _DIGITS) + 0.0
+    turned = ribbons.between(at_lane, at, np.concatenate((np.zeros(1), turn[:-1])))
+    curvature = np.round((turned[row + 1] - turned[row]) / step, _DIGITS) + 0.0
     slope = np.full(len(lane), np.nan)
     if heights is not None:
-        slope = np.round((heights(lane, end) - heights(lane, start)) / step, _DIGITS) + 0.0
-    end[number == counts[lane] - 1] = np.inf
+        height = heights(at_lane, at)
+        slope = np.round((height[row + 1] - height[row]) / step, _DIGITS) + 0.0
+    end[last] = np.inf
     every = LaneCourses(lane, start, end, curvature, slope)
     return _joined(every)
 
