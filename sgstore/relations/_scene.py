@@ -431,12 +431,10 @@ class EdgeRoom:
         return edges
 
     def chained(self, parts: Sequence[Edges]) -> Edges:
-        """Edges of all parts, one part after another, as :meth:`Edges.chained` does it."""
-        parts = [part for part in parts if len(part)]
-        first, others = parts[: len(self._parts)], parts[len(self._parts) :]
+        """Edges of all parts: those that are in their place, and the others behind them."""
+        others = [part for part in parts if not any(part is own for own in self._parts)]
         count = self._used + sum(map(len, others))
-        in_place = all(one is other for one, other in zip(first, self._parts, strict=False))
-        if not in_place or len(first) < len(self._parts) or count > len(self._columns[0]):
+        if len(parts) - len(others) < len(self._parts) or count > len(self._columns[0]):
             return Edges.chained(parts)
         for part in others:
             _fill(self._columns, self._used, part)
