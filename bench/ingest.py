@@ -5,7 +5,7 @@
     python -m bench ingest [--quick]
 
 The recordings are made up: 40 cars in a town, one of them the ego, ground truth at 10 Hz, a picture at 5 Hz,
-the map in the file.
+the map in the file. Beside them stands real traffic, esmini's swarm on Town04, where the shared recordings are.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.measure import Measure
+from bench.replicas import DATA
 from bench.sgg import town
 from sgstore.config import Config
 from sgstore.ingest import BLOCK_FRAMES, ingest
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 CARS = 40
 MINUTE = 600
 """Frames of a minute."""
+SWARM = DATA / "traces/esmini/swarm_Town04.mcap"
 
 
 def recording(path: Path, frames: int) -> Path:
@@ -129,6 +131,19 @@ def peaks(folder: Path, short: Path, long: Path, times: int) -> Iterator[Measure
     yield Measure(f"peak memory, {60 * times} s", second, "MB", f"{second / first:.2f} times")
 
 
+def of_swarm(folder: Path, times: int = 3) -> Iterator[Measure]:
+    """A short recording of real traffic into stores of its own, the best of some."""
+    for on in ("a map never seen", "a known map") if SWARM.exists() else ():
+        spent, frames = math.inf, 0
+        for number in range(times):
+            if on == "a map never seen":
+                read_map.cache_clear()
+            start = time.process_time()
+            (outcome,) = ingest(folder / f"{on} {number}.db", [SWARM])
+            spent, frames = min(spent, time.process_time() - start), outcome.frames
+        yield Measure(f"esmini's swarm, {on}", frames / spent, "frames/s", f"{frames} frames")
+
+
 def run(quick: bool = False) -> list[Measure]:
     """A minute in parts, and one beside ten minutes."""
     times = 3 if quick else 10
@@ -156,5 +171,5 @@ def run(quick: bool = False) -> list[Measure]:
         outcomes = ingest(folder / "parts.db", [long])
         again = time.process_time() - start
         table.append(Measure("the same again", again, "s", outcomes[0].status))
-        table += peaks(folder, short, long, times)
+        table += [*of_swarm(folder), *peaks(folder, short, long, times)]
     return table

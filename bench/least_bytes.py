@@ -16,6 +16,8 @@ import duckdb
 import numpy as np
 import zstandard
 
+from bench.measure import Measure
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
@@ -44,6 +46,8 @@ TOLD = {
     "event": {"trace_id": "frame_id >> 24"},
 }
 """What other columns of a row tell: no more bytes are needed for it."""
+OF_MAPS = re.compile("map|light_lane")
+"""Tables that grow with the number of maps, not of frames."""
 _UUIDS = re.compile(r"([0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}\n)+")
 
 
@@ -142,3 +146,59 @@ def packed(values: NDArray[Any]) -> int:
 
 def _squeezed(data: bytes) -> int:
     return len(zstandard.ZstdCompressor(level=LEVEL).compress(data))
+
+
+def sizes(store: Path, folder: Path) -> Iterator[tuple[str, int, int]]:
+    """Bytes and rows of each table, in a file of its own, of blocks as large, less one that holds a number."""
+
+    def alone(source: str | None) -> tuple[int, int]:
+        path = folder / f"alone-{source}.db"
+        with duckdb.connect() as connection:
+            connection.execute(f"ATTACH '{store}' AS store (READ_ONLY)")
+            (block,) = connection.execute(
+                "SELECT block_size FROM pragma_database_size() WHERE database_name = 'store'"
+            ).fetchone()
+            connection.execute(
+                f"ATTACH '{path}' AS alone (STORAGE_VERSION 'v1.5.0', BLOCK_SIZE {block})"
+            )
+            told = "SELECT 1" if source is None else f"FROM store.inside.{source}"
+            connection.execute(f"CREATE TABLE alone.t AS {told}")
+            (rows,) = connection.execute("SELECT count(*) FROM alone.t").fetchone()
+            connection.execute("CHECKPOINT alone")
+            connection.execute("DETACH alone")
+        size = path.stat().st_size
+        path.unlink()
+        return size, rows
+
+    with duckdb.connect(str(store), read_only=True) as connection:
+        names = connection.execute(
+            "SELECT table_name FROM duckdb_tables() WHERE schema_name = 'inside' ORDER BY table_name"
+        ).fetchall()
+    empty, _ = alone(None)
+    for (name,) in names:
+        size, rows = alone(name)
+        if rows:
+            yield name, size - empty, rows
+
+
+def bytes_of(path: Path, frames: int, folder: Path, aim: int) -> Iterator[Measure]:
+    """Bytes a frame, whole and by table, beside the least that tables and their largest columns take."""
+    table = list(sizes(path, folder))
+    floor = {name: (least, columns) for name, least, columns in floors(path)}
+    whole = path.stat().st_size
+    maps = sum(size for label, size, _ in table if OF_MAPS.match(label))
+    yield Measure("whole file without maps", (whole - maps) / frames, "B/frame", f"aim {aim}")
+    for label, size, rows in sorted(table, key=lambda line: -line[1]):
+        if size >= frames / 10:
+            note = f"{rows / frames:.2f} rows a frame"
+            least, columns = floor.get(label, (0.0, {}))
+            if columns:
+                named = sorted(columns, key=lambda name: -columns[name])
+                large = [f"{name} {columns[name]:.0f}" for name in named if columns[name] >= 1]
+                note += f"; floor {least:.1f}" + (f": {', '.join(large)}" if large else "")
+            yield Measure(f"  {label}", size / frames, "B/frame", note)
+    rest = whole - sum(size for _, size, _ in table)
+    yield Measure("  what else is in the file", rest / frames, "B/frame")
+    lowest = sum(least for least, _ in floor.values())
+    yield Measure("floor of all tables but maps", lowest, "B/frame", "columns packed one by one")
+    yield Measure("tables of maps", maps / 2**20, "MiB")

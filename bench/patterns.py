@@ -28,8 +28,8 @@ import networkx as nx
 from networkx.algorithms.isomorphism import MultiDiGraphMatcher
 
 from bench import drives, peers
+from bench.least_bytes import sizes
 from bench.measure import Measure
-from bench.store import sizes
 from sgstore.config import Config, PairSettings
 from sgstore.opendrive import read_map
 from sgstore.query import Store

@@ -23,11 +23,10 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.least_bytes import floors
+from bench.least_bytes import bytes_of
 from bench.measure import Measure
 from bench.patterns import QUESTIONS, REFERENCE, asked, reference
 from bench.replicas import given, replicate, sources
-from bench.store import OF_MAPS, sizes
 from sgstore.query import Store
 from sgstore.store import StoreFile
 
@@ -66,29 +65,6 @@ def made(path: Path, traces: int) -> Iterator[Measure]:
     spent = time.process_time() - start
     yield Measure("brought into the store", frames / spent, "frames/s", f"{traces:,} traces")
     StoreFile(path).compact()
-
-
-def bytes_of(path: Path, frames: int, folder: Path) -> Iterator[Measure]:
-    """Bytes a frame, whole and by table, beside the least that tables and their largest columns take."""
-    table = list(sizes(path, folder))
-    floor = {name: (least, columns) for name, least, columns in floors(path)}
-    whole = path.stat().st_size
-    maps = sum(size for label, size, _ in table if OF_MAPS.match(label))
-    yield Measure("whole file without maps", (whole - maps) / frames, "B/frame", f"aim {BYTES}")
-    for label, size, rows in sorted(table, key=lambda line: -line[1]):
-        if size >= frames / 10:
-            note = f"{rows / frames:.2f} rows a frame"
-            least, columns = floor.get(label, (0.0, {}))
-            if columns:
-                named = sorted(columns, key=lambda name: -columns[name])
-                large = [f"{name} {columns[name]:.0f}" for name in named if columns[name] >= 1]
-                note += f"; floor {least:.1f}" + (f": {', '.join(large)}" if large else "")
-            yield Measure(f"  {label}", size / frames, "B/frame", note)
-    rest = whole - sum(size for _, size, _ in table)
-    yield Measure("  what else is in the file", rest / frames, "B/frame")
-    lowest = sum(least for least, _ in floor.values())
-    yield Measure("floor of all tables but maps", lowest, "B/frame", "columns packed one by one")
-    yield Measure("tables of maps", maps / 2**20, "MiB")
 
 
 def questions(path: str) -> dict[str, Any]:
@@ -151,5 +127,5 @@ def run(quick: bool = False) -> Iterator[Measure]:
             Store(path).sql("SELECT count(*), count(DISTINCT trace_id) FROM frames").values
         )
         yield Measure("frames", frames, "", f"{traces:,} traces")
-        yield from bytes_of(path, frames, folder)
+        yield from bytes_of(path, frames, folder, BYTES)
         yield from times_of(path, frames)

@@ -10,7 +10,6 @@ takes anyway weighs little.
 
 from __future__ import annotations
 
-import re
 import tempfile
 import time
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ from typing import TYPE_CHECKING
 import duckdb
 
 from bench.ingest import CARS, MINUTE, recording
+from bench.least_bytes import bytes_of, sizes
 from bench.measure import Measure
 from sgstore.config import Config
 from sgstore.ingest import BLOCK_FRAMES
@@ -31,8 +31,6 @@ from sgstore.vocabulary import KINDS, RELATIONS
 from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from sgstore.graph import GraphBlock
     from sgstore.roads import RoadMap
     from sgstore.world import TraceInfo
@@ -40,8 +38,6 @@ if TYPE_CHECKING:
 BASELINE_FRAMES = 20
 BYTES = 300
 """What is aimed at: bytes a frame of the compacted file, without the tables of maps."""
-OF_MAPS = re.compile("map|light_lane")
-"""Tables that grow with the number of maps, not of frames."""
 
 
 @dataclass
@@ -98,34 +94,6 @@ def by_rows(graph: GraphBlock, frames: int, path: Path) -> tuple[float, int]:
         return time.perf_counter() - start, len(nodes) + len(links)
 
 
-def sizes(store: Path, folder: Path) -> Iterator[tuple[str, int, int]]:
-    """Bytes and rows of each table, in a file of its own less one that holds a single number."""
-
-    def alone(source: str | None) -> tuple[int, int]:
-        path = folder / f"alone-{source}.db"
-        with duckdb.connect() as connection:
-            connection.execute(f"ATTACH '{store}' AS store (READ_ONLY)")
-            connection.execute(f"ATTACH '{path}' AS alone (STORAGE_VERSION 'v1.5.0')")
-            told = "SELECT 1" if source is None else f"FROM store.inside.{source}"
-            connection.execute(f"CREATE TABLE alone.t AS {told}")
-            (rows,) = connection.execute("SELECT count(*) FROM alone.t").fetchone()
-            connection.execute("CHECKPOINT alone")
-            connection.execute("DETACH alone")
-        size = path.stat().st_size
-        path.unlink()
-        return size, rows
-
-    with duckdb.connect(str(store), read_only=True) as connection:
-        names = connection.execute(
-            "SELECT table_name FROM duckdb_tables() WHERE schema_name = 'inside' ORDER BY table_name"
-        ).fetchall()
-    empty, _ = alone(None)
-    for (name,) in names:
-        size, rows = alone(name)
-        if rows:
-            yield name, size - empty, rows
-
-
 def filled(folder: Path, traces: int, minutes: int) -> tuple[StoreFile, int]:
     """A store of traces that differ in their digest only, and its number of frames."""
     store = StoreFile.create(folder / "many.db")
@@ -157,12 +125,7 @@ def run(quick: bool = False) -> list[Measure]:
         whole = store.path.stat().st_size
         table.append(Measure("compacted", whole / frames, "B/frame", note))
         store.close()
-        tables = list(sizes(store.path, folder))
-        maps = sum(size for label, size, _ in tables if OF_MAPS.match(label))
-        table.append(Measure("  without maps", (whole - maps) / frames, "B/frame", f"aim {BYTES}"))
-        for label, size, _ in sorted(tables, key=lambda line: -line[1]):
-            if size >= frames:
-                table.append(Measure(f"  {label}", size / frames, "B/frame", "compacted"))
+        table += bytes_of(store.path, frames, folder, BYTES)
         made = Made.of(recording(folder / "short.mcap", MINUTE))
         columns = made.into(StoreFile.create(folder / "columns.db")) / MINUTE
         seconds, count = by_rows(made.graphs[0], BASELINE_FRAMES, folder / "rows.db")
