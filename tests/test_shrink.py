@@ -192,3 +192,39 @@ def test_what_is_cut_out_of_a_recording_still_has_it_there(
             assert [one.verdict for one in cut_out.check(rule)] == ["false"]
         else:
             assert cut_out.find("MATCH cut_in()").count() == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [("file", "a file; an export needs a folder"), ("used", "manifest.json exists already")],
+)
+@pytest.mark.parametrize("verb", ["shrink", "export"])
+def test_a_folder_is_refused_before_anything_is_searched(
+    town_store: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    verb: str,
+    name: str,
+    told: str,
+) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "used").mkdir()
+    (tmp_path / "used" / "manifest.json").touch()
+    for search in ("shrink", "find"):
+        monkeypatch.setattr(Store, search, lambda *_, **__: pytest.fail("it searches"))
+
+    assert run([verb, str(town_store), "-p", "cut_in", "--to", str(tmp_path / name)]) != 0
+
+    assert told in " ".join(capsys.readouterr().err.split())
+
+
+def test_what_has_nothing_to_cut_says_so(
+    town_store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for text, told in (
+        ("CHECK ALWAYS ego.speed < 99", "nothing violates"),
+        ("MATCH (e:Ego) WHERE e.speed > 99", "nothing matches"),
+    ):
+        assert run(["shrink", str(town_store), text]) == 0
+        assert f"{told}: nothing to cut" in capsys.readouterr().err

@@ -160,9 +160,16 @@ def export(
     Geometric (pyg) and S3C (s3c). RETURN CLIPS(-3s, +5s) in the query wins over
     --before and --after.
     """
-    from sgstore.exporters import exporter_named, labelled, parse_labels, write_export
+    from sgstore.exporters import (
+        check_folder,
+        exporter_named,
+        labelled,
+        parse_labels,
+        write_export,
+    )
 
     exporter_named(form)  # before anything is searched
+    check_folder(to)
     texts = parse_labels(clip.labels or [])
     opened = bounds.opened(store)
     values = parameters_of(question.parameters)
@@ -253,7 +260,10 @@ def shrink(
     whole recording.
     """
     from sgstore.diff import has_checks
+    from sgstore.exporters import check_folder
 
+    if to is not None:
+        check_folder(to)  # before anything is searched
     opened = bounds.opened(store)
     text, values = question.asked()
     found = list(opened.shrink(text, clip, **values))
@@ -263,6 +273,8 @@ def shrink(
         say_unknown((one.check, one.trace, one.reason) for one in unknown)
     else:
         say_left_out(opened.find(text, **values))
+    if not found:
+        say(f"nothing {'violates' if checks else 'matches'}: nothing to cut")
     written: dict[Clip, WrittenClip | WrittenFile] = {}
     if to is not None and found:
         written = _cut_out(opened, list(dict.fromkeys(one.clip for one in found)), text, to)

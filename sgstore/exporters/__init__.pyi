@@ -2,6 +2,7 @@
 
 from ._clips import WrittenClip as WrittenClip
 from ._clips import WrittenFile as WrittenFile
+from ._clips import check_folder as check_folder
 from ._frames import cloud_of as cloud_of
 from ._labels import FEW as FEW
 from ._labels import ClipFrames as ClipFrames
@@ -38,6 +39,7 @@ __all__ = [
     "WrittenClip",
     "WrittenFile",
     "around_frames",
+    "check_folder",
     "cloud_of",
     "exporter_named",
     "exporters",

@@ -175,6 +175,24 @@ def safe_name(text: str, otherwise: str) -> str:
     return f"_{name}" if _RESERVED.fullmatch(name) else name
 
 
+def check_folder(to: Path) -> None:
+    """Refuse a folder that no export can be written into, before anything is searched.
+
+    Parameters
+    ----------
+    to : Path
+        It need not exist.
+
+    Raises
+    ------
+    ExportError
+        It is a file, or there is an export in it.
+    """
+    if os.path.lexists(to) and not to.is_dir():
+        raise ExportError(f"{to}: a file; an export needs a folder")
+    _refuse_taken(to, [MANIFEST])
+
+
 @contextmanager
 def export_folder(to: Path) -> Generator[Path]:
     """A folder to write the files of an export into; they are moved to ``to`` if all goes well.
