@@ -2,8 +2,9 @@
 
 ::
 
-    git clone https://github.com/opencypher/openCypher
-    python tests/tck.py openCypher/tck/features [--list]
+    mvn dependency:copy -Dartifact=org.opencypher:tck:1.0.0-M23 -DoutputDirectory=build
+    unzip -q build/tck-1.0.0-M23.jar -d build/tck
+    python tests/tck.py build/tck [--list]
 
 Of the scenarios of its Technology Compatibility Kit the queries that are executed count, each text once; not
 those that write, call procedures, or must be refused.
