@@ -12,18 +12,20 @@ from __future__ import annotations
 
 import cmath
 import math
+import re
 import sys
 import time
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from sgstore.lang import parse
 from sgstore.lang import syntax as s
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
     import networkx as nx
     from oracle_worlds import Frame, World
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
 
     Compared = Callable[[World], tuple[str, int]]
 
+T = TypeVar("T")
 VEHICLES = {"car", "truck", "van", "bus", "motorcycle", "bicycle", "trailer", "train", "vehicle"}
 MAP_KINDS = {"lane", "road", "junction", "crosswalk", "offroad", "waypoint"}
 GROUPS = {
@@ -388,34 +391,35 @@ def related(relation: str, label: s.LabelExpression) -> bool:
     )
 
 
+def remembered(function: Callable[[Any], T]) -> Callable[[Any], T]:
+    """What a function tells of a part of a parsed text, worked out once; ``REMEMBERED.clear()`` forgets it."""
+
+    def told(part: Any) -> T:
+        key = function.__name__, id(part)
+        if key not in REMEMBERED:
+            REMEMBERED[key] = part, function(part)
+        return REMEMBERED[key][1]
+
+    return told
+
+
+REMEMBERED: dict[tuple[str, int], tuple[Any, Any]] = {}
+"""By function and part: the part, so that it lives on, and what is told of it."""
+
+
+@remembered
 def links_of(block: s.Block) -> list[tuple[s.EdgePattern, int, int]]:
     """The edges of a block, and which nodes they join."""
-    if id(block) not in LINKS:
-        LINKS[id(block)] = (
-            block,
-            [
-                (edge, id(left), id(right))
-                for path in block.paths
-                for edge, left, right in zip(path.edges, path.nodes, path.nodes[1:], strict=False)
-            ],
-        )
-    return LINKS[id(block)][1]
+    return [
+        (edge, id(left), id(right))
+        for path in block.paths
+        for edge, left, right in zip(path.edges, path.nodes, path.nodes[1:], strict=False)
+    ]
 
 
-LINKS: dict[int, tuple[s.Block, list[tuple[s.EdgePattern, int, int]]]] = {}
-
-
+@remembered
 def free_names(block: s.Block | s.MatchClause) -> set[str]:
     """All names that occur in a block, or in blocks in it."""
-    if id(block) not in FREE:
-        FREE[id(block)] = block, names_in(block)
-    return FREE[id(block)][1]
-
-
-FREE: dict[int, tuple[s.Block | s.MatchClause, set[str]]] = {}
-
-
-def names_in(block: s.Block | s.MatchClause) -> set[str]:
     found: set[str] = set()
 
     def visit(part: Any) -> None:
@@ -693,7 +697,11 @@ def with_worlds(first: int, count: int) -> Iterator[tuple[int, World]]:
 
 
 def try_each(
-    first: int, count: int, made: Callable[[int], tuple[str, Compared]], found: str = "with rows"
+    first: int,
+    count: int,
+    made: Callable[[int], tuple[str, Compared]],
+    found: str = "with rows",
+    rows: Mapping[str, str] = MappingProxyType({}),
 ) -> Counter[str]:
     """Random queries on random worlds; how many, how many find something, how many are refused.
 
@@ -703,27 +711,29 @@ def try_each(
         Gives the text of a query by its number, and what tells the difference on a world and how much is found.
     found : str
         The word for those that find something.
+    rows : mapping of str to str
+        Regular expressions by name: how many queries have them is told, too.
     """
     from sgstore.errors import QueryError
 
     seen = Counter[str]()
     for number, world in with_worlds(first, count):
         text, compared = made(number)
-        LINKS.clear()
-        FREE.clear()
-        name = f"query {number}, world {number - (number - first) % WORLD}: {text}"
+        REMEMBERED.clear()
+        about = f"query {number}, world {number - (number - first) % WORLD}: {text}"
         try:
-            problem, rows = compared(world)
+            problem, many = compared(world)
         except QueryError as error:
             seen["refused"] += 1
             seen[error.reason.split("'")[0]] += 1
             continue
         except Exception as error:
-            error.add_note(name)
+            error.add_note(about)
             raise
         seen["tried"] += 1
-        seen[found] += rows > 0
-        assert not problem, f"{name}\n{problem}"
+        seen[found] += many > 0
+        seen.update(name for name, told in rows.items() if re.search(told, text))
+        assert not problem, f"{about}\n{problem}"
     return seen
 
 

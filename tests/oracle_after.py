@@ -223,19 +223,19 @@ class AfterWriter(Writer):
         case = self.case(a, b, number)
         keys = [f"{a}.kind", f"{b}.name", "trace.name", f"{a}.is_ego", "frame.seq % 2", case]
         values = [f"{a}.x", f"{b}.y", f"{a}.speed", f"{b}.width", "frame.seq", f"{a}.x - {b}.y"]
-        if self.rng.random() < 0.35:
+        if self.rng.random() < 0.25:
             return self.listed([*keys, *values], names)
         counted = self.counted(values, keys)
         chosen = self.rng.sample(keys, self.rng.choice((0, 1, 1, 2)))
         names = [*(f"k{i}" for i in range(len(chosen)))]
         items = [f"{key} AS {name}" for key, name in zip(chosen, names, strict=True)]
-        told = self.rng.sample(counted, self.rng.choice((1, 2)))
+        told = self.rng.sample(counted, self.rng.randint(1, len(counted)))
         items += [f"{value} AS n{i}" for i, value in enumerate(told)]
         if chosen and self.rng.random() < 0.2:
             items.append(f"CASE WHEN COUNT(*) > 1 THEN {chosen[0]} END AS mixed")
         self.rng.shuffle(items)
         text = f" RETURN {', '.join(items)}"
-        if self.rng.random() < 0.5:
+        if self.rng.random() < 0.8:
             text += f" HAVING {self.having(counted, names)}"
         return text + self.chosen(["COUNT(*)", *names], names)
 
@@ -255,9 +255,9 @@ class AfterWriter(Writer):
             text += " ORDER BY " + ", ".join(k + self.rng.choice(("", " DESC")) for k in some)
         if self.edges:
             return text
-        if per and self.rng.random() < 0.4:
+        if per and self.rng.random() < 0.7:
             text += f" LIMIT {self.rng.choice('123')} PER {self.rng.choice(per)}"
-        if self.rng.random() < 0.25:
+        if self.rng.random() < 0.6:
             text += f" SKIP {self.rng.choice('0125')}"
         if self.rng.random() < 0.25:
             text += f" LIMIT {self.rng.choice('1359')}"
@@ -318,6 +318,20 @@ def disagreement_after(text: str, world: World, *, in_order: bool = True) -> tup
     return ("" if same else f"found\n{found}\nwanted\n{wanted}"), len(wanted)
 
 
+ROWS = {
+    "HAVING": r"HAVING",
+    "of aggregates": r"COUNT\(\*\) \*|MAX\(.*\) - MIN|/ COUNT|\+ COUNT",
+    "CASE of rows": r"CASE",
+    "median": r"median",
+    "percentile": r"percentile",
+    "stddev": r"stddev",
+    "collect": r"collect",
+    "LIMIT n PER": r"LIMIT \d PER",
+    "SKIP": r"SKIP",
+}
+"""Constructs, and how they are told in a query."""
+
+
 def try_many_after(first: int, count: int) -> Counter[str]:
     """Random queries on random worlds."""
 
@@ -327,7 +341,7 @@ def try_many_after(first: int, count: int) -> Counter[str]:
         text += writer.after()
         return text, partial(disagreement_after, text, in_order=not writer.edges)
 
-    return try_each(first, count, made)
+    return try_each(first, count, made, rows=ROWS)
 
 
 if __name__ == "__main__":

@@ -14,8 +14,9 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from oracle import FREE, LINKS, answer, returned, rounded
+from oracle import REMEMBERED, answer, returned, rounded
 from oracle_over_time import compare_sequence, random_sequence, worlds
+from oracle_parts import online
 from oracle_patterns import Writer
 
 from sgstore.errors import QueryError
@@ -101,6 +102,8 @@ def of_second(world: World, store: Store, rng: random.Random) -> int:
     keep = [0, *(found.columns.index(name) for name in sorted(names))]
     assert Counter(tuple(row[i] for i in keep) for row in found) == wanted, apart
     assert found.count() == len(frames), apart
+    problem, _ = online(apart.removeprefix("USING UNKNOWN false "), world)
+    assert not problem, (apart, problem)
     return len(wanted)
 
 
@@ -132,8 +135,7 @@ def run(seeds: range, questions: int, folder: Path) -> Counter[str]:
         with store.file.snapshot():
             for name, construct in CONSTRUCTS.items():
                 for _ in range(questions):
-                    LINKS.clear()
-                    FREE.clear()
+                    REMEMBERED.clear()
                     try:
                         rows = construct(world, store, rng)
                     except QueryError:

@@ -13,12 +13,12 @@ import sys
 import tempfile
 from collections import Counter
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from itertools import pairwise, product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from oracle import Edge, Search, arithmetic, compare, links_of
+from oracle import Edge, Search, arithmetic, compare, links_of, remembered
 from oracle_worlds import random_world
 
 import sgstore
@@ -30,13 +30,14 @@ from sgstore.store import StoreFile
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from oracle_worlds import Frame, Trace, World
 
     from sgstore.query import Store
-    from sgstore.temporal import MonitorEvent
+    from sgstore.temporal import MonitorEvent, Verdict
 
+T = TypeVar("T")
 Binding = dict[str, int]
 GAP = 2.5
 WINDOWS = {
@@ -49,16 +50,16 @@ TIMED = {"run_length", "since_true", "age"}
 AHEAD = {"ALWAYS", "EVENTUALLY", "NEXT", "WEAKNEXT", "UNTIL", "RELEASE"}
 
 
-def parts_of(expression: Any) -> Iterator[Any]:
-    yield expression
+@remembered
+def parts_of(expression: Any) -> list[Any]:
+    """An expression and all that stands in it."""
+    inner: Any = expression if isinstance(expression, tuple) else ()
     if is_dataclass(expression):
-        for one in fields(expression):
-            yield from parts_of(getattr(expression, one.name))
-    elif isinstance(expression, tuple):
-        for part in expression:
-            yield from parts_of(part)
+        inner = [getattr(expression, one.name) for one in fields(expression)]
+    return [expression, *(part for one in inner for part in parts_of(one))]
 
 
+@remembered
 def is_temporal(expression: Any) -> bool:
     courses = {
         "prev",
@@ -76,6 +77,18 @@ def is_temporal(expression: Any) -> bool:
     )
 
 
+def once(method: Callable[[Any, Any, int, Binding], T]) -> Callable[[Any, Any, int, Binding], T]:
+    """What is told of an expression at a frame, worked out once for each binding."""
+
+    def told(self: Told, e: Any, i: int, binding: Binding) -> T:
+        key = method.__name__, id(e), i, *binding.items()
+        if key not in self.known:
+            self.known[key] = e, method(self, e, i, binding)
+        return self.known[key][1]
+
+    return told
+
+
 @dataclass
 class Told:
     """A trace and the definitions of what is true in it."""
@@ -84,6 +97,7 @@ class Told:
     period: int
     links: dict[str, tuple[s.EdgePattern, str, str]] = field(default_factory=dict)
     """Edge variables: the edge of the pattern, and the names of the nodes to its left and right."""
+    known: dict[Any, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.slack = max(1000, self.period // 100)
@@ -96,6 +110,7 @@ class Told:
 
     # Conditions
 
+    @once
     def true(self, e: Any, i: int, binding: Binding) -> bool:
         """A condition at a frame, unknown being false where time begins."""
         match e:
@@ -115,7 +130,7 @@ class Told:
             case _ if is_temporal(e):
                 return self.value(e, i, binding) is True
             case _:
-                spoken = {p.name for p in parts_of(e) if isinstance(p, s.Variable | s.NodePattern)}
+                spoken = named_in(e)
                 graph = self.frames[i].graph
                 here = all(binding[name] in graph for name in spoken & set(binding))
                 ways = self.with_edges(spoken, i, binding) if here else []
@@ -167,6 +182,7 @@ class Told:
 
     # Margins: by how much a condition is true
 
+    @once
     def margin(self, e: Any, i: int, binding: Binding) -> float:  # noqa: PLR0911 - a case each
         """By how much a condition holds at a frame: a comparison of numbers by their difference."""
         match e:
@@ -183,13 +199,13 @@ class Told:
             case s.Temporal():
                 return self.margin_over_time(e, i, binding)
             case s.Comparison(word=word, left=left, right=right):
-                spoken = {p.name for p in parts_of(e) if isinstance(p, s.Variable | s.NodePattern)}
+                spoken = named_in(e)
                 graph = self.frames[i].graph
                 here = all(binding[name] in graph for name in spoken & set(binding))
                 if not (here or is_temporal(e)):
                     return -math.inf
                 frames = isinstance(right, s.Duration) and right.unit == "frames"
-                one = self.counted(left, i, binding) if frames else self.value(left, i, binding)
+                one = self.timed(left, right, i, binding)
                 other = self.value(right, i, binding)
                 if not all(isinstance(v, int | float) or v is None for v in (one, other)):
                     return math.inf if self.true(e, i, binding) else -math.inf
@@ -244,15 +260,16 @@ class Told:
 
     def either(self, e: Any, i: int, binding: Binding) -> Any:
         """A condition that looks at other frames, or a value, at a frame."""
-        temporal = isinstance(e, s.Temporal)
-        return self.true(e, i, binding) if temporal else self.value(e, i, binding)
+        logic = isinstance(e, s.Temporal | s.Logic) and is_temporal(e)
+        return self.true(e, i, binding) if logic else self.value(e, i, binding)
 
+    @once
     def value(self, e: Any, i: int, binding: Binding) -> Any:  # noqa: C901, PLR0911, PLR0912 - a case each
         """A value at a frame; ``None`` is NULL."""
         match e:
             case s.Comparison(word=word, left=left, right=right):
                 frames = isinstance(right, s.Duration) and right.unit == "frames"
-                one = self.value(left, i, binding) if not frames else self.counted(left, i, binding)
+                one = self.timed(left, right, i, binding)
                 other = self.value(right, i, binding)
                 timed = isinstance(left, s.Call) and left.name in TIMED
                 same = timed and not frames and one is not None
@@ -286,8 +303,7 @@ class Told:
             case s.Call(name="robustness", arguments=(inner,)):
                 return self.margin(inner, i, binding)
             case s.Call(name="run_length", arguments=(inner,)):
-                run = self.run_up_to(inner, i, binding)
-                return (self.times[i] - self.times[run[0]]) / 1e9 if run else 0
+                return len(self.run_up_to(inner, i, binding))
             case s.Call(name="since_true", arguments=(inner,)):
                 past = [j for j in range(i + 1) if self.true(inner, j, binding)]
                 return (self.times[i] - self.times[past[-1]]) / 1e9 if past else None
@@ -303,8 +319,13 @@ class Told:
     def nodes_in(self, e: Any) -> set[str]:
         return spoken_of(e) - set(self.links)
 
-    def counted(self, e: Any, i: int, binding: Binding) -> int:
-        return len(self.run_up_to(e.arguments[0], i, binding))
+    def timed(self, e: Any, other: Any, i: int, binding: Binding) -> Any:
+        """What is compared with something: a run with a time is as long as it lasts, and else its frames."""
+        run_length = isinstance(e, s.Call) and e.name == "run_length"
+        if not (run_length and isinstance(other, s.Duration) and other.unit != "frames"):
+            return self.value(e, i, binding)
+        run = self.run_up_to(e.arguments[0], i, binding)
+        return (self.times[i] - self.times[run[0]]) / 1e9 if run else 0
 
     def run_up_to(self, e: Any, i: int, binding: Binding) -> list[int]:
         run: list[int] = []
@@ -348,12 +369,33 @@ class Told:
             {n for search in self.searches for n in search.graph if search.labelled(n, asked)}
         )
 
+    def checked(self, statement: s.CheckClause) -> tuple[bool, float]:
+        """Whether a check of the ego, or of it and each or some v, is met, and by how much."""
+        # The signs of the map are entities, too.
+        domain = self.ever("Entity")
+        ego = self.trace.ego if self.trace.ego in domain else -99
+        spoken = named_in(statement.formula)
+        if "ego" in spoken:
+            domain = [node for node in domain if node != ego]
+        asked = {one.word for one in statement.quantifiers}
+        bindings = [{"v": v, "ego": ego} for v in domain] if asked else [{"ego": ego}]
+        values = [self.true(statement.formula, 0, binding) for binding in bindings]
+        margins = [self.margin(statement.formula, 0, binding) for binding in bindings]
+        if "FORSOME" in asked:
+            return any(values), max(margins, default=-math.inf)
+        return all(values), min(margins, default=math.inf)
+
     # Sequences
 
     def holds(self, step: s.StepClause, known: set[str]) -> set[tuple[int, tuple[Any, ...]]]:
         """Frames and bindings in which a step's pattern and conditions hold; some names are those of others."""
-        named = (s.Variable, s.NodePattern)
-        told = {p.name for p in parts_of(step.block.where) if isinstance(p, named)} & known
+        key = "holds", id(step), *sorted(known)
+        if key not in self.known:
+            self.known[key] = step, self.held(step, known)
+        return self.known[key][1]
+
+    def held(self, step: s.StepClause, known: set[str]) -> set[tuple[int, tuple[Any, ...]]]:
+        told = named_in(step.block.where) & known
         names = sorted(told | names_of(step))
         parts = conjuncts(step.block.where)
         now = [part for part in parts if not is_temporal(part)]
@@ -623,6 +665,13 @@ def names_of(step: s.StepClause) -> set[str]:
     return {node.name for node in nodes if node.name}
 
 
+@remembered
+def named_in(e: Any) -> set[str | None]:
+    """The names of variables and nodes of patterns."""
+    return {part.name for part in parts_of(e) if isinstance(part, s.Variable | s.NodePattern)}
+
+
+@remembered
 def spoken_of(where: Any) -> set[str]:
     return {part.name for part in parts_of(where) if isinstance(part, s.Variable)} - {"frame"}
 
@@ -807,19 +856,31 @@ def compare_expression(world: World, store: Store, rng: random.Random) -> int:
             expected[trace.name, trace.frames[frames[0]].seq, trace.frames[end].seq, *nodes] += 1
             lasts[trace.name, tuple(frames), nodes] += 1
     assert set(found) == set(expected), (policy, text, found - expected, expected - found)
-    seen: Counter[Any] = Counter()
-    for trace in world.traces:
-        events: list[MonitorEvent] = []
-        about = {"on_event": events.append, "trace": trace.name}
-        monitor = Monitor(f"{using} {text}", period_s=periods(store)[trace.name] / 1e9, **about)
-        for frame in trace.frames:
-            monitor.look([graph_of(frame)])
-        monitor.finish()
-        for event in events:
-            nodes = tuple(event.nodes[name] for name in names)
-            seen[trace.name, tuple(step.seq for step in event.steps), nodes] += 1
+    seen = steps_watched(world, f"{using} {text}", names, periods(store))
     assert seen == lasts, (policy, text, seen - lasts, lasts - seen)
     return sum(lasts.values())
+
+
+def events_of(trace: Trace, text: str, period: dict[str, int]) -> list[MonitorEvent]:
+    """What is told of a trace frame by frame."""
+    events: list[MonitorEvent] = []
+    about = {"on_event": events.append, "trace": trace.name}
+    monitor = Monitor(text, period_s=period[trace.name] / 1e9, **about)
+    for frame in trace.frames:
+        monitor.look([graph_of(frame)])
+    monitor.finish()
+    return events
+
+
+def steps_watched(
+    world: World, text: str, names: list[str], period: dict[str, int]
+) -> Counter[Any]:
+    """The matches of a sequence, frame by frame: trace, frames of the steps, nodes of some names."""
+    return Counter(
+        (trace.name, tuple(step.seq for step in e.steps), tuple(e.nodes[name] for name in names))
+        for trace in world.traces
+        for e in events_of(trace, text, period)
+    )
 
 
 def expressions(seeds: range, questions: int, folder: Path) -> int:
@@ -832,6 +893,7 @@ def expressions(seeds: range, questions: int, folder: Path) -> int:
     return found
 
 
+@lru_cache(4)
 def periods(store: Store) -> dict[str, int]:
     return {trace.name: trace.period_ns for trace in store.info()}
 
@@ -854,6 +916,7 @@ def compare_sequence(world: World, store: Store, text: str, policy: str, written
     )
     expected: Counter[Any] = Counter()
     expected_spans: set[Any] = set()
+    lasts: Counter[Any] = Counter()
     period = periods(store)
     for trace in world.traces:
         told = Told(trace, period[trace.name])
@@ -863,7 +926,10 @@ def compare_sequence(world: World, store: Store, text: str, policy: str, written
             expected[trace.name, *nodes, *((told.times[i] - start) / 1e9 for i in frames)] += 1
             seqs = (trace.frames[frames[0]].seq, trace.frames[end].seq)
             expected_spans.add((trace.name, *seqs, *nodes))
+            lasts[trace.name, tuple(frames), nodes] += 1
     assert found == expected, (text, found - expected, expected - found)
+    seen = steps_watched(world, query, names, period)
+    assert seen == lasts, (query, seen - lasts, lasts - seen)
     assert set(spans) == expected_spans, (text, set(spans) ^ expected_spans)
     return sum(expected.values())
 
@@ -911,10 +977,10 @@ PAIR_OPERANDS = (
 OVER = ("MIN", "MAX", "AVG", "SUM", "FIRST", "LAST", "ARGMIN", "ARGMAX")
 
 
-def over_values(rng: random.Random, names: list[str], *, pair: bool) -> list[str]:
+def over_values(rng: random.Random, names: list[str], *, pair: bool, many: int = 4) -> list[str]:
     """Values over a match whose steps have these names."""
     found: list[str] = []
-    for _ in range(4):
+    for _ in range(many):
         operands = OPERANDS + (PAIR_OPERANDS * 2 if pair else ())
         word, operand = rng.choice(OVER), rng.choice(operands)
         more = f", {rng.choice(operands)}" if word[:3] == "ARG" and rng.random() < 0.5 else ""
@@ -926,7 +992,7 @@ def over_values(rng: random.Random, names: list[str], *, pair: bool) -> list[str
     return found
 
 
-def compare_over_sequence(world: World, store: Store, rng: random.Random) -> int:
+def compare_over_sequence(world: World, store: Store, rng: random.Random, *, many: int = 4) -> int:
     """Ask values over the matches of a sequence both ways; how many there are."""
     text = random_sequence(rng)
     policy = rng.choice(("all", "first", "longest"))
@@ -934,7 +1000,7 @@ def compare_over_sequence(world: World, store: Store, rng: random.Random) -> int
     assert isinstance(plain, s.MatchClause)
     steps = [one for one in plain.sequence.steps if isinstance(one, s.StepClause) and one.name]
     names = [str(step.name) for step in steps]
-    asked = over_values(rng, names, pair="(v" in text)
+    asked = over_values(rng, names, pair="(v" in text, many=many)
     returns = ", ".join(f"{value} AS y{n}" for n, value in enumerate(asked))
     query = f"USING UNKNOWN false, MATCHES {policy} {text} RETURN trace.name, t(s0), {returns}"
     found = Counter(rounded_row(row) for row in store.find(query))
@@ -950,20 +1016,15 @@ def compare_over_sequence(world: World, store: Store, rng: random.Random) -> int
             parts = partial(lambda e, spans: spans[part_of(e)], spans=spans)
             row = [told.beside(one, parts, frames[-1], binding) for one in values]
             expected[rounded_row((trace.name, told.seconds(frames[0]), *row))] += 1
-    assert found == expected, (query, found - expected, expected - found)
+    assert found == expected, differing(query, found, expected)
     seen = Counter(row for trace in world.traces for row in watched(trace, query, periods(store)))
-    assert seen == expected, (query, seen - expected, expected - seen)
+    assert seen == expected, differing(f"online {query}", seen, expected)
     return sum(expected.values())
 
 
 def watched(trace: Trace, text: str, period: dict[str, int]) -> Iterator[tuple[Any, ...]]:
     """The values of what is found in a trace frame by frame."""
-    events: list[MonitorEvent] = []
-    told = {"on_event": events.append, "trace": trace.name}
-    monitor = Monitor(text, period_s=period[trace.name] / 1e9, **told)
-    for frame in trace.frames:
-        monitor.look([graph_of(frame)])
-    monitor.finish()
+    events = events_of(trace, text, period)
     return (rounded_row((trace.name, *event.values.values())) for event in events)
 
 
@@ -984,15 +1045,37 @@ def part_of(e: Any) -> tuple[str, str]:
     return (e.start.name if e.start else "", e.end.name if e.end else "")
 
 
+def differing(text: str, found: Counter[Any], wanted: Counter[Any]) -> str:
+    """A query whose rows differ, and in which columns the first of them that is most alike does."""
+    more, less = [*(found - wanted)], [*(wanted - found)]
+    if not (more and less):
+        return f"{text}: too many {more[:3]}, missing {less[:3]}"
+    alike = max(less, key=lambda row: sum(a == b for a, b in zip(row, more[0], strict=True)))
+    columns = [
+        (n, *both) for n, both in enumerate(zip(more[0], alike, strict=True)) if both[0] != both[1]
+    ]
+    return f"{text}: {len(more)} rows differ, such as {more[0]}: column, found, wanted {columns}"
+
+
 def rounded_row(row: Any) -> tuple[Any, ...]:
-    return tuple(round(v, 5) + 0.0 if isinstance(v, int | float) else v for v in row)
+    """Numbers to five decimals, and of large ones nine digits."""
+    return tuple(
+        (round(v, 5) if abs(v) < 1e4 else float(f"{v:.9g}")) + 0.0
+        if isinstance(v, int | float)
+        else v
+        for v in row
+    )
 
 
-def compare_over_pattern(world: World, store: Store, rng: random.Random) -> int:
+def compare_over_pattern(
+    world: World, store: Store, rng: random.Random, asked: Sequence[str] = (), pattern: str = ""
+) -> int:
     """Ask values over the runs of a pattern's matches both ways; how many rows there are."""
-    where = condition(rng, pair=True, depth=rng.randint(0, 1), temporal=rng.random() < 0.3)
-    asked = over_values(rng, [], pair=True)
-    text = f"USING UNKNOWN false MATCH (e:Ego), (v:Entity) WHERE {where} RETURN trace.name, frame.seq, e, v, "
+    asked = asked or over_values(rng, [], pair=True)
+    pattern = pattern or "(e:Ego), (v:Entity)"
+    pair = "(v:Lane)" not in pattern
+    where = condition(rng, pair=pair, depth=rng.randint(0, 1), temporal=rng.random() < 0.3)
+    text = f"USING UNKNOWN false MATCH {pattern} WHERE {where} RETURN trace.name, frame.seq, e, v, "
     text += ", ".join(f"{value} AS y{n}" for n, value in enumerate(asked))
     found = Counter(rounded_row(row) for row in store.find(text))
     (statement,) = parse(text)
@@ -1002,31 +1085,43 @@ def compare_over_pattern(world: World, store: Store, rng: random.Random) -> int:
     expected: Counter[Any] = Counter()
     runs: Counter[Any] = Counter()
     for trace in world.traces:
-        told = Told(trace, periods(store)[trace.name])
+        told = Told(trace, periods(store)[trace.name], edges_of(statement.block))
         step = replace(statement.sequence.steps[0], hold=None)
         held = told.holds(step, {"e", "v"})
+        frames: dict[Any, set[int]] = {}
+        for i, nodes in held:
+            frames.setdefault(nodes, set()).add(i)
+        rows: dict[Any, Any] = {}
         for i, nodes in held:
             binding = dict(nodes)
-            run = told.run(i, {j for j, other in held if other == nodes})
-            parts = partial(lambda _, ends: ends, ends=(run[0], run[-1]))
-            row = [told.beside(one, parts, i, binding) for one in values]
+            run = told.run(i, frames[nodes])
+            if any(isinstance(one, s.Arithmetic) for one in values) or (nodes, run[0]) not in rows:
+                parts = partial(lambda _, ends: ends, ends=(run[0], run[-1]))
+                rows[nodes, run[0]] = [told.beside(one, parts, i, binding) for one in values]
+            row = rows[nodes, run[0]]
             seq = trace.frames[i].seq
             expected[rounded_row((trace.name, seq, binding["e"], binding["v"], *row))] += 1
             runs[rounded_row((trace.name, *row))] += i == run[0]
-    assert found == expected, (text, found - expected, expected - found)
+    assert found == expected, differing(text, found, expected)
     seen = Counter(row for trace in world.traces for row in watched(trace, text, periods(store)))
-    assert seen == +runs, (text, seen - runs, runs - seen)
+    assert seen == +runs, differing(f"online {text}", seen, +runs)
     return sum(expected.values())
 
 
-def compare_over_check(world: World, store: Store, rng: random.Random) -> int:
+def edges_of(block: s.Block) -> dict[str, tuple[s.EdgePattern, str, str]]:
+    """The edge variables of a pattern: the edge, and the names of the nodes to its left and right."""
+    names = {id(node): node.name or "" for path in block.paths for node in path.nodes}
+    return {one.name: (one, names[a], names[b]) for one, a, b in links_of(block) if one.name}
+
+
+def compare_over_check(world: World, store: Store, rng: random.Random, *, many: int = 4) -> int:
     """Ask values over the violations of a check both ways; how many there are."""
     check = random_check(rng)
     pair = "(v:Entity)" in check
     if rng.random() < 0.7:
         reset = condition(rng, pair, rng.randint(0, 1), temporal=False)
         check += " RESET WHEN " + re.sub(r"\be\b", "ego", reset)
-    asked = [re.sub(r"\be\b", "ego", one) for one in over_values(rng, [], pair=pair)]
+    asked = [re.sub(r"\be\b", "ego", one) for one in over_values(rng, [], pair=pair, many=many)]
     asked += [rng.choice(("ego.speed", "prev(ego.x)", "frame.t"))]
     returns = ", ".join(f"{value} AS y{n}" for n, value in enumerate(asked))
     text = f"USING UNKNOWN false {check} RETURN {returns}"
@@ -1147,8 +1242,7 @@ def compare_edges(world: World, store: Store, pattern: str, where: str, asked: l
     assert statement.returns is not None
     values = [item.value for item in statement.returns.items[4:]]
     paths = s.Block(statement.block.paths, None, statement.span)
-    names = {id(n): n.name for path in paths.paths for n in path.nodes}
-    links = {one.name: (one, names[a], names[b]) for one, a, b in links_of(paths)}
+    links = edges_of(paths)
     expected: set[tuple[Any, ...]] = set()
     period = periods(store)
     for trace in world.traces:
@@ -1175,44 +1269,39 @@ def random_check(rng: random.Random) -> str:
     return f"CHECK c: {f'{word} (v:Entity) ' if pair else ''}{formula}"
 
 
-def compare_check(world: World, store: Store, check: str) -> int:
-    """Ask a check both ways; how many traces violate it."""
-    text = f"USING UNKNOWN false {check}"
-    (statement,) = parse(text)
-    assert isinstance(statement, s.CheckClause)
-    verdicts = {verdict.trace: verdict for verdict in store.check(f"{text} ROBUSTNESS")}
-    found = {name: verdict.verdict == "true" for name, verdict in verdicts.items()}
-    period = periods(store)
-    named = (s.Variable, s.NodePattern)
-    spoken = {p.name for p in parts_of(statement.formula) if isinstance(p, named)}
+def compare_check(world: World, store: Store, *checks: str) -> int:
+    """Ask checks, their verdicts and margins, both ways; how many traces violate one."""
+    texts = [f"USING UNKNOWN false {check}" for check in checks]
+    texts = [text.replace("CHECK c:", f"CHECK c{n}:", 1) for n, text in enumerate(texts)]
+    asked = ";".join(f"{text} ROBUSTNESS" for text in texts)
+    verdicts = {(one.trace, one.check): one for one in store.check(asked)}
+    online = margins_watched(world, asked, periods(store))
+    violated = 0
+    for n, text in enumerate(texts):
+        (statement,) = parse(text)
+        assert isinstance(statement, s.CheckClause)
+        for trace in world.traces:
+            expected, wanted = Told(trace, periods(store)[trace.name]).checked(statement)
+            for verdict in (verdicts[trace.name, f"c{n}"], online[trace.name, f"c{n}"]):
+                told = verdict.robustness
+                assert told is not None
+                assert (verdict.verdict == "true") == expected, (text, verdict, expected)
+                near = math.isclose(told.value, wanted, rel_tol=1e-9, abs_tol=1e-9)
+                assert near, (text, trace.name, told, wanted)
+                assert told.value == 0 or (told.value > 0) == expected, (text, told)
+            violated += not expected
+    return violated
+
+
+def margins_watched(world: World, text: str, period: dict[str, int]) -> dict[Any, Verdict]:
+    """The verdicts of checks, frame by frame."""
+    found: dict[Any, Verdict] = {}
     for trace in world.traces:
-        told = Told(trace, period[trace.name])
-        # The signs of the map are entities, too.
-        domain = told.ever("Entity")
-        ego = trace.ego if trace.ego in domain else -99
-        if "ego" in spoken:
-            domain = [node for node in domain if node != ego]
-        pair = "(v:Entity)" in check
-        bindings = [{"v": v, "ego": ego} for v in domain] if pair else [{"ego": ego}]
-        values = [told.true(statement.formula, 0, binding) for binding in bindings]
-        expected = any(values) if "FORSOME" in check else all(values)
-        assert found[trace.name] == expected, (text, trace.name, found[trace.name], expected)
-        margins = [told.margin(statement.formula, 0, binding) for binding in bindings]
-        wanted = (
-            max(margins, default=-math.inf)
-            if "FORSOME" in check
-            else min(margins, default=math.inf)
-        )
-        robustness = verdicts[trace.name].robustness
-        assert robustness is not None
-        assert math.isclose(robustness.value, wanted, rel_tol=1e-9, abs_tol=1e-9), (
-            text,
-            trace.name,
-            robustness,
-            wanted,
-        )
-        assert robustness.value == 0 or (robustness.value > 0) == expected, (text, robustness)
-    return sum(not holds for holds in found.values())
+        monitor = Monitor(text, period_s=period[trace.name] / 1e9, trace=trace.name)
+        for frame in trace.frames:
+            monitor.look([graph_of(frame)])
+        found |= {(trace.name, verdict.check): verdict for verdict in monitor.finish()}
+    return found
 
 
 def worlds(seed: int, folder: Path, *, traces: int = 3, frames: int = 0) -> tuple[World, Store]:

@@ -336,7 +336,7 @@ class PartsWriter(Writer):
     def whole(self) -> str:
         text = self.query() if self.rng.random() < 0.3 else self.simple()
         kinds = self.rng.choice(
-            ("o", "o", "oo", "w", "w", "ow", "wo", "wm", "wmo", "owm", "ww", "om")
+            ("o", "oo", "w", "ow", "wo", "wm", "wmo", "owm", "ww", "om", "wom", "mw")
         )
         for place, kind in enumerate(kinds):
             text += (
@@ -570,6 +570,16 @@ def answering(match: Any, world: World) -> Iterator[Frame]:
             yield frame
 
 
+ROWS = {
+    "OPTIONAL MATCH": r"OPTIONAL MATCH",
+    "WITH": r" WITH ",
+    "MATCH after WITH": r" (?<!OPTIONAL )MATCH .* (?<!OPTIONAL )MATCH ",
+    "named paths": r"\b[pq]\d* = \(",
+    "WITH of many": r" WITH [^W]*(COUNT\(|MAX\(|SUM\(|median|percentile|stddev|collect)",
+}
+"""Constructs, and how they are told in a query."""
+
+
 def try_many_parts(first: int, count: int) -> Counter[str]:
     """Random queries on random worlds, by SQL, in memory, and frame by frame."""
 
@@ -583,7 +593,7 @@ def try_many_parts(first: int, count: int) -> Counter[str]:
         told = [partial(one, text) for one in (disagreement_of_parts, in_memory)]
         return text, partial(all_agree, told + bare)
 
-    return try_each(first, count, made)
+    return try_each(first, count, made, rows=ROWS)
 
 
 if __name__ == "__main__":

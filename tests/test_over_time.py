@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from formulas import OnlineFormula, formula_of, prefix_verdicts
+from oracle_constructs import ASKED
 from oracle_over_time import (
     COURSES,
     MARGINS,
@@ -27,6 +28,7 @@ from oracle_over_time import (
     worlds,
 )
 from oracle_temporal import holds, random_formula, random_word
+from thorough import LONG
 
 from sgstore.cli import run as run_verb
 from sgstore.errors import QueryError
@@ -89,10 +91,19 @@ def test_values_over_matches_are_what_their_definition_says(asked: tuple[World, 
             compare(*asked, rng)
             for compare in (compare_over_sequence, compare_over_pattern, compare_over_check)
         ]
-        for _ in range(3)
+        for _ in range(2)
     ]
 
     assert all(sum(one) > 3 for one in zip(*found, strict=True))
+
+
+@pytest.mark.parametrize("construct", ASKED)
+def test_random_values_and_checks_are_what_their_definition_says(
+    asked: tuple[World, Store], construct: str
+) -> None:
+    rng = random.Random(6)
+
+    assert sum(ASKED[construct](*asked, rng) for _ in range(20 if LONG else 2)) > 0
 
 
 LOOSE = "MATCH (a), (b), (c) AS s0 THEN MATCH (b), (a), (c) AS s1 RETURN trace.name, a, b, c"

@@ -1,0 +1,180 @@
+"""How far it is along the lanes, and how they run: ``python oracle_constructs.py 5000 lane_dist``.
+
+Cars stand anywhere on the lanes of a town. ``lane_dist`` from car to car, the next junction, light and the
+like, curvature and slope are asked of a store, of its graphs in memory, and of a monitor that sees these. By
+definition every way is tried from where a car stands, by Dijkstra; lanes are cut into metres, and heights are
+those of the file.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+from collections import Counter
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import networkx as nx
+import pytest
+from builders import Recording
+from graph_blocks import trace_info
+from test_lane_courses import by_elevation, by_its_points
+from test_lane_dist import FARTHEST, lane_ways
+from test_lane_places import SORTS, columns_of, town, traffic
+
+from sgstore.config import Config
+from sgstore.lang import FrameView
+from sgstore.query import Store
+from sgstore.sgg import SceneGraphGenerator
+from sgstore.store import StoreFile
+from sgstore.temporal import Monitor
+from sgstore.world import TraceReport
+
+if TYPE_CHECKING:
+    from sgstore.graph import SceneGraph
+    from sgstore.roads import RoadMap
+
+    Place = tuple[int, float]
+
+TOWNS = ("Town07", "multi_intersections", "Town01", "fabriksgatan")
+DATA = Path(os.environ.get("SGSTORE_DATA", Path(__file__).parents[2] / "shared/data"))
+COURSES = ("curvature", "slope")
+NEXT = tuple(f"to_{sort}" for sort in SORTS)
+ROWS = ("lane_dist", "next places", "curvature, slope")
+
+
+@cache
+def known(name: str) -> tuple[RoadMap, Any, dict[str, list[tuple[int, float, float]]]]:
+    """A town, its lanes as ways, and where things of each sort lie on lanes."""
+    road_map = town(DATA, name)
+    places: dict[str, list[tuple[int, float, float]]] = {sort: [] for sort in SORTS}
+    for what, lane, start, end in zip(road_map.places.what, *columns_of(road_map), strict=True):
+        places.setdefault(what, []).append((lane, start, end))
+    return road_map, lane_ways(road_map), places
+
+
+class Around:
+    """What is reached from a place by driving on."""
+
+    def __init__(self, ways: Any, place: Place) -> None:
+        self.lane, self.along = place
+        length = ways.edges[(self.lane, "start"), (self.lane, "end")]["weight"]
+        self.rest = length - self.along
+        self.far = nx.single_source_dijkstra_path_length(ways, (self.lane, "end"), cutoff=FARTHEST)
+
+    def to(self, lane: int, along: float) -> float:
+        if lane == self.lane and along >= self.along:
+            return along - self.along
+        return self.rest + self.far.get((lane, "start"), math.inf) + along
+
+
+def tried(number: int) -> Counter[str]:
+    """Ask of the traffic of a number; how many cases there were."""
+    name = TOWNS[number % len(TOWNS)]
+    road_map, _, _ = known(name)
+    with tempfile.TemporaryDirectory() as folder:
+        file = StoreFile.create(Path(folder) / "s.db")
+        block = Recording().block(*traffic(road_map, number))
+        answers = ("isIn", "controlsTrafficOf", "travelsTo")
+        with file.segment(trace_info(), Config(), road_map=road_map, answers=answers) as segment:
+            segment.append(SceneGraphGenerator(road_map, Config()).block(block))
+            file.publish(segment.seal(TraceReport(frames=4)))
+        store = Store(file.path)
+        with store.file.snapshot():
+            return compared(store, name)
+
+
+def compared(store: Store, name: str) -> Counter[str]:
+    seen = Counter[str]()
+    of_one = [f"{name}(v)" for name in (*NEXT, *COURSES)]
+    one = f"MATCH (v:Car) RETURN frame.id, v.id, {', '.join(of_one)}"
+    two = "MATCH (v:Car), (w:Car) RETURN frame.id, v.id, w.id, lane_dist(v, w)"
+    alone = {tuple(row[:2]): tuple(row[2:]) for row in store.find(one).rows()}
+    pairs = {tuple(row[:3]): row[3] for row in store.find(two).rows()}
+    seen["tried"] += 2
+    over = [f"FIRST({value}) OVER match" for value in of_one]
+    online = f"MATCH (v:Car) RETURN {', '.join(over)};"
+    online += "MATCH (v:Car), (w:Car) RETURN FIRST(lane_dist(v, w)) OVER match"
+    for frame in sorted({frame for frame, _ in alone}):
+        graph = store.file.graph(frame)
+        view = FrameView(graph)
+        events: list[Any] = []
+        monitor = Monitor(online, period_s=0.1, on_event=events.append)
+        monitor.look([graph])
+        monitor.finish()
+        told = {
+            tuple(e.nodes[n] for n in "vw" if n in e.nodes): tuple(e.values.values())
+            for e in events
+        }
+        wanted = Defined(graph, name)
+        for node in [node for at, node in alone if at == frame]:
+            found, memory = (
+                alone[frame, node],
+                tuple(view.pair(one, node, node) for one in (*NEXT, *COURSES)),
+            )
+            assert found == memory == told[node,], (name, frame, node, found, memory, told[node,])
+            for value, which in zip(found, (*SORTS, *COURSES), strict=True):
+                expected = (
+                    wanted.course(node, which) if which in COURSES else wanted.next(node, which)
+                )
+                same(value, expected, (name, frame, node, which))
+                seen[ROWS[2 if which in COURSES else 1]] += 1
+                seen["with rows"] += value is not None
+        for _, a, b in [key for key in pairs if key[0] == frame]:
+            far = pairs[frame, a, b]
+            assert far == view.pair("lane_dist", a, b) == told[a, b][0], (name, frame, a, b, far)
+            same(far, wanted.between(a, b), (name, frame, a, b))
+            seen["lane_dist"] += 1
+            seen["with rows"] += far is not None
+    return seen
+
+
+def same(found: float | None, wanted: float | None, about: Any) -> None:
+    if wanted is not None and abs(abs(wanted) - FARTHEST) < 1e-6:
+        return  # at the end of what is looked at, either is right
+    assert found == (None if wanted is None else pytest.approx(wanted, abs=2e-6)), (
+        about,
+        found,
+        wanted,
+    )
+
+
+class Defined:
+    """The definitions, of the cars of a graph."""
+
+    def __init__(self, graph: SceneGraph, name: str) -> None:
+        self.name = name
+        self.map, ways, self.places = known(name)
+        own = graph.places()
+        self.own = {node: [Around(ways, (-2 - n, at)) for n, at in own[node]] for node in own}
+        self.primary = {
+            src: (-2 - dst, about["along"])
+            for src, relation, dst, about in graph.edges
+            if relation == "isIn" and about.get("primary", about.get("is_primary"))
+        }
+
+    def next(self, node: int, sort: str) -> float | None:
+        ways = [
+            0.0 if lane == one.lane and start <= one.along <= end else one.to(lane, start)
+            for one in self.own.get(node, [])
+            for lane, start, end in self.places[sort]
+        ]
+        nearest = min(ways, default=math.inf)
+        return nearest if nearest <= FARTHEST else None
+
+    def between(self, a: int, b: int) -> float | None:
+        here, there = self.own.get(a, []), self.own.get(b, [])
+        ahead = min((one.to(o.lane, o.along) for one in here for o in there), default=math.inf)
+        back = min((o.to(one.lane, one.along) for one in here for o in there), default=math.inf)
+        nearest = ahead if ahead <= back else -back
+        return nearest if abs(nearest) <= FARTHEST else None
+
+    def course(self, node: int, which: str) -> float | None:
+        if node not in self.primary:
+            return None
+        lane, along = self.primary[node]
+        if which == "slope":
+            return by_elevation(DATA, self.map, lane, along)
+        return by_its_points(self.map, lane, along)[0]
