@@ -7,6 +7,7 @@ import os
 import random
 import shutil
 import time
+from collections import Counter
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -210,6 +211,26 @@ def test_other_forms_are_those_of_one_store(store: Store, whole: Collection, tex
     graphs = [(g.graph, sorted(g.nodes), sorted(g.edges)) for g in found.limit(3).subgraphs()]
     wanted = [(g.graph, sorted(g.nodes), sorted(g.edges)) for g in expected.limit(3).subgraphs()]
     assert graphs == wanted
+
+
+def test_sequences_that_end_together_come_by_what_they_return(
+    store: Store, whole: Collection
+) -> None:
+    """Of one pair of cars, each run of being near leads to one and the same frame."""
+    text = (
+        "MATCH (a:Car)-[:near]->(b) AS s THEN MATCH (a) WHERE frame.seq = 45 AS t"
+        " RETURN trace.name, a, b, t(s)"
+    )
+    rows = [tuple(row) for row in store.find(text)]
+
+    together = Counter(row[:3] for row in rows)
+    assert max(together.values()) > 2
+    for pair in together:
+        times = [row[3] for row in rows if row[:3] == pair]
+        assert times == sorted(times)
+    assert [tuple(row) for row in whole.find(text)] == rows
+    for most in (1, 3, 7):
+        assert [tuple(row) for row in whole.find(f"{text} LIMIT {most}")] == rows[:most]
 
 
 @pytest.mark.skipif(not LONG, reason="make cluster asks them")
