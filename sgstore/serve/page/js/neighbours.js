@@ -6,14 +6,17 @@ import { egoRow, rowOf, SCENERY, spotOf } from "./draw.js";
 import { chosen, lit, open } from "./state.js";
 
 const html = htm.bind(h);
-const MOST = 16, WIDE = 420, HIGH = 210;
+const MOST = 16, ROOM = 5000; // nodes, and how much of the panel each has
+
+/** How wide a node is drawn. @param {string} name */
+const widthOf = (name) => Math.max(name.length * 6 + 14, 34);
 
 /** Edges of the panel, which the view from above shows, too. */
 export const hop = signal(/** @type {any[]} */ ([]));
 
 /** One hop around some nodes: who is there, the nearest first, and how they are joined.
- * @param {any} graph @param {Set<number>} bound @param {(node: number) => number[] | null} placeOf */
-function hopOf(graph, bound, placeOf) {
+ * @param {any} graph @param {Set<number>} bound @param {(node: number) => number[] | null} placeOf @param {number} most */
+function hopOf(graph, bound, placeOf, most) {
   /** @type {Map<string, {src: number, dst: number, labels: Set<string>, both: boolean}>} */
   const pairs = new Map();
   for (const { src, dst, relation } of graph.edges) {
@@ -29,32 +32,35 @@ function hopOf(graph, bound, placeOf) {
   const all = [...new Set([...pairs.values()].flatMap(({ src, dst }) => [src, dst]))].filter((node) => !bound.has(node) && Number.isFinite(far(node)));
   const met = all.filter((node) => !SCENERY.has(kinds.get(node)));
   // Whoever moves before parts of the map, the nearest first.
-  const near = met.sort((a, b) => Number(a < 0) - Number(b < 0) || far(a) - far(b)).slice(0, MOST - bound.size);
+  const near = met.sort((a, b) => Number(a < 0) - Number(b < 0) || far(a) - far(b)).slice(0, Math.max(most - bound.size, 3));
   const shown = new Set([...bound, ...near]);
   return { shown: [...shown].filter((node) => placeOf(node)), edges: [...pairs.values()].filter(({ src, dst }) => shown.has(src) && shown.has(dst)), left: all.length - near.length };
 }
 
 /** Where nodes stand in the panel: in their direction, those far away less far. @param {number[]} nodes @param {(node: number) => number[] | null} placeOf
- * @param {Set<number>} bound @param {number} turn */
-function layout(nodes, placeOf, bound, turn) {
+ * @param {Set<number>} bound @param {number} turn @param {(node: number) => string} name @param {[number, number]} size of the panel */
+function layout(nodes, placeOf, bound, turn, name, [WIDE, HIGH]) {
   const of = nodes.filter((n) => bound.has(n)).map((n) => placeOf(n) || [0, 0]), many = Math.max(of.length, 1);
   const cx = of.reduce((s, [x]) => s + (x || 0), 0) / many, cy = of.reduce((s, [, y]) => s + (y || 0), 0) / many;
   const spots = nodes.map((node) => {
     const [x, y] = placeOf(node) || [0, 0], dx = (x || 0) - cx, dy = (y || 0) - cy;
     const far = Math.sqrt(Math.hypot(dx, dy)), angle = Math.atan2(dy, dx) + turn;
-    return { node, x: far * Math.cos(angle), y: -far * Math.sin(angle) };
+    return { node, x: far * Math.cos(angle), y: -far * Math.sin(angle), wide: widthOf(name(node)) };
   });
   // The panel is filled both ways, as far as that does not twist directions too much: on a road all are ahead or behind.
   const wide = Math.max(...spots.map((p) => Math.abs(p.x)), 1), high = Math.max(...spots.map((p) => Math.abs(p.y)), 1);
   const down = Math.min((HIGH / 2 - 24) / high, 4 * (WIDE / 2 - 44) / wide), right = Math.min((WIDE / 2 - 44) / wide, 4 * down);
   for (const p of spots) { p.x = WIDE / 2 + p.x * right; p.y = HIGH / 2 + p.y * down; }
-  for (let round = 0; round < 40; round++) { // who would stand on another steps aside
+  for (let round = 0; round < 60; round++) { // who would stand on another steps aside: up or down, and where that is full to the side
     for (const a of spots) for (const b of spots) {
-      const dx = b.x - a.x, dy = b.y - a.y;
-      if (a === b || Math.abs(dx) > 62 || Math.abs(dy) > 24) continue;
-      const push = (dy < 0 || (dy === 0 && a.node < b.node) ? -1 : 1) * (24 - Math.abs(dy)) / 2;
-      a.y = Math.min(Math.max(a.y - push, 16), HIGH - 16);
-      b.y = Math.min(Math.max(b.y + push, 16), HIGH - 16);
+      const dx = b.x - a.x, dy = b.y - a.y, besides = (a.wide + b.wide) / 2 + 4 - Math.abs(dx), below = 25 - Math.abs(dy);
+      if (a === b || besides <= 0 || below <= 0) continue;
+      const sign = (/** @type {number} */ d) => (d < 0 || (d === 0 && a.node < b.node) ? -0.5 : 0.5);
+      const [right, down] = round < 20 ? [0, sign(dy) * below] : besides < below || round % 2 ? [sign(dx) * besides, 0] : [0, sign(dy) * below];
+      for (const [p, way] of /** @type {[typeof a, number][]} */ ([[a, -1], [b, 1]])) {
+        p.x = Math.min(Math.max(p.x + way * right, p.wide / 2 + 2), WIDE - p.wide / 2 - 2);
+        p.y = Math.min(Math.max(p.y + way * down, 14), HIGH - 14);
+      }
     }
   }
   return new Map(spots.map(({ node, x, y }) => [node, [x, y]]));
@@ -70,14 +76,18 @@ export function Neighbours({ graph, states, north }) {
   const about = new Map(graph.nodes.map((/** @type {any} */ n) => [n.id, n]));
   const near = [...bound].map((n) => rowOf(states, n)).filter((row) => row >= 0).map((row) => [states.columns.x[row], states.columns.y[row]])[0];
   const placeOf = (/** @type {number} */ node) => (about.has(node) ? spotOf(now.trace, states, node, near) : null);
-  const { shown, edges, left } = hopOf(graph, bound, placeOf);
   const heading = ego >= 0 ? states.columns.heading[ego] : NaN;
-  const at = layout(shown, placeOf, bound, north || !Number.isFinite(heading) ? 0 : Math.PI / 2 - heading);
+  const name = (/** @type {number} */ node) => (keys.get(node) || about.get(node)?.kind.replace(/_/g, " ") || String(node)).slice(0, 14);
+  // As large as the panel is, so that words are neither small nor cut; on a wide screen they are larger.
+  const box = document.querySelector(".panel.pattern")?.getBoundingClientRect(), scale = Math.max(1, (box?.width || 0) / 620);
+  /** @type {[number, number]} */
+  const size = [Math.max((box?.width || 440) / scale - 18, 280), Math.max(((box?.height || 250) - 62) / scale, 110)];
+  const { shown, edges, left } = hopOf(graph, bound, placeOf, Math.min(MOST, size[0] * size[1] / ROOM));
+  const at = layout(shown, placeOf, bound, north || !Number.isFinite(heading) ? 0 : Math.PI / 2 - heading, name, size);
   const drawn = edges.filter(({ src, dst }) => at.has(src) && at.has(dst));
   const told = drawn.map(({ src, dst, both, labels }) => ({ src, dst, both, label: [...labels].join(", "), holds: null }));
   queueMicrotask(() => { if (JSON.stringify(hop.peek()) !== JSON.stringify(told)) hop.value = told; });
-  const name = (/** @type {number} */ node) => keys.get(node) || about.get(node)?.kind.replace(/_/g, " ") || String(node);
-  return html`<div class="scroll near"><svg viewBox=${`0 0 ${WIDE} ${HIGH}`} role="img" aria-label="Neighbours">
+  return html`<div class="scroll near"><svg viewBox=${`0 0 ${size[0]} ${size[1]}`} role="img" aria-label="Neighbours">
       ${drawn.map(({ src, dst, labels, both }) => {
         const [ax, ay] = at.get(src) || [0, 0], [bx, by] = at.get(dst) || [0, 0], inside = bound.has(src) && bound.has(dst), on = lit.value.has(src) && lit.value.has(dst);
         const words = [...labels], text = words.length > 2 && !on ? `${words[0]} +${words.length - 1}` : words.join(", ");
@@ -86,7 +96,7 @@ export function Neighbours({ graph, states, north }) {
           ${on || inside || drawn.length < 5 ? html`<text class="halo" x=${((ax || 0) + (bx || 0)) / 2} y=${((ay || 0) + (by || 0)) / 2 - 3} font-size="9.5" text-anchor="middle" fill="currentColor">${text}</text>` : null}</g>`;
       })}
       ${shown.map((node) => {
-        const [x, y] = at.get(node) || [0, 0], one = name(node).slice(0, 14), wide = Math.max(one.length * 6 + 14, 34);
+        const [x, y] = at.get(node) || [0, 0], one = name(node), wide = widthOf(one);
         return html`<g key=${node} style=${{ cursor: node >= 0 ? "pointer" : "default" }} onMouseEnter=${() => { lit.value = new Set([node]); }} onMouseLeave=${() => { lit.value = new Set(); }}
           onClick=${() => { if (node >= 0) { chosen.value = node; panel.value = "near"; } }}><title>${about.get(node)?.name || node}</title>
           <rect x=${(x || 0) - wide / 2} y=${(y || 0) - 11} width=${wide} height="22" rx=${node < 0 ? 4 : 11} fill=${bound.has(node) ? "var(--soft)" : "var(--raised)"} stroke=${bound.has(node) ? "var(--mark)" : lit.value.has(node) ? "var(--accent)" : "var(--line)"} stroke-width=${bound.has(node) ? 2 : 1.2} />
