@@ -132,7 +132,8 @@ def test_hostile_names_stay_text(store: Store, tmp_path: Path) -> None:
 
 def test_no_more_matches_than_wanted(store: Store, tmp_path: Path) -> None:
     assert report(store, NEAR, tmp_path / "r.html", parameters={"least": 1}, most=2) == (2, True)
-    assert len(kept_in(tmp_path / "r.html")["find"][-2]["matches"]) == 2
+    told = kept_in(tmp_path / "r.html")["find"]
+    assert sum(len(reply.get("matches", ())) for reply in told) == 2
 
 
 def test_a_hundred_matches_are_small(store: Store, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import os
 import threading
 import time
 import uuid
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
 from functools import partial
@@ -28,7 +29,7 @@ from sgstore.serve._requests import Fields, RequestError
 from sgstore.serve._wire import as_json
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator, Mapping
+    from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable, Iterator, Sequence
 
     from starlette.requests import Request
     from starlette.types import Receive, Scope, Send
@@ -326,20 +327,10 @@ class Explorer:
     async def one(self, request: Request, ask: str) -> Response:
         """The whole answer to a question: lanes of truth, why not, verdicts. An error is an answer, too."""
         fields = await Fields.of(request)
-        question: dict[str, Any] = {"ask": ask}
         side = fields.one_of("side", *self._pools)
-        if ask in {"coverage", "select"}:
-            question["abstraction"] = fields.text("abstraction", "RSV")
-        else:
-            question |= {"text": fields.text("text"), "parameters": fields.parameters()}
-        if ask == "coverage":
-            question["what"] = fields.one_of("what", "classes", "growth", "combos")
-        elif ask == "select":
-            question["clips"] = fields.clips()
-        elif ask != "check":
-            trace, seq = fields.text("trace"), fields.whole("seq")
-            ref = await self.threaded(self.reads[side].frame_id, trace, seq)
-            question |= {"frame": ref, "binding": fields.binding()}
+        question = {"ask": ask, **_QUESTIONS[ask](self, fields)}
+        if "frame" in question:
+            question["frame"] = await self.threaded(self.reads[side].frame_id, *question["frame"])
         asked = self._ask(question, side=side)
 
         async def answer() -> AsyncGenerator[bytes]:
@@ -362,15 +353,7 @@ class Explorer:
         """Something that is read of a store: columns as bytes, a picture, or plain values."""
         fields = await Fields.of(request)
         reads = self.reads[fields.one_of("side", *self.reads)]
-        ask = getattr(reads, name)(fields)
-        found = await self.threaded(ask)
-        if isinstance(found, bytes):
-            return Response(found, media_type="application/octet-stream")
-        if isinstance(found, tuple):
-            data, kind = found
-            headers = {"cache-control": "private, max-age=3600"}
-            return Response(data, media_type=kind, headers=headers)
-        return JSONResponse(found)
+        return answered(await self.threaded(getattr(reads, name), fields))
 
     async def about(self, _: Request) -> Response:
         """The stores: their traces, and what the page may do."""
@@ -455,22 +438,50 @@ async def given_file(request: Request) -> Response:
     return FileResponse(path, media_type=kind, headers={"cache-control": "no-cache"})
 
 
-_WORK: Final[Mapping[str, Callable[[Explorer, Fields], dict[str, Any]]]] = {
-    "lock": lambda of, fields: {
-        "clips": fields.clips(),
-        "to": str(of.target(fields.text("name"))),
-    },
-    "export": lambda of, fields: {
-        "clips": fields.clips(),
-        "to": str(of.target(fields.text("name"))),
-        "format": fields.text("format", "mcap"),
-    },
-    "diff": lambda of, fields: {
-        "other": str(of.compared.file.path.absolute()),
-        "abstraction": fields.text("text", "") or "RSV",
-    },
+def _typed(_: Explorer, fields: Fields) -> dict[str, Any]:
+    return {"text": fields.text("text"), "parameters": fields.parameters()}
+
+
+def _at_frame(of: Explorer, fields: Fields) -> dict[str, Any]:
+    frame = fields.text("trace"), fields.whole("seq")
+    return {**_typed(of, fields), "frame": frame, "binding": fields.binding()}
+
+
+def _to_file(of: Explorer, fields: Fields) -> dict[str, Any]:
+    to = str(of.target(fields.text("name")))
+    return {"clips": fields.clips(), "to": to, "format": fields.text("format", "mcap")}
+
+
+def _of_classes(_: Explorer, fields: Fields, what: Sequence[str] = ()) -> dict[str, Any]:
+    told = {"what": fields.one_of("what", *what)} if what else {"clips": fields.clips()}
+    return {**told, "abstraction": fields.text("abstraction", "RSV")}
+
+
+def _of_both(of: Explorer, fields: Fields) -> dict[str, Any]:
+    other = str(of.compared.file.path.absolute())
+    return {"other": other, "abstraction": fields.text("text", "") or "RSV"}
+
+
+Needs = Mapping[str, "Callable[[Explorer, Fields], dict[str, Any]]"]
+_QUESTIONS: Final[Needs] = {
+    "parts": _at_frame,
+    "why": _at_frame,
+    "check": _typed,
+    "coverage": partial(_of_classes, what=("classes", "growth", "combos")),
+    "select": _of_classes,
 }
-"""What a longer piece of work needs to be told, by its name."""
+_WORK: Final[Needs] = {"lock": _to_file, "export": _to_file, "diff": _of_both}
+"""What a question, and a longer piece of work, needs to be told, by its name."""
+
+
+def answered(found: Any) -> Response:
+    """Answer of columns as bytes, of a picture with its type, or of plain values."""
+    if isinstance(found, bytes):
+        return Response(found, media_type="application/octet-stream")
+    if isinstance(found, tuple):
+        headers = {"cache-control": "private, max-age=3600"}
+        return Response(found[0], media_type=found[1], headers=headers)
+    return JSONResponse(found)
 
 
 def _is_sql(text: str) -> bool:
@@ -491,7 +502,7 @@ def _files() -> dict[str, Path]:
 
 FILES: Final = _files()
 
-_READ: Final = ("thumbs", "states", "static", "map", "frame", "picture", "series")
+_READ: Final = "words", "library", "states", "static", "map", "frame", "picture", "series"
 
 
 def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: str) -> Guard:
@@ -506,29 +517,18 @@ def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: 
     cookie : str
         Name of the cookie that holds the token.
     """
-
-    def bound(method: Callable[..., Awaitable[Response]], name: str) -> Endpoint:
-        return told(lambda request: method(request, name))
-
-    get, post = ["GET"], ["POST"]
-    routes = [
-        Route("/", told(page_of), methods=get),
-        Route("/static/{name:path}", told(given_file), methods=get),
-        Route("/api/store", told(explorer.about), methods=get),
-        Route("/api/words", bound(explorer.read, "words"), methods=get),
-        Route("/api/library", bound(explorer.read, "library"), methods=get),
-        Route("/api/find", told(explorer.find), methods=post),
-        Route("/api/find/{key}", told(explorer.cancel), methods=["DELETE"]),
-        *(
-            Route(f"/api/{n}", bound(explorer.one, n), methods=post)
-            for n in ("parts", "why", "check", "coverage", "select")
-        ),
-        *(
-            Route(f"/api/{n}", bound(explorer.read, n), methods=post if n == "thumbs" else get)
-            for n in _READ
-        ),
-        Route("/api/notes", told(explorer.tags), methods=[*get, *post]),
-        *(Route(f"/api/{n}", bound(explorer.work, n), methods=post) for n in _WORK),
+    table: list[tuple[str, Endpoint]] = [
+        ("GET /", page_of),
+        ("GET /static/{name:path}", given_file),
+        ("GET /api/store", explorer.about),
+        ("POST /api/find", explorer.find),
+        ("DELETE /api/find/{key}", explorer.cancel),
+        ("GET /api/notes", explorer.tags),
+        ("POST /api/notes", explorer.tags),
+        ("POST /api/thumbs", partial(explorer.read, name="thumbs")),
+        *((f"GET /api/{name}", partial(explorer.read, name=name)) for name in _READ),
+        *((f"POST /api/{name}", partial(explorer.one, ask=name)) for name in _QUESTIONS),
+        *((f"POST /api/{name}", partial(explorer.work, name=name)) for name in _WORK),
     ]
 
     @asynccontextmanager
@@ -536,19 +536,25 @@ def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: 
         yield
         await asyncio.get_running_loop().run_in_executor(None, explorer.close)
 
-    return Guard(Starlette(routes=routes, lifespan=lifespan), token, hosts, cookie)
+    return Guard(Starlette(routes=routed(table), lifespan=lifespan), token, hosts, cookie)
 
 
-def told(endpoint: Endpoint) -> Endpoint:
+def routed(table: Iterable[tuple[str, Endpoint]]) -> list[Route]:
+    """Routes of endpoints, each by its method and its path."""
+    pairs = ((*where.split(), endpoint) for where, endpoint in table)
+    return [Route(path, _told(endpoint), methods=[method]) for method, path, endpoint in pairs]
+
+
+def _told(endpoint: Endpoint) -> Endpoint:
     """An endpoint whose errors are answers."""
 
-    async def answered(request: Request) -> Response:
+    async def run(request: Request) -> Response:
         try:
             return await endpoint(request)
         except SgstoreError as error:
             return JSONResponse(error.as_dict(), _status(error))
 
-    return answered
+    return run
 
 
 def _status(error: SgstoreError) -> int:

@@ -13,24 +13,23 @@ import math
 import threading
 import time
 from collections import OrderedDict, deque
-from dataclasses import asdict
 from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import numpy as np
 from starlette.applications import Starlette
-from starlette.responses import JSONResponse, Response, StreamingResponse
-from starlette.routing import Route
+from starlette.responses import Response, StreamingResponse
 
 from sgstore.errors import QueryNameError, SgstoreError, StoreError
 from sgstore.lang import Binding, FrameView, ScopeSearch, parts_of, why_not
 from sgstore.pair_numbers import PAIR_FUNCTIONS
-from sgstore.serve._app import given_file, page_of, told
+from sgstore.serve._app import answered, given_file, page_of, routed
 from sgstore.serve._guard import Guard
 from sgstore.serve._reads import clean, drawn_map, shown_picture, told_graph
 from sgstore.serve._requests import Fields
 from sgstore.serve._wire import as_json, packed
+from sgstore.serve._worker import told_lane
 from sgstore.vocabulary import KIND_CODE, KINDS, LIGHT_STATE_CODE, LIGHT_STATES
 from sgstore.world import INPUTS, POSE
 
@@ -43,6 +42,7 @@ if TYPE_CHECKING:
     from sgstore.lang.ir import Query
     from sgstore.readers import Cameras
     from sgstore.roads import RoadMap
+    from sgstore.serve._app import Endpoint
     from sgstore.step import Frame
     from sgstore.temporal import FrameTime, Monitor, MonitorEvent, Verdict
 
@@ -131,15 +131,9 @@ class WatchedMatch:
             "binding": self._nodes,
             "known": [max(first, self._begun), self._seen],
             "lanes": [
-                {
-                    "text": part.text,
-                    "step": part.step,
-                    "nodes": part.nodes,
-                    "edges": [asdict(edge) for edge in part.edges],
-                    "conditions": part.conditions,
-                    "spans": [] if search is None else [one for one in spans if one[1] >= first],
-                    "unknown": ["what is asked of other frames"] if search is None else [],
-                }
+                told_lane(part, [], ["what is asked of other frames"])
+                if search is None
+                else told_lane(part, [one for one in spans if one[1] >= first], [])
                 for part, search, spans in zip(self._parts, self._search, self._spans, strict=True)
             ],
         }
@@ -316,7 +310,7 @@ class LiveRun:
         trace = {"name": self.name, "frames": 0, "seconds": 0.0, "period": 0.0, "map": ""}
         trace |= {"map_key": "live" * self._has_map, "origin": self._origin or (0.0, 0.0)}
         cameras = [] if self._cameras is None else [*self._cameras.topics]
-        trace |= {"ego": "", "cameras": cameras, "answers": []}
+        trace |= {"cameras": cameras}
         monitor = self._monitor
         names = monitor.names if monitor is not None else ()
         checks = [*monitor.status] if monitor is not None else []
@@ -456,59 +450,28 @@ def paced(frames: Iterable[Frame]) -> Iterator[Frame]:
 def live_application(run: LiveRun, token: str, hosts: tuple[str, ...], cookie: str) -> Guard:
     """The ASGI application of a monitor, behind a token; as :func:`sgstore.serve.application`."""
 
-    async def page(request: Request) -> Response:
-        return await page_of(request, "live.js")
-
-    async def about(_: Request) -> Response:
-        return JSONResponse(run.about())
-
-    async def outlines(_: Request) -> Response:
-        return Response(run.outlines(), media_type="application/octet-stream")
-
-    async def parts(request: Request) -> Response:
-        fields = await Fields.of(request)
-        nodes = fields.binding() or {}
-        return JSONResponse(await asyncio.to_thread(run.parts, fields.text("text"), nodes))
-
-    async def frame(request: Request) -> Response:
-        fields = await Fields.of(request)
-        return JSONResponse(await asyncio.to_thread(run.graph, fields.whole("seq")))
-
-    async def why(request: Request) -> Response:
-        fields = await Fields.of(request)
-        about = fields.text("text"), fields.whole("seq")
-        return JSONResponse(await asyncio.to_thread(run.why, *about))
-
-    async def series(request: Request) -> Response:
-        fields = await Fields.of(request)
-        other = fields.whole("other") if fields.has("other") else None
-        asked = fields.text("attribute"), fields.whole("node"), other
-        found = await asyncio.to_thread(run.series, *asked)
-        return Response(found, media_type="application/octet-stream")
-
-    async def picture(request: Request) -> Response:
-        fields = await Fields.of(request)
-        asked = fields.whole("seq"), fields.text("channel")
-        data, kind = await asyncio.to_thread(run.picture, *asked)
-        return Response(data, media_type=kind)
+    async def ask(request: Request, of: Callable[[Fields], Any]) -> Response:
+        return answered(await asyncio.to_thread(of, await Fields.of(request)))
 
     async def live(_: Request) -> Response:
         return StreamingResponse(run.messages(), media_type="text/event-stream")
 
-    get = ["GET"]
-    routes = [
-        Route("/", told(page), methods=get),
-        Route("/static/{name:path}", told(given_file), methods=get),
-        Route("/api/store", told(about), methods=get),
-        Route("/api/map", told(outlines), methods=get),
-        Route("/api/parts", told(parts), methods=["POST"]),
-        Route("/api/frame", told(frame), methods=get),
-        Route("/api/why", told(why), methods=["POST"]),
-        Route("/api/series", told(series), methods=get),
-        Route("/api/picture", told(picture), methods=get),
-        Route("/api/live", told(live), methods=get),
+    asked: dict[str, Callable[[Fields], Any]] = {
+        "GET /api/store": lambda _: run.about(),
+        "GET /api/map": lambda _: run.outlines(),
+        "GET /api/frame": lambda fields: run.graph(fields.whole("seq")),
+        "GET /api/series": lambda fields: run.series(*fields.curve()),
+        "GET /api/picture": lambda f: run.picture(f.whole("seq"), f.text("channel")),
+        "POST /api/parts": lambda fields: run.parts(fields.text("text"), fields.binding() or {}),
+        "POST /api/why": lambda fields: run.why(fields.text("text"), fields.whole("seq")),
+    }
+    table: list[tuple[str, Endpoint]] = [
+        ("GET /", partial(page_of, script="live.js")),
+        ("GET /static/{name:path}", given_file),
+        ("GET /api/live", live),
+        *((where, partial(ask, of=of)) for where, of in asked.items()),
     ]
-    return Guard(Starlette(routes=routes), token, hosts, cookie)
+    return Guard(Starlette(routes=routed(table)), token, hosts, cookie)
 
 
 def _columns(graph: SceneGraph, origin: tuple[float, float]) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Readings of a store by trace and frame: columns of states, maps, pictures, graphs, words.
 
-Each method takes the fields of a request, which it checks at once, and gives a function that reads.
+Each method that takes the fields of a request looks at all of them before it reads.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import threading
 from contextlib import suppress
-from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -22,7 +21,7 @@ from sgstore.serve._wire import packed
 from sgstore.serve._words import words
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
     from sgstore.graph import SceneGraph
     from sgstore.lang import Catalog
@@ -31,8 +30,6 @@ if TYPE_CHECKING:
     from sgstore.roads import RoadMap
     from sgstore.serve._requests import Fields
     from sgstore.store import StoredTrace
-
-    Read = Callable[[], Any]
 
 MOST_THUMBS: Final = 400
 """Frames whose states are sent for small pictures at once."""
@@ -72,21 +69,12 @@ class Reads:
 
     def _told(self, traces: dict[str, StoredTrace]) -> dict[str, Any]:
         file, places = self._store.file, self._store.file.places()
-        listed = [
-            {
-                "name": name,
-                "frames": one.frames,
-                "seconds": (one.end_ns - one.start_ns) / 1e9,
-                "period": one.period_ns / 1e9,
-                "map": one.map,
-                "map_key": places[name][2],
-                "origin": places[name][:2],
-                "ego": one.ego,
-                "cameras": places[name][3],
-                "answers": list(one.answers),
-            }
-            for name, one in traces.items()
-        ]
+        listed: list[dict[str, Any]] = []
+        for name, one in traces.items():
+            x, y, digest, cameras = places[name]
+            about = {"name": name, "frames": one.frames, "period": one.period_ns / 1e9}
+            about |= {"seconds": (one.end_ns - one.start_ns) / 1e9, "map": one.map}
+            listed.append(about | {"map_key": digest[:16], "origin": (x, y), "cameras": cameras})
         return {"store": file.path.name, "traces": listed, "codes": file.codes()}
 
     def about(self) -> dict[str, Any]:
@@ -110,38 +98,28 @@ class Reads:
 
     # Columns -------------------------------------------------------------------------------------
 
-    def thumbs(self, fields: Fields) -> Read:
+    def thumbs(self, fields: Fields) -> bytes:
         """States in some frames, for small pictures."""
         frames = fields.frames()
         if len(frames) > MOST_THUMBS:
             raise RequestError(f"frames: expected at most {MOST_THUMBS}")
+        traces = self._traces()[0]  # asked for once: the store may change all the time
+        of = [(_among(traces, trace).trace_id, seq) for trace, seq in frames]
+        return packed({}, self._store.file.states_at(of))
 
-        def read() -> bytes:
-            traces = self._traces()[0]  # asked for once: the store may change all the time
-            of = [(_among(traces, trace).trace_id, seq) for trace, seq in frames]
-            return packed({}, self._store.file.states_at(of))
-
-        return read
-
-    def states(self, fields: Fields) -> Read:
+    def states(self, fields: Fields) -> bytes:
         """States in a window of frames: ``frame.…`` of each frame, the others of each state."""
         trace, first, last = fields.text("trace"), fields.whole("first"), fields.whole("last")
+        frames, states = self._store.file.states(self._trace(trace).trace_id, first, last)
+        # Where the states of each frame begin, so that the page need not look for them.
+        start = np.searchsorted(states.pop("seq"), [*frames["seq"].tolist(), 1 << 31])
+        columns = {f"frame.{name}": column for name, column in frames.items()}
+        columns["frame.start"] = start.astype(np.uint32)
+        return packed({"trace": trace, "first": first, "last": last}, columns | states)
 
-        def read() -> bytes:
-            of = self._trace(trace)
-            frames, states = self._store.file.states(of.trace_id, first, last)
-            # Where the states of each frame begin, so that the page need not look for them.
-            start = np.searchsorted(states["seq"], [*frames["seq"].tolist(), 1 << 31])
-            columns = {f"frame.{name}": column for name, column in frames.items()}
-            columns["frame.start"] = start.astype(np.uint32)
-            states = {name: column for name, column in states.items() if name != "seq"}
-            return packed({"trace": trace, "first": first, "last": last}, columns | states)
-
-        return read
-
-    def static(self, fields: Fields) -> Read:
+    def static(self, fields: Fields) -> bytes:
         """Things that never move in a trace, and the names of all entities."""
-        return partial(self.still, fields.text("trace"))
+        return self.still(fields.text("trace"))
 
     def still(self, trace: str) -> bytes:
         """Things that never move in a trace, and the names of all entities, as bytes."""
@@ -151,9 +129,9 @@ class Reads:
             columns = self._store.file.scenery(of)
         return packed({"trace": trace, "names": names}, columns)
 
-    def map(self, fields: Fields) -> Read:
+    def map(self, fields: Fields) -> bytes:
         """Outlines of the road map of a trace; without points where it has none."""
-        return partial(self.outlines, fields.text("trace"))
+        return self.outlines(fields.text("trace"))
 
     def outlines(self, trace: str) -> bytes:
         """Outlines of the road map of a trace; without points where it has none."""
@@ -178,34 +156,23 @@ class Reads:
                     return
                 self.outlines(trace)
 
-    def series(self, fields: Fields) -> Read:
+    def series(self, fields: Fields) -> bytes:
         """An attribute over time."""
-        trace, attribute = fields.text("trace"), fields.text("attribute")
-        node = fields.whole("node", least=-(1 << 31))
-        other = fields.whole("other", least=-(1 << 31)) if fields.has("other") else None
-
-        def read() -> bytes:
-            of = self._trace(trace).trace_id
-            columns = self._store.file.series(of, attribute, node, other)
-            return packed({"trace": trace, "attribute": attribute}, columns)
-
-        return read
+        trace, (attribute, node, other) = fields.text("trace"), fields.curve()
+        columns = self._store.file.series(self._trace(trace).trace_id, attribute, node, other)
+        return packed({"trace": trace, "attribute": attribute}, columns)
 
     # Plain values, pictures --------------------------------------------------------------------------
 
-    def frame(self, fields: Fields) -> Read:
+    def frame(self, fields: Fields) -> dict[str, Any]:
         """The scene graph of a frame: all that is known of its nodes and edges."""
         trace, seq = fields.text("trace"), fields.whole("seq")
+        return told_graph(self._store.file.graph(self.frame_id(trace, seq)))
 
-        def read() -> dict[str, Any]:
-            return told_graph(self._store.file.graph(self.frame_id(trace, seq)))
-
-        return read
-
-    def picture(self, fields: Fields) -> Read:
-        """Picture of a camera at a frame, as it stands in the recording."""
+    def picture(self, fields: Fields) -> tuple[bytes, str]:
+        """Picture of a camera at a frame, as it stands in the recording, and its type."""
         trace, seq, channel = fields.text("trace"), fields.whole("seq"), fields.text("channel")
-        return partial(self.picture_at, trace, seq, channel)
+        return self.picture_at(trace, seq, channel)
 
     def picture_at(self, trace: str, seq: int, channel: str) -> tuple[bytes, str]:
         """Picture of a camera at a frame, and its type.
@@ -217,33 +184,17 @@ class Reads:
         """
         return shown_picture(self._store.file.carried(self.frame_id(trace, seq), channel), channel)
 
-    def words(self, _: Fields) -> Read:
+    def words(self, _: Fields) -> dict[str, Any]:
         """Words of the language, for completion."""
-        return lambda: words(self._store.catalog())
+        return words(self._store.catalog())
 
-    def library(self, _: Fields) -> Read:
+    def library(self, _: Fields) -> list[dict[str, Any]]:
         """Patterns that have names, with their drawings."""
-
-        def read() -> list[dict[str, Any]]:
-            return [
-                {
-                    "name": one.name,
-                    "kind": one.kind,
-                    "query": one.query,
-                    "text": one.text,
-                    "sentence": one.sentence,
-                    "source": one.source,
-                    "library": one.library,
-                    "drawing": one.example,
-                    "parameters": [
-                        {"name": p.name, "type": p.type, "default": p.default, "meaning": p.meaning}
-                        for p in one.parameters.values()
-                    ],
-                }
-                for one in patterns().values()
-            ]
-
-        return read
+        names = ("name", "kind", "text", "sentence", "library")
+        return [
+            {name: getattr(one, name) for name in names} | {"drawing": one.example}
+            for one in patterns().values()
+        ]
 
 
 def _among(traces: Mapping[str, StoredTrace], name: str) -> StoredTrace:

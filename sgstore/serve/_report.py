@@ -87,15 +87,8 @@ def report(
     QueryError
         The text is no query.
     """
-    page, many, truncated = _made(
-        store,
-        text,
-        dict(parameters or {}),
-        Path(to).stem,
-        most=most,
-        around_s=around_s,
-        pictures=pictures,
-    )
+    title = Path(to).stem
+    page, many, truncated = _made(store, text, parameters, title, most, around_s, pictures)
     write_bytes(to, page.encode())
     return many, truncated
 
@@ -145,26 +138,22 @@ def inline(
     QueryError
         The text is no query.
     """
-    values = dict(parameters or {})
-    page, _, _ = _made(
-        store, text, values, "sgstore", most=most, around_s=around_s, pictures=pictures
-    )
+    page, _, _ = _made(store, text, parameters, "sgstore", most, around_s, pictures)
     return PlayableMatches(page, height)
 
 
 def _made(
     store: Store,
     text: str,
-    values: dict[str, Any],
+    parameters: Mapping[str, Any] | None,
     title: str,
-    *,
     most: int,
     around_s: float,
-    pictures: bool,
+    pictures: bool,  # noqa: FBT001 - as report has it
 ) -> tuple[str, int, bool]:
     """A page, how many matches it holds, and whether there are more."""
     with store.file.snapshot():
-        kept, found, truncated = _kept(store, text, values, most, around_s)
+        kept, found, truncated = _kept(store, text, dict(parameters or {}), most, around_s)
         if pictures:
             kept["pictures"] = _pictures(store, kept["about"]["traces"], found)
     return _page(kept, title), len(found), truncated
@@ -382,20 +371,12 @@ def _page(kept: dict[str, Any], title: str) -> str:
         name: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
         for name, text in (("script", code), ("style", style))
     }
-    data = as_json(kept).decode().replace("<", "\\u003c")
-    return f"""<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="content-security-policy" content="{POLICY.format(**digests)}">
-<title>{html.escape(title)}</title>
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<style>{style}</style>
-</head>
-<body><div id="app"></div>
-<script type="application/json" id="kept">{data}</script>
-<script type="module">{code}</script>
-</body>
-</html>
-"""
+    told = {
+        "policy": POLICY.format(**digests),
+        "title": html.escape(title),
+        "style": style,
+        "kept": as_json(kept).decode().replace("<", "\\u003c"),
+        "script": code,
+    }
+    text = (PAGE / "report.html").read_text(encoding="utf-8")
+    return re.sub(r"\{\{(\w+)\}\}", lambda place: told[place[1]], text)

@@ -123,6 +123,12 @@ class Fields:
             raise RequestError("binding: expected an object of node ids")
         return {str(k): _whole(v, f"binding of {k!r}", -(1 << 31)) for k, v in found.items()}
 
+    def curve(self) -> tuple[str, int, int | None]:
+        """Name of a number, the node that it is of, and the other node if it is of two."""
+        least = -(1 << 31)
+        other = self.whole("other", least=least) if self.has("other") else None
+        return self.text("attribute"), self.whole("node", least=least), other
+
     def frames(self) -> list[tuple[str, int]]:
         """Frames as trace and number."""
         return [(name, seq) for name, seq in self._lists("frames", 2)]

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from sgstore.errors import QueryError
-from sgstore.lang import WhyNotSteps
+from sgstore.lang import PatternPart, WhyNotSteps
 from sgstore.query import Store
 from sgstore.sandbox import plain, rows_found, serve, tell
 from sgstore.temporal import margin_cells
@@ -67,20 +67,16 @@ def _told_parts(store: Store, question: dict[str, Any], _: int) -> Iterator[Repl
     yield {
         "trace": lanes.trace,
         "binding": lanes.binding,
-        "lanes": [
-            {
-                "text": lane.part.text,
-                "step": lane.part.step,
-                "nodes": lane.part.nodes,
-                "edges": [asdict(edge) for edge in lane.part.edges],
-                "conditions": lane.part.conditions,
-                "spans": lane.spans,
-                "unknown": lane.unknown,
-            }
-            for lane in lanes.lanes
-        ],
+        "lanes": [told_lane(lane.part, lane.spans, lane.unknown) for lane in lanes.lanes],
         "together": {step: lanes.together(step) for step in lanes.steps},
     }
+
+
+def told_lane(part: PatternPart, spans: Any, unknown: Any) -> Reply:
+    """A lane of truth as the page takes it."""
+    names = "text", "step", "nodes", "conditions"
+    about = {name: getattr(part, name) for name in names}
+    return about | {"edges": list(map(asdict, part.edges)), "spans": spans, "unknown": unknown}
 
 
 def _told_why(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:

@@ -8,7 +8,7 @@ import * as api from "./api.js";
  *   binding: Record<string, number>, names: Record<string, string>, values: Record<string, any>, index: any,
  *   pattern?: string, group?: string, go?: () => void}} Match */
 /** @typedef {{name: string, frames: number, seconds: number, period: number, map: string, map_key: string,
- *   origin: [number, number], ego: string, cameras: string[], answers: string[], side?: string}} Trace */
+ *   origin: [number, number], cameras: string[], side?: string}} Trace */
 
 export const store = signal(/** @type {any} */ (null));
 export const words = signal(/** @type {any} */ (null));
