@@ -452,11 +452,10 @@ def _digests(labels: tuple[str, ...]) -> NDArray[np.uint64]:
 def _on_edges(words: Words, bundles: tuple[tuple[int, ...], ...]) -> Words:
     """The words of labels as edges add them up: for each label, and from the end for each bundle."""
     words = _mixed(words)
-    if not bundles:
-        return words
     several = bundles[::-1]
-    starts = np.cumsum([0, *(len(bundle) for bundle in several[:-1])])
-    sums = np.add.reduceat(words[[label for bundle in several for label in bundle]], starts)
+    flat = np.array([label for bundle in several for label in bundle], np.int64)
+    sums = np.zeros((len(several), 2), np.uint64)
+    np.add.at(sums, np.repeat(np.arange(len(several)), [*map(len, several)]), words[flat])
     return np.concatenate([words, sums])
 
 

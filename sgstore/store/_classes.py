@@ -104,7 +104,8 @@ class TraceClasses:
             named += self._classes.of(
                 *(of.function(seen) for of in self._of[first : first + together])
             )
-        return [tuple(named[i : i + seen.frames]) for i in range(0, len(named), seen.frames)]
+        count = seen.frames
+        return [tuple(named[i * count : (i + 1) * count]) for i in range(len(self._of))]
 
     def _columns(self, named: Sequence[tuple[str, ...]], trace_id: int, seq: Ints) -> Columns:
         rows: list[tuple[str, str]] = []
