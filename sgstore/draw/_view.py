@@ -156,7 +156,7 @@ def caption(node: int, attributes: Mapping[str, Any]) -> str:
     """Name of a node in a picture: what it is called, ``car 17``, ``lane 12/0/-1``, ``ego (car 0)``."""
     told = clean(attributes.get(CALLED, ""), 32)
     if told:
-        return f"ego ({told})" if attributes.get("is_ego") else told
+        return f"ego ({told})" if attributes.get("is_ego") and told != "ego" else told
     kind = clean(attributes.get("kind", "node"), 16)
     name = clean(attributes.get("name", ""), 24)
     if node < 0 and name == kind:
