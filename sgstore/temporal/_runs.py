@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 
     Keys = NDArray[np.int64]
 
-FIRST_WINDOW: Final = 4096
-"""Buckets of the first window: 245,760 frames."""
+FIRST_WINDOW: Final = 16_384
+"""Buckets of the first window, a million frames: each looks into most of the tables."""
 
 ROWS_EACH: Final = 4
 """Rows in arrays that are read at a time for one of those that :class:`Windows` counts."""
@@ -289,7 +289,7 @@ class RunFinder:
         self._plan, self._ask, self._named = plan, ask, named
         scope = ask.query.scope
         bare = not (scope.edges or scope.where) and {*scope.nodes} == {*ask.variables}
-        self._window_nodes = {*ask.variables} if bare else None
+        self._window_nodes = frozenset(ask.variables) if bare else None
 
     def fits(self, places: Sequence[b.Bound]) -> bool:
         """Tell whether rows of the pattern are enough to tell where it holds, and some values."""
@@ -379,14 +379,13 @@ class RunFinder:
 
     def _read(self, tests: Collection[Test], window: Window | None) -> BindingRows:
         """The rows of the pattern, with all that tests need of them."""
-        signals = {signal.name: signal for test in tests for signal in test.signals.values()}
-        asked = [signal.value for signal in signals.values() if signal.value is not None]
+        signals = (signal.value for test in tests for signal in test.signals.values())
+        asked = list(dict.fromkeys(value for value in signals if value is not None))
         line = FrameLine.read(self._file, self._query, self._catalog, window)
         size = ROW_BYTES + EDGE_BYTES * len(self._ask.edges) + VALUE_BYTES * len(asked)
         most = self._file.memory // size
         ids, keys, found = arrays_of(self._file, self._catalog, self._ask, window, asked, most)
-        asks = signals.values()
-        values = {ask.value: _column(one) for ask, one in zip(asks, found, strict=True)}
+        values = {value: _column(one) for value, one in zip(asked, found, strict=True)}
         return BindingRows.of(line, ids, keys, values)
 
 
