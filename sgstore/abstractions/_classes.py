@@ -308,7 +308,7 @@ def contents_of(seen: GraphColumns) -> list[bytes]:
     _told(sums[:2], 0, seen.node_frame, seen.node, own)
     _told(sums[:2], 1, lanes.frame, lanes.strand, lanes.role)
     _told(sums[:2], 2, np.arange(seen.frames), seen.ego_lane)
-    _told(sums[2:], 3, *(of[rows] for of in (seen.frame, seen.src, seen.dst, seen.relation)))
+    _told(sums[2:], 3, seen.frame[rows], seen.src[rows], seen.dst[rows], seen.relation[rows])
     return [row.tobytes() for row in np.ascontiguousarray(sums.T)]
 
 
@@ -358,12 +358,13 @@ class _Block:
         first = np.flatnonzero(np.append(True, key[order[1:]] != key[order[:-1]])[: len(key)])
         label, alone = on_edges[graphs.label[order]], order[first]
         low, high = label.T.copy() if len(first) == len(key) else np.add.reduceat(label, first).T
-        of_node = words[graphs.node_label].T.copy()
+        node_low, node_high = words[graphs.node_label].T.copy()
         return cls(
             graphs.frames,
             graphs.node_frame,
             graphs.node,
-            *of_node,
+            node_low,
+            node_high,
             graphs.frame[alone],
             src[alone],
             dst[alone],

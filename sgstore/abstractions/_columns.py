@@ -632,10 +632,9 @@ class EgoLanes:
             rows = np.flatnonzero(number[frame] >= 0)
             return number[frame[rows]], *(column[rows] for column in columns)
 
-        lanes = some(self.frame, self.strand, self.role)
-        return EgoLanes(
-            *lanes, *(some(*of) for of in (self.inside, self.inside_lane, self.off_road))
-        )
+        frame, strand, role = some(self.frame, self.strand, self.role)
+        inside, inside_lane = some(*self.inside), some(*self.inside_lane)
+        return EgoLanes(frame, strand, role, inside, inside_lane, some(*self.off_road))
 
 
 _FOUND: Final[WeakKeyDictionary[GraphColumns, EgoLanes]] = WeakKeyDictionary()
