@@ -10,16 +10,9 @@ from sgstore.pair_numbers._ways import LANE_DIST
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-GAP: Final = (
-    "CASE WHEN reach1 + reach2 IS NULL THEN NULL WHEN greatest(out1, out2, out3, out4) <= 0 THEN 0"
-    " ELSE sqrt(least("
-    + ", ".join(
-        f"CASE WHEN out{i} > 0 THEN out{i} * out{i} + greatest(past{i}, 0) * greatest(past{i}, 0) END"
-        for i in (1, 2, 3, 4)
-    )
-    + ")) END"
-)
-"""The distance of b's centre from the octagon."""
+# Not within a branch of a CASE, for which DuckDB works out all parts anew.
+GAP: Final = "coalesce(sqrt(least(square1, square2, square3, square4)), 0) + 0 * (out1 + out2)"
+"""The distance of b's centre from the octagon; NULL where a place or size is not known."""
 
 BEYOND: Final = {
     "out1": "abs(lon) - reach1",
@@ -30,8 +23,13 @@ BEYOND: Final = {
     "past2": "abs(CASE WHEN lat < 0 THEN -lon ELSE lon END - hand * (lb * co - wb * si)) - la",
     "past3": "abs(CASE WHEN back < 0 THEN -side ELSE side END + hand * (la * si - wa * co)) - wb",
     "past4": "abs(CASE WHEN side < 0 THEN -back ELSE back END + hand * (la * co - wa * si)) - lb",
+    **{
+        f"square{i}": f"CASE WHEN out{i} > 0"
+        f" THEN out{i} * out{i} + greatest(past{i}, 0) * greatest(past{i}, 0) END"
+        for i in (1, 2, 3, 4)
+    },
 }
-"""Distances of b's centre beyond edges of the octagon, and past their ends."""
+"""Distances of b's centre beyond edges of the octagon, and past their ends; squares of those from the edges."""
 
 
 def _turned(angle: str) -> str:
@@ -119,7 +117,7 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
     "closing_time": PairFunction(
         "the gap at the closing speed, whether or not the ways meet",
         "s",
-        "CASE WHEN closing_speed > 0 THEN gap / closing_speed END",
+        "gap / nullif(approach, 0)",
         note="NULL where the centres do not approach",
         dear=True,
         worse="low",

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from sgstore.pair_numbers._declared import PairFunction
 
 _EGGERT: Final = "Eggert, Predictive Risk Estimation for Intelligent ADAS Functions, 2014"
-_MOVED: Final = re.compile(r"\b(lon|lat|back|side|(?:out|past)[1-4])\b")
+_MOVED: Final = re.compile(r"\b(lon|lat|back|side|(?:out|past|square)[1-4])\b")
 _HALVES: Final = ((1, "la", 1, 2), (2, "wa", 2, 1), (3, "lb", 3, 4), (4, "wb", 4, 3))
 """Half extents of both boxes, each with the axis that it lies on and the one across."""
 

@@ -222,7 +222,7 @@ class Prioritized:
         times = _times(units) if self.worst else np.zeros(0)
         coded = self.code[self.picked] if len(self.code) else np.full(len(self.picked), UNKNOWN)
         turns = _turns(coded)
-        many = np.bincount(self.code[self.code != UNKNOWN]) if len(self.code) else np.zeros(0)
+        many = np.bincount(self.code[self.code != UNKNOWN]).tolist() if len(self.code) else []
         of = [f"with {one}" for one in self.names]
         for start in range(0, len(self.picked), _TOLD):
             part = self.picked[start : start + _TOLD]
