@@ -430,6 +430,9 @@ assert run(["find", sys.argv[1], "MATCH (e:Ego) WHERE e.speed > 5", "--count"]) 
 unloaded("numpy", *engine[2:], "pydantic", "rich", "sgstore.readers", "sgstore.roads", "sgstore.relations")
 unloaded("sgstore.coverage", "sgstore.selection", "sgstore.draw", "sgstore.exporters._write", "sgstore.sgg")
 unloaded("sgstore.mcap._chunks", "sgstore.opendrive", "sgstore.config", "sgstore.sandbox")
+with sgstore.open(sys.argv[1]) as store:
+    assert store.find("MATCH (e:Ego)").rows()
+unloaded("ray", "pyspark", "obstore", "sgstore.collection._questions", "sgstore.collection._engines")
 """
 
 
