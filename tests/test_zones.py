@@ -11,7 +11,7 @@ from lanelet2_maps import LaneletMap
 from library_scenes import ENTRY, EXIT, SCENES, WAYS, on
 from opendrive_maps import a_map, a_road, lane, line, link, mark, section
 from scenes import APART, Scene, along, ego, store_of
-from thorough import some
+from thorough import LONG, some
 
 from sgstore.errors import QueryError
 from sgstore.lanelet2 import lanelet2_text
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 ZONES: Final = {"main": WAYS, "merge": ENTRY, "departure": EXIT}
 """Roads of two lanes, to whose right there is nothing, a lane that leads on, and one that leads off."""
 ISO: Final = [name for name in patterns() if name.startswith("iso_")]
-TRIED: Final = some(ISO, 3)
+TRIED: Final = some(ISO, 7)
 
 
 # The 24 disturbances ----------------------------------------------------------------------------------------
@@ -81,7 +81,7 @@ def test_a_disturbance_is_found_in_its_zone_alone(store: Store, name: str, zone:
     }
 
 
-@pytest.mark.parametrize(("name", "zone"), some([(n, z) for n in TRIED for z in ZONES], 3))
+@pytest.mark.parametrize(("name", "zone"), some([(n, z) for n in TRIED for z in ZONES], 7))
 def test_a_monitor_finds_it_where_the_store_does(store: Store, name: str, zone: str) -> None:
     for number, scene in enumerate(TRACES[f"{zone} {name}"]):
         told: list[str] = []
@@ -195,7 +195,7 @@ def test_zones_are_where_maps_were_drawn_with_them(tmp_path: Path) -> None:
         "sumo": of_sumo(),
     }
     traces = {
-        f"{name} {number}": [Scene(road, ego(way, 40), seconds=29.6)]
+        f"{name} {number}": [Scene(road, ego(way, 40), seconds=29.6, rate=5 if LONG else 2)]
         for name, road in maps.items()
         for number, way in enumerate(
             (along(-1.75, 3, 1197), RAMP if name == "lanelets" else along(-5.25, 3, 1197))
