@@ -20,6 +20,7 @@ from sgstore import coverage
 from sgstore.cli import run as run_verb
 from sgstore.collection import Collection, PartialAnswerError, gc, pack, unpack, verify
 from sgstore.collection import _catalogue as catalogue
+from sgstore.collection import _engines as engines
 from sgstore.errors import QueryError, SqlError, StoreError
 from sgstore.lang import _catalog, compile_query, ir, syntax
 from sgstore.lang import _parts as parts
@@ -585,6 +586,32 @@ def test_garbage_goes_and_what_is_spoken_of_stays(path: Path, tmp_path: Path) ->
 def test_a_folder_that_is_no_collection_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="not a collection"):
         Collection(tmp_path)
+
+
+OF_RAY = (
+    '\x1b[36mray::_done()\x1b[39m (pid=12, ip=10.0.0.1)\n  File "a.py", line 3, in _done\n    f(task)\n'
+    "    ^^^^^^^\nKeyError: 'bundle'\n\nDuring handling of the above exception, another one occurred:\n\n"
+    '\x1b[36mray::_done()\x1b[39m (pid=12, ip=10.0.0.1)\n  File "b.py", line 4, in f\nValueError: no 7\nat all'
+)
+OF_SPARK = (
+    "An error occurred while calling z:org.apache.spark.api.python.PythonRDD.collectAndServe.\n"
+    ": org.apache.spark.SparkException: Job aborted due to stage failure: Task 0 in stage 0.0 failed 4 times\n"
+    'Traceback (most recent call last):\n  File "a.py", line 3, in main\n    f()\nMemoryError: 9 GB\n\n'
+    "\tat org.apache.spark.api.python.BasePythonRunner.handle(PythonRunner.scala:572)"
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        (OF_RAY, "ValueError: no 7"),
+        (OF_SPARK, "MemoryError: 9 GB"),
+        ("\n\x1b[31mThe worker died.\x1b[39m\nSee its logs.", "The worker died."),
+        ("", "RuntimeError"),
+    ],
+)
+def test_what_a_task_raised_far_away_is_told_in_one_plain_line(text: str, line: str) -> None:
+    assert engines._cause(RuntimeError(text)) == line
 
 
 def test_what_is_asked_of_one_store_says_so(place: Path) -> None:

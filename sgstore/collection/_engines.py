@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -205,7 +206,7 @@ class _Ray:
                 try:
                     yield self._ray.get(one)
                 except self._ray.exceptions.RayError as error:
-                    yield {"bundle": task["bundle"], "error": _first_line(error)}
+                    yield {"bundle": task["bundle"], "error": _cause(error)}
 
 
 class _Spark:
@@ -226,7 +227,7 @@ class _Spark:
         try:
             self._spark: Any = session or _session(sql, master)
         except Exception as error:
-            raise StoreError(f"Spark does not start: {_first_line(error)}") from error
+            raise StoreError(f"Spark does not start: {_cause(error)}") from error
 
     def map(self, function: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[Outcome]:
         name = f"{function.__module__}:{function.__qualname__}"
@@ -242,7 +243,7 @@ class _Spark:
         try:
             return self._done(name, [task])
         except Exception as error:  # noqa: BLE001  as above
-            return [{"bundle": task["bundle"], "error": _first_line(error)}]
+            return [{"bundle": task["bundle"], "error": _cause(error)}]
 
     def _done(self, name: str, tasks: Sequence[Task]) -> list[Outcome]:
         # Not as a data frame (mapInArrow): planning it, and rows of Java between, cost four times as much.
@@ -267,9 +268,15 @@ def _lines_done(name: str, lines: Iterable[str]) -> Iterator[str]:
         yield json.dumps(_done(name, json.loads(line)))
 
 
-def _first_line(error: BaseException) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[0][:300] if lines else type(error).__name__
+_RAISED: Final = re.compile(r'^[ \t]+File ".*\n(?:[ \t].*\n)*(\S.*)', re.MULTILINE)
+"""Frames of Python within the text of an error, and what was raised there."""
+
+
+def _cause(error: BaseException) -> str:
+    """One line that says why: what a task raised far away, else the first line."""
+    text = re.sub(r"\x1b\[[\d;]*m", "", str(error)).strip()  # Ray writes in colours
+    lines = _RAISED.findall(text)[-1:] or text.splitlines() or [type(error).__name__]
+    return lines[0].strip()[:300]
 
 
 # A process that does tasks for another -----------------------------------------------------------
