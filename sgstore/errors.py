@@ -132,6 +132,14 @@ class StoreError(SgstoreError):
     """A store cannot be opened, or lacks what was asked of it."""
 
 
+def one_store_needed(collection: str | Path, why: str = "this asks one store") -> StoreError:
+    """The error of a collection that is named where one store is needed."""
+    place = place_named(collection)
+    return StoreError(
+        f"{place}: a collection, and {why}: 'sgstore collection unpack {place} all.sgstore' makes one of it"
+    )
+
+
 class SqlError(StoreError):
     """A statement of the user's that the database refuses."""
 

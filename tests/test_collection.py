@@ -25,6 +25,7 @@ from sgstore.errors import QueryError, SqlError, StoreError
 from sgstore.lang import _catalog, compile_query, ir, syntax
 from sgstore.lang import _parts as parts
 from sgstore.lang._aggregates import AGGREGATES
+from sgstore.locks import Lock, made_with
 from sgstore.query import Store
 from sgstore.store import CATALOGUE, StoreFile, _bundles
 
@@ -614,9 +615,38 @@ def test_what_a_task_raised_far_away_is_told_in_one_plain_line(text: str, line: 
     assert engines._cause(RuntimeError(text)) == line
 
 
-def test_what_is_asked_of_one_store_says_so(place: Path) -> None:
-    with pytest.raises(StoreError, match=r"a collection, .* 'sgstore collection unpack'"):
-        Store(place)
+@pytest.mark.parametrize("where", ["{fleet}", "s3://bucket/fleet"])
+@pytest.mark.parametrize(
+    "verb",
+    [
+        "select {} MATCH+(a:Car)",
+        "like {} trace1@1",
+        "diff {} {one} --query MATCH+(a:Car)",
+        "diff {fleet} {one}",
+        "diff {fleet}:{lock} {one}",
+        "lock verify {lock} {}",
+    ],
+)
+def test_what_is_asked_of_one_store_names_the_verb_that_makes_one(
+    verb: str,
+    where: str,
+    path: Path,
+    place: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    places = {"fleet": place, "one": path, "lock": tmp_path / "t.lock"}
+    Lock(made_with(), {}).write(places["lock"])
+    url = (where if "{}" in verb else "{fleet}").format(**places)
+    words = verb.format(url, **places).split()
+
+    assert run_verb([word.replace("+", " ") for word in words]) == 1
+    told = capsys.readouterr().err
+    assert told.startswith(f"sgstore: {url}: a collection, and ")
+    assert told.endswith(
+        f" one store: 'sgstore collection unpack {url} all.sgstore' makes one of it\n"
+    )
+    assert told.count("\n") == 1
 
 
 def test_verbs_ask_collections_as_they_ask_stores(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.errors import StoreError, url_named
+from sgstore.errors import StoreError, one_store_needed, url_named
 from sgstore.lang import node_of_kind
 from sgstore.locks import ENDING as LOCK
 from sgstore.locks import frames_of_lock, read_lock, store_beside
@@ -202,9 +202,7 @@ class ChosenFrames:
         """
         if isinstance(self.source, Store):
             return self.source
-        raise StoreError(
-            f"{self.text}: a collection, where one store is needed; 'sgstore collection unpack' makes one of it"
-        )
+        raise one_store_needed(self.source.place.url)
 
     def joined(self, tables: Mapping[str, Path]) -> ChosenFrames:
         """The same frames, with tables of one's own that patterns can ask; see :class:`sgstore.query.Store`."""
@@ -317,9 +315,7 @@ def _of_collection(text: str, url: str, query: str, engine: str) -> ChosenFrames
 
     whole = Collection(url, engine=engine)
     if Path(query).suffix == LOCK:
-        raise StoreError(
-            f"{text}: a lock names frames of one store: 'sgstore collection unpack' makes one of a collection"
-        )
+        raise one_store_needed(url, "a lock names frames of one store")
     if not query:
         return ChosenFrames(text, whole)
     return ChosenFrames(text, whole, frames_of(whole, query), whole.find(query).reasons)

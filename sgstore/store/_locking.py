@@ -20,7 +20,7 @@ from weakref import finalize
 import duckdb
 
 import sgstore.store._schema as shape
-from sgstore.errors import SqlError, StoreError
+from sgstore.errors import SqlError, StoreError, one_store_needed, url_named
 from sgstore.files import HeldFolder, new_place, sweep
 from sgstore.logs import logger
 from sgstore.quoting import literal
@@ -55,6 +55,8 @@ def refuse_special(path: Path) -> None:
     ------
     StoreError
     """
+    if url_named(path) is not None:
+        raise one_store_needed(path)
     for file in (path.with_name(f"{path.name}.wal"), path):
         try:
             mode = file.stat().st_mode
@@ -64,9 +66,7 @@ def refuse_special(path: Path) -> None:
             reason = error.strerror if isinstance(error, OSError) else "not a name of a file"
             raise StoreError(f"{path}: cannot be read: {reason}") from error
         if (path / "COLLECTION.json").is_file():
-            raise StoreError(
-                f"{path}: a collection, and this asks one store: 'sgstore collection unpack' makes one"
-            )
+            raise one_store_needed(path)
         if not stat.S_ISREG(mode):
             what = _KINDS.get(stat.S_IFMT(mode), "no file")
             whose = "" if file == path else f"{file.name} beside it is "
