@@ -169,6 +169,19 @@ def test_a_lock_hands_its_cases_on(here: pytest.Pytester, lock: dict[str, Any]) 
     here.runpytest(*PLUGIN).assert_outcomes(passed=3)
 
 
+def test_cases_run_in_the_order_that_a_lock_says(
+    here: pytest.Pytester, lock: dict[str, Any]
+) -> None:
+    first, second, third = (case["id"] for case in lock["cases"])
+    lock["selection"]["order"] = [third, first, second]
+    (here.path / "tests.lock").write_text(json.dumps(lock))
+
+    ran = here.runpytest(*PLUGIN, "-v")
+
+    ran.assert_outcomes(passed=3)
+    ran.stdout.fnmatch_lines([f"*::test_scene?{case}? PASSED*" for case in (third, first, second)])
+
+
 @pytest.mark.parametrize(
     ("field", "value", "says"),
     [
