@@ -239,12 +239,16 @@ def test_a_crossing_is_no_zone(tmp_path: Path) -> None:
     assert store.find("MATCH (v:Car) WHERE NOT in_zone(v, 'main')").rows() == []
 
 
-def test_who_is_on_no_lane_is_in_no_zone_that_is_known(tmp_path: Path) -> None:
-    scene = Scene(ENTRY, ego(along(-30.0), 10), seconds=1)
-    store = store_of(tmp_path / "s.db", {"aside": [scene]})
+def test_zones_are_unknown_on_no_lane_and_on_lanes_without_sections(tmp_path: Path) -> None:
+    scenes = {
+        "aside": [Scene(ENTRY, ego(along(-30.0), 10), seconds=1)],
+        "merged": [Scene(ENTRY.without_sections, ego(along(-1.75), 10), seconds=1)],
+    }
+    store = store_of(tmp_path / "s.db", scenes)
 
-    assert len(store.find("MATCH (e:Ego) WHERE NOT known(in_merge_zone(e))").rows()) == 6
-    assert store.find("MATCH (e:Ego) WHERE in_zone(e, 'main')").rows() == []
+    assert store.find("MATCH (e:Ego) WHERE EXISTS {(e)-[:isIn]->(:Lane)}").count() == 6
+    for zone in ("main", "merge", "departure"):
+        assert store.find(f"MATCH (e:Ego) WHERE NOT known(in_zone(e, '{zone}'))").count() == 12
 
 
 # Broad markings ---------------------------------------------------------------------------------------------
