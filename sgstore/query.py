@@ -614,7 +614,7 @@ class Store:
             The last two with the extra ``video``.
         **look
             ``camera``, ``relations``, ``radius``, ``north_up``, ``diagram``, ``names``, ``fps``: see
-            :func:`sgstore.draw.draw_clip`.
+            :func:`sgstore.draw.draw_clip`. ``fps`` is 10; a long GIF has less, 150 pictures: some 10 MB.
 
         Raises
         ------
@@ -628,6 +628,9 @@ class Store:
 
         frames = self._range_of(clip)
         matches = None if query is None else self.find(query)
+        if form == "gif":
+            start, end = (self.file.frame(one).log_time_ns for one in frames)
+            look.setdefault("fps", min(10.0, 150e9 / max(end - start, 1)))
         with working_folder("animation") as folder:
             file = folder / f"clip.{form}"
             marked = draw_clip(self, frames, file, matches=matches, **look)
@@ -639,17 +642,13 @@ class Store:
         from sgstore.matches import Interval
 
         if isinstance(clip, str):
-            frames = range_of(clip)
-            if frames is None:
+            if (frames := range_of(clip)) is None:
                 raise StoreError(f"not a clip: {clip!r}; expected TRACE@12s..18s or TRACE#120..180")
             return frames
         if isinstance(clip, Interval):
             return f"{clip.trace}#{clip.start_seq}", f"{clip.trace}#{clip.end_seq}"
-        sql = (
-            "SELECT min(seq), max(seq) FROM frames WHERE trace = ? AND log_time_ns BETWEEN ? AND ?"
-        )
-        rows = self.file.rows(sql, [clip.trace, clip.start_ns, clip.end_ns])
-        first, last = rows.values[0]
+        sql = "SELECT min(seq), max(seq) FROM frames WHERE trace=? AND log_time_ns BETWEEN ? AND ?"
+        first, last = self.file.rows(sql, [clip.trace, clip.start_ns, clip.end_ns]).values[0]
         if first is None:
             raise StoreError(f"no frame of {clip.trace!r} is in {clip}")
         return f"{clip.trace}#{first}", f"{clip.trace}#{last}"

@@ -97,6 +97,28 @@ def test_the_graph_has_its_nodes_and_edges(
 
 
 @rerun
+def test_every_path_has_its_place(
+    store: sgstore.Store, chunks: dict[str, list[dict[str, Any]]]
+) -> None:
+    graphs = [store.graph(f"town#{seq}") for seq in range(360, 381)]
+    relations = {key for graph in graphs for *_, key in graph.edges(keys=True)}
+    areas = {"crosswalk", "driving", "none", "parking", "sidewalk"}
+
+    assert {path for path in chunks if not path.startswith("/__")} == {
+        "/graph",
+        "/world",
+        "/world/boxes",
+        "/world/ego",
+        r"/world/ego/ego\/lidar",
+        r"/world/ego/ego\/lidar/\/ego\/lidar\/points",
+        r"/camera/\/ego\/camera\/front\/image",
+        *(f"/world/map/{area}" for area in areas),
+        *(f"/world/edges/{relation}" for relation in relations),
+    }
+    assert all(chunks.values())
+
+
+@rerun
 def test_pictures_points_and_axes_are_there(
     store: sgstore.Store, chunks: dict[str, list[dict[str, Any]]]
 ) -> None:

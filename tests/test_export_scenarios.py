@@ -152,19 +152,35 @@ def test_a_scenario_has_everybody_where_the_recording_has_them(
     (file, road_map) = write_export(
         Export(store, (Clip("town", low * S // 10, high * S // 10),)), tmp_path / "out", "xosc"
     )
-    found, _, end = played(file.file)
-    tracks = tracks_of(frames)
-    z = {o.id.value: o.base.position.z for f in frames[low : high + 1] for o in f.moving_object}
-    compared, absent = 0, 0
+    compared, absent, end = stands_as_recorded(file.file, store, frames, low)
 
     assert file.losses == ()
     assert end == (high - low) / 10
+    assert compared > 900
+    assert absent > 100
+    assert (
+        road_map.file.read_text()
+        == decoded(SAMPLE)[1]["ground_truth_map"][0].open_drive_xml_content
+    )
+    assert faults([file.file]) == []
+
+
+def stands_as_recorded(
+    file: Path, store: sgstore.Store, frames: list[Any], low: int
+) -> tuple[int, int, float]:
+    """How many places were compared, how many entities were not there, and how long it lasts; s.
+
+    Everybody is within 1 cm of the recording, from its frame ``low`` on, at each frame and between two.
+    """
+    found, _, end = played(file)
+    tracks = tracks_of(frames)
+    z = {o.id.value: o.base.position.z for frame in frames for o in frame.moving_object}
+    compared, absent = 0, 0
     for one in found.values():
         track = tracks.get(one.properties["sgstore.ident"])
         if track is None:  # it stands for ever
             continue
-        z = {o.id.value: o.base.position.z for frame in frames for o in frame.moving_object}
-        for step in range(2 * (high - low) + 1):
+        for step in range(2 * round(end * 10) + 1):
             middle, row = one.middle(step / 20), low + step // 2
             rows = [row, row + step % 2]
             if middle is None:
@@ -173,15 +189,9 @@ def test_a_scenario_has_everybody_where_the_recording_has_them(
             if not track.here[rows].all() or not {*rows} <= stored(store, one):
                 continue
             expected = [track.x[rows].mean(), track.y[rows].mean(), z[track.ident]]
-            assert np.abs(middle - expected).max() < 0.01, (one.properties, step)
+            assert np.abs(middle - expected).max() < 0.01, (file.name, one.properties, step)
             compared += 1
-    assert compared > 900
-    assert absent > 100
-    assert (
-        road_map.file.read_text()
-        == decoded(SAMPLE)[1]["ground_truth_map"][0].open_drive_xml_content
-    )
-    assert faults([file.file]) == []
+    return compared, absent, end
 
 
 def stored(store: sgstore.Store, one: Played) -> set[int]:
@@ -222,16 +232,23 @@ def test_lights_show_what_they_showed(
     assert compared > 300
 
 
-def test_matches_of_the_library_are_valid_scenarios(store: sgstore.Store, tmp_path: Path) -> None:
+def test_matches_of_the_library_are_valid_scenarios_and_driven_again_what_was_recorded(
+    store: sgstore.Store, frames: list[Any], tmp_path: Path
+) -> None:
     wanted, clips = (20 if LONG else 1), []
     for pattern in patterns().values():
         if pattern.kind == "scenario" and len(clips) < wanted:
             clips += list(store.find(pattern.written()).clips(1, 1))[:1]
     written = write_export(Export(store, tuple(clips)), tmp_path / "out", "xosc")
+    files = [one.file for one in written if one.file.suffix == ".xosc"]
 
-    assert len(clips) == wanted
-    assert faults([one.file for one in written if one.file.suffix == ".xosc"]) == []
+    assert len(clips) == len(files) == wanted
+    assert faults(files) == []
     assert [one.file.name for one in written if one.holds == "maps"] == ["town.xodr"]
+    for clip, file in zip(clips, files, strict=True):
+        low = max(0, -(-clip.start_ns * 10 // S))  # a clip may begin before the recording
+        compared, _, end = stands_as_recorded(file, store, frames, low)
+        assert compared > 10 * end, file.name
 
 
 # Recordings that lack something -----------------------------------------------------------------------

@@ -117,6 +117,24 @@ def test_a_clip_plays(store: sgstore.Store, tmp_path: Path) -> None:
         store.animate("town@25s")
 
 
+@pytest.mark.parametrize(("clip", "fps"), [("town@2s..12s", 10), ("town@2s..62s", 2.5)])
+def test_a_long_clip_has_fewer_pictures_a_second(
+    clip: str, fps: float, store: sgstore.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[float | None] = []
+
+    def drawn(_store: sgstore.Store, _frames: Any, to: Path, **look: Any) -> int:
+        asked.append(look.get("fps"))
+        return to.write_bytes(b"")
+
+    monkeypatch.setattr("sgstore.draw.draw_clip", drawn)
+    store.animate(clip)
+    store.animate(clip, fps=4)
+    store.animate(clip, form="mp4")
+
+    assert asked == [fps, 4, None]
+
+
 def points_by_protobuf(log_time_ns: int) -> np.ndarray[Any, Any]:
     """The cloud of the sample nearest to a time, decoded by the descriptors in the file and nothing of ours."""
     with RECORDING.open("rb") as stream:
