@@ -222,7 +222,7 @@ class ExternalRelation:
     Attributes
     ----------
     first, last : list of int
-        Of runs of ``frame_id``: the same is matched in each of them.
+        Of runs of ``frame_id``, each within a bucket: the same is matched in each of them.
     nodes : dict of str to list of int
         Node ids by key.
     edges : dict of str to list of str
@@ -279,20 +279,18 @@ def external_matches(
     columns |= {f"{key}.id": "BIGINT" for key in shape.nodes}
     columns |= {f"{key}.type": "VARCHAR" for key in shape.edges}
     columns |= {n: "BIGINT" if one in SPAN else _TYPES[one.type] for one, n in names.items()}
-    select = Select(['unnest(range("first", "last" + 1)) AS "frame_id"'])
-    select.columns += [quoted(name) for name in list(columns)[2:]]
     if isinstance(found, ExternalRelation):
         parts = [
             f"unnest(CAST({sql.values.add(rows)} AS {kind}[])) AS {quoted(name)}"
             for rows, (name, kind) in zip(_columns(found, shape), columns.items(), strict=True)
         ]
-        select.join(nested("SELECT " + ",\n  ".join(parts), ":runs"), [])
+        name = sql.share("SELECT " + ",\n  ".join(parts), "found")
     else:
-        gathered = Gathered(GATHERED, columns, lambda window: _columns(found(window), shape))
+        name = GATHERED
+        gathered = Gathered(name, columns, lambda window: _columns(found(window), shape))
         sql.gathered = (gathered,)
-        select.join(quoted(GATHERED), [])
-    name = sql.share(select.text(), "found")
-    sql.found = SharedRelation(name, frozenset(shape.nodes), frozenset(shape.edges), names)
+    nodes, edges = frozenset(shape.nodes), frozenset(shape.edges)
+    sql.found = SharedRelation(name, nodes, edges, names, runs=True)
     return sql
 
 

@@ -10,7 +10,7 @@ from dataclasses import field
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.lang._catalog import DisplayUnit
-from sgstore.lang._formulas import Leaf, leaves, nested
+from sgstore.lang._formulas import Leaf, Select, leaves, nested
 from sgstore.lang._kinds import Profile
 from sgstore.lang._rewrite import counted_block, is_lasting
 from sgstore.lang.ir import (
@@ -29,13 +29,14 @@ from sgstore.lang.ir import (
     nodes_of,
     walk,
 )
+from sgstore.quoting import quoted
 from sgstore.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from sgstore.lang._catalog import Catalog
-    from sgstore.lang._formulas import BoundValues, Select
+    from sgstore.lang._formulas import BoundValues
     from sgstore.lang.ir import FrameAttribute
 
 
@@ -88,12 +89,22 @@ class SharedRelation:
         What it binds.
     told : mapping of FrameAttribute to str
         Values that it has beside them, and their columns.
+    runs : bool
+        Whether a row is of all frames of a bucket from ``first`` to ``last``, rather than of one.
     """
 
     name: str
     nodes: frozenset[str]
     edges: frozenset[str]
     told: Mapping[FrameAttribute, str] = field(default_factory=dict["FrameAttribute", str])
+    runs: bool = False
+
+    def frames(self, alias: str) -> str:
+        """The relation with a row for each frame, as ``FROM`` takes it."""
+        if not self.runs:
+            return f"{quoted(self.name)} AS {quoted(alias)}"
+        every = ['unnest(range("first", "last" + 1)) AS "frame_id"', '* EXCLUDE ("first", "last")']
+        return nested(Select(every, [quoted(self.name)]).text(), alias)
 
 
 @dataclass(slots=True)

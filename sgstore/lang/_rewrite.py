@@ -36,6 +36,7 @@ from sgstore.lang.ir import (
     NodeAttribute,
     NodeValue,
     Operation,
+    PairNumber,
     PathWay,
     Query,
     Result,
@@ -50,6 +51,7 @@ from sgstore.lang.ir import (
     walk,
     with_operands,
 )
+from sgstore.pair_numbers import PAIR_FUNCTIONS
 from sgstore.vocabulary import KINDS
 
 if TYPE_CHECKING:
@@ -546,3 +548,42 @@ def _weighed(value: Bound) -> Bound:
             return replace(value, operand=INVARIANT)
         case _:
             return with_operands(value, _weighed)
+
+
+# Conditions that follow from others ------------------------------------------------------------------------
+
+_LESS: Final = {"<", "<=", "="}
+_MORE: Final = {">", ">=", "="}
+
+
+def bounds(conditions: list[Bound]) -> list[Bound]:
+    """Conditions that follow from others and are cheap to test: ``gap < t`` needs circles that near."""
+    found: list[Bound] = []
+    for condition in conditions:
+        match condition:
+            case Operation(word, (PairNumber() as pair, limit)) if word in _LESS:
+                found += _bound(pair, limit)
+            case Operation(word, (limit, PairNumber() as pair)) if word in _MORE:
+                found += _bound(pair, limit)
+            case _:
+                pass
+    return found
+
+
+def _bound(pair: PairNumber, limit: Bound) -> list[Bound]:
+    if not is_dear(pair) or any(is_dear(leaf) for leaf in leaves(limit)):
+        return []
+    least = PairNumber("at_least", pair.a, pair.b)
+    if PAIR_FUNCTIONS[pair.function].unit == "s":
+        approach = PairNumber("approach", pair.a, pair.b)
+        limit = Operation("*", (limit, approach), Type.number)
+    return [Operation("<=", (least, limit), Type.boolean)]
+
+
+def is_dear(leaf: Leaf) -> bool:
+    """Tell whether it is a number of pairs that takes long to compute."""
+    return (
+        isinstance(leaf, PairNumber)
+        and leaf.function in PAIR_FUNCTIONS
+        and PAIR_FUNCTIONS[leaf.function].dear
+    )

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, TypeGuard
 
-from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit, Home, Type
+from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit, Home
 from sgstore.lang._formulas import (
     Aliases,
     Leaf,
@@ -38,7 +38,7 @@ from sgstore.lang._formulas import (
 from sgstore.lang._kinds import Profile, homes_of, kind_conditions
 from sgstore.lang._operators import COMPARISONS, Column
 from sgstore.lang._plan import Phases, SharedRelation, apart, phases_of
-from sgstore.lang._rewrite import INVARIANT, complement, counted_block, is_lasting
+from sgstore.lang._rewrite import INVARIANT, bounds, complement, counted_block, is_dear, is_lasting
 from sgstore.lang._sql_masks import (
     BUCKET,
     CountRange,
@@ -46,6 +46,7 @@ from sgstore.lang._sql_masks import (
     base_rows,
     expanded,
     folded,
+    found_masks,
     frames_with,
     held,
     if_bound,
@@ -73,7 +74,7 @@ from sgstore.lang.ir import (
     blocks_of,
     nodes_of,
 )
-from sgstore.pair_numbers import PAIR_FUNCTIONS, WAYS, needed_for, parts_of, stage_of
+from sgstore.pair_numbers import WAYS, needed_for, parts_of, stage_of
 from sgstore.quoting import quoted
 
 if TYPE_CHECKING:
@@ -82,9 +83,6 @@ if TYPE_CHECKING:
     from sgstore.lang._catalog import Attribute, Catalog
     from sgstore.lang._formulas import BoundValues
 
-
-_LESS: Final = {"<", "<=", "="}
-_MORE: Final = {">", ">=", "="}
 
 Part = tuple[str, str, str]
 """A number of a pair: its name, and the nodes."""
@@ -151,7 +149,7 @@ class Layers:
     tested: int = 0
 
     def __post_init__(self) -> None:
-        cheap = [c for c in self.conditions if not any(_dear(leaf) for leaf in leaves(c))]
+        cheap = [c for c in self.conditions if not any(is_dear(leaf) for leaf in leaves(c))]
         pairs = [pair for c in cheap for pair in _pairs(leaves(c))]
         self.early = {
             (name, p.a, p.b) for p in pairs for name in needed_for(p.function) if stage_of(name)
@@ -235,38 +233,6 @@ def named(text: str, name: str) -> str:
     return text if text == name or text.endswith(f".{name}") else f"{text} AS {name}"
 
 
-def bounds(conditions: list[Bound]) -> list[Bound]:
-    """Conditions that follow from others and are cheap to test: ``gap < t`` needs circles that near."""
-    found: list[Bound] = []
-    for condition in conditions:
-        match condition:
-            case Operation(word, (PairNumber() as pair, limit)) if word in _LESS:
-                found += _bound(pair, limit)
-            case Operation(word, (limit, PairNumber() as pair)) if word in _MORE:
-                found += _bound(pair, limit)
-            case _:
-                pass
-    return found
-
-
-def _bound(pair: PairNumber, limit: Bound) -> list[Bound]:
-    if not _dear(pair) or any(_dear(leaf) for leaf in leaves(limit)):
-        return []
-    least = PairNumber("at_least", pair.a, pair.b)
-    if PAIR_FUNCTIONS[pair.function].unit == "s":
-        approach = PairNumber("approach", pair.a, pair.b)
-        limit = Operation("*", (limit, approach), Type.number)
-    return [Operation("<=", (least, limit), Type.boolean)]
-
-
-def _dear(leaf: Leaf) -> bool:
-    return (
-        isinstance(leaf, PairNumber)
-        and leaf.function in PAIR_FUNCTIONS
-        and PAIR_FUNCTIONS[leaf.function].dear
-    )
-
-
 # Bound patterns → SQL, second phase: conditions and results that need values of single frames ----
 # The frames that the first phase leaves are joined with ``state`` (and the tables of constants) for each node
 # whose values are asked for; numbers of pairs are computed around that join (:mod:`sgstore.lang._sql_frames`).
@@ -295,6 +261,8 @@ def masks(
 
     ``kinds`` are nodes whose kind is a column, too, of those of :func:`told_kinds`.
     """
+    if (found := sql.found_in(scope)) is not None:
+        return found_masks(found)
     if not parts.blocks:
         return base_rows(sql, scope, parts, given, nodes, edges, kinds)
     outside = {key for c in parts.blocks for block in blocks_of(c) for key in block.scope.outer}
@@ -453,18 +421,21 @@ def _of_buckets(
     wanted: Sequence[Leaf],
 ) -> tuple[Select, dict[Leaf, str]]:
     """Return the result of the first phase, joined with the tables of lasting values, and their SQL."""
-    known = told_kinds(sql, scope, parts)
+    found = sql.found_in(scope)
+    known = set[str]() if found else told_kinds(sql, scope, parts)
     kinds = {leaf: leaf.node for leaf in wanted if _is(leaf, "kind") and leaf.node in known}
     text = masks(sql, scope, parts, given, nodes, edges, frozenset(kinds.values()))
     select = Select()
-    if len(scope.edges) > 1 and scope is sql.query.scope:
+    if len(scope.edges) > 1 and scope is sql.query.scope and not found:
         text = Select(["*"], [quoted(sql.share(text, "pattern"))]).text()
     select.join(nested(text, PATTERN[1:-1]), [])
     bound = {key: f"{PATTERN}.{quoted(f'{key}.id')}" for key in nodes}
     bucket = f'{PATTERN}."bucket"'
-    others = [leaf for leaf in wanted if leaf not in kinds]
+    told = found.told if found else {}
+    others = [leaf for leaf in wanted if leaf not in kinds and leaf not in told]
     texts = _join_lasting(select, bucket, bound, scope, sql.catalog, others)
     texts |= {leaf: f"{PATTERN}.{quoted(column_of(leaf))}" for leaf in kinds}
+    texts |= {leaf: f"{PATTERN}.{quoted(name)}" for leaf, name in told.items()}
     for leaf in wanted:
         if isinstance(leaf, EdgeRelation):
             texts[leaf] = f"CAST({PATTERN}.{quoted(f'{leaf.edge}.type')} AS VARCHAR)"
@@ -497,9 +468,11 @@ def in_masks(
 def _lasting(sql: SqlBuilder, scope: Scope, wanted: Iterable[Leaf]) -> str | None:
     """One row a bucket and match, with values that last as long; ``None`` if frames must be looked at."""
     parts, wanted = phases(sql, scope), list(dict.fromkeys(wanted))
-    if sql.found_in(scope) or parts.rest or parts.late:
+    known = sql.found_in(scope)
+    if (known and not known.runs) or parts.rest or parts.late:
         return None
-    if not all(is_lasting(v, scope, sql.catalog) for v in wanted):
+    told = known.told if known else {}
+    if not all(leaf in told or is_lasting(leaf, scope, sql.catalog) for leaf in wanted):
         return None
     nodes = frozenset(key for leaf in wanted for key in nodes_of(leaf))
     edges = frozenset(leaf.edge for leaf in wanted if isinstance(leaf, EdgeRelation))
@@ -528,12 +501,12 @@ def _first_phase(
     known = sql.found_in(scope)
     if known is not None:
         join.select.lenient = True  # what is not there in the frame is unknown
-        join.select.join(f"{quoted(known.name)} AS {PATTERN}", [])
+        join.select.join(known.frames(PATTERN[1:-1]), [])
         join.frame = f'{PATTERN}."frame_id"'
         if not blocks:
             return join, None
         keys = columns_of(bound)
-        rows = Select(['"frame_id"', *keys], [quoted(known.name)], distinct=True)
+        rows = Select(['"frame_id"', *keys], [known.frames(":found")], distinct=True)
         name = sql.share(folded(rows.text(), keys), "pattern")
         return join, SharedRelation(name, bound, frozenset())
     told = _kinds_of_edges(sql, scope, parts, needed)

@@ -410,6 +410,15 @@ def number_of_frames(text: str) -> str:
     return Select([total], [nested(text, ":pattern")]).text()
 
 
+def found_masks(found: SharedRelation) -> str:
+    """Runs of matches that are known, each within a bucket, as rows of the first phase."""
+    mask = (
+        '((1::BIGINT << ("last" - "first" + 1)::INTEGER) - 1) << ("first" & 63)::INTEGER AS "mask"'
+    )
+    columns = ['"first" >> 6 AS "bucket"', mask, '* EXCLUDE ("first", "last")']
+    return Select(columns, [quoted(found.name)]).text()
+
+
 def in_which(alias: str) -> list[str]:
     """The columns that say in which frames a row of a relation of the first phase holds."""
     return [f'{alias}."bucket"', f'{alias}."mask"']

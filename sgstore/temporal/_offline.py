@@ -377,7 +377,8 @@ def read(
                 trace.relations[name] = _no_rows(ask)
         else:
             size = ROW_BYTES + EDGE_BYTES * len(ask.edges)
-            many = _relate(file, catalog, name, narrower, window, found, memory // size)
+            where = _window_left(ask, catalog, window, found)
+            many = _relate(file, catalog, name, narrower, where, found, memory // size)
             rows, memory = rows + many, memory - many * size
     ordered = (trace.trace_id for trace in catalog.traces)
     return [found[trace] for trace in ordered if trace in found], rows
@@ -396,6 +397,20 @@ def _narrowed(ask: Ask, traces: Collection[TraceReader]) -> Ask | None:
             ids[node] = np.intersect1d(ids[node], held) if node in ids else held
     few = {node: held.tolist() for node, held in ids.items() if len(held) <= NODES_NAMED}
     return ask.among(few) if few else ask
+
+
+def _window_left(
+    ask: Ask, catalog: Catalog, window: Window | None, traces: Mapping[int, TraceReader]
+) -> Window | None:
+    """The traces in which each of the steps that are asked before holds."""
+    left = {
+        trace_id
+        for trace_id, trace in traces.items()
+        if all(len(trace.relations[before.name].keys) for before in ask.after)
+    }
+    if len(left) == len(traces):
+        return window
+    return Window.of([one.extent for one in catalog.traces if one.trace_id in left] or [(0, 0)])
 
 
 def _no_rows(ask: Ask) -> TimedRelation:
