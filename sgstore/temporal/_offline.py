@@ -477,7 +477,7 @@ def arrays_of(
     statement = relation(ask.query, catalog, window, values, bound, most + 1)
     *before, last = statement.steps()
     arrays = file.arrays(*last, given=before)
-    ids = np.ma.getdata(arrays["frame_id"]).astype(np.int64)
+    ids = np.ma.getdata(arrays["frame_id"]).astype(np.int64, copy=False)
     if len(ids) > most:
         held = (one.name for one in catalog.traces if window is None or one.extent[0] in window)
         raise TooMuchError(
@@ -485,7 +485,7 @@ def arrays_of(
             f" {', '.join(held)}, more than memory may take",
             hint="say more of its nodes: a label, an edge between them, a condition; or allow more memory",
         )
-    columns = [np.ma.getdata(arrays[key]).astype(np.int64) for key in ask.variables]
+    columns = [np.ma.getdata(arrays[key]).astype(np.int64, copy=False) for key in ask.variables]
     columns += [np.searchsorted(words(), np.ma.getdata(arrays[k]).astype(str)) for k in ask.edges]
     keys = np.stack(columns, axis=1) if columns else np.zeros((len(ids), 0), np.int64)
     return ids, keys, [arrays[f":{n}"] for n in range(len(values))]

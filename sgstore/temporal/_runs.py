@@ -44,11 +44,11 @@ if TYPE_CHECKING:
 
     Keys = NDArray[np.int64]
 
-FIRST_WINDOW: Final = 16_384
-"""Buckets of the first window, a million frames: each looks into most of the tables."""
+FIRST_WINDOW: Final = 2_048
+"""Buckets of the first window: each looks into most of the tables, and dense patterns take memory."""
 
-ROWS_EACH: Final = 4
-"""Rows in arrays that are read at a time for one of those that :class:`Windows` counts."""
+ROWS_EACH: Final = 2
+"""So many rows of those that :class:`Windows` counts take the memory of one that is put in order here."""
 
 VALUE_BYTES: Final = 20
 """Memory that a value of a row takes beside its binding; bytes."""
@@ -324,10 +324,13 @@ class RunFinder:
         within : Window or None
         """
         asked = [one for one in extents(self._catalog) if within is None or one[0] in within]
+        # Traces that are alike stand beside one another: each window is to have some of all kinds.
+        apart = 1 + sum(buckets for _, buckets in asked) // FIRST_WINDOW
+        asked = [one for first in range(apart) for one in asked[first::apart]]
         steps = Windows(asked, first=FIRST_WINDOW, whole_traces=True)
         for window in steps:
             for told, rows in steps.parts(window or within, partial(self._found, places)):
-                steps.rows += rows // ROWS_EACH
+                steps.rows += rows * ROWS_EACH
                 yield told
 
     def _found(self, places: Sequence[b.Bound], window: Window | None) -> tuple[RunsTold, int]:
