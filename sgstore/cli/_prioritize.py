@@ -207,6 +207,7 @@ def prioritize(
         say(text)
     if known is not None:
         _fault_detection(found, known, given.picture)
+    rows = found.rows()  # the store is asked for them before there is a lock
     if output is not None:
         values = parameters_of(parameters)
         with count_bar(output.name, "cases") as progress:
@@ -219,7 +220,7 @@ def prioritize(
             )
         say_made(made, output)
     # Last: who reads only the first rows has the lock all the same.
-    out.write(found.columns, found.rows())
+    out.write(found.columns, rows)
 
 
 def _fault_detection(order: Prioritized, known: dict[str, bool], picture: Path | None) -> None:

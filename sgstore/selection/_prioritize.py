@@ -215,18 +215,26 @@ class Prioritized:
         return ("place", "unit", "risk", *likely, *(one.name for one in self.worst), "reason")
 
     def rows(self) -> Iterator[tuple[Any, ...]]:
-        """The units in order, with the reasons: made some thousand at a time, as they are asked for."""
-        store, units = self.units.chosen.store, self.units
+        """The units in order, with the reasons: made some thousand at a time, as they are asked for.
+
+        The store is asked at once, and not again.
+        """
         sql = "SELECT trace_id, node_id, kind FROM entities"
-        kinds = {tuple(one): kind for *one, kind in store.file.rows(sql).values}
-        times = _times(units) if self.worst else np.zeros(0)
+        found = self.units.chosen.store.file.rows(sql).values
+        kinds = {tuple(one): kind for *one, kind in found}
+        times = _times(self.units) if self.worst else np.zeros(0)
+        return self._told(kinds, times, names_of_units(self.units, self.picked))
+
+    def _told(
+        self, kinds: dict[tuple[Any, ...], Any], times: Floats, units: list[str]
+    ) -> Iterator[tuple[Any, ...]]:
         coded = self.code[self.picked] if len(self.code) else np.full(len(self.picked), UNKNOWN)
         turns = _turns(coded)
         many = np.bincount(self.code[self.code != UNKNOWN]).tolist() if len(self.code) else []
         of = [f"with {one}" for one in self.names]
         for start in range(0, len(self.picked), _TOLD):
             part = self.picked[start : start + _TOLD]
-            traces = trace_of(units.first[part]).tolist()
+            traces = trace_of(self.units.first[part]).tolist()
             columns = [one.value[part].tolist() for one in self.worst]
             risk = self.risk[part].tolist() if len(self.risk) else [None] * len(part)
             told = [_reasons(one, part, traces, kinds, times) for one in self.worst]
@@ -240,13 +248,13 @@ class Prioritized:
                     [
                         ""
                         if code == UNKNOWN
-                        else _of_class(turn, many[code], units.unit, of[code] if of else _OWN)
+                        else _of_class(turn, many[code], self.units.unit, of[code] if of else _OWN)
                         for code, turn in classes
                     ]
                 )
             said = ("; ".join(filter(None, one)) for one in zip(*told, strict=True))
             known = [[None if v != v else v for v in one] for one in columns]  # noqa: PLR0124 - NaN
-            names = names_of_units(units, part)
+            names = units[start : start + _TOLD]
             places = range(start + 1, start + 1 + len(part))
             for *row, reason in zip(places, names, risk, *known, said, strict=True):
                 yield (*row, reason or "nothing is known of it")
