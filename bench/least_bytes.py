@@ -48,6 +48,8 @@ TOLD = {
 """What other columns of a row tell: no more bytes are needed for it."""
 OF_MAPS = re.compile("map|light_lane")
 """Tables that grow with the number of maps, not of frames."""
+BOUND = "what bounds the file: exact values in blocks of 2,048 that a scan reads without the rows before"
+"""Said beside the bytes of FLOAT columns."""
 _UUIDS = re.compile(r"([0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}\n)+")
 
 
@@ -181,6 +183,28 @@ def sizes(store: Path, folder: Path) -> Iterator[tuple[str, int, int]]:
             yield name, size - empty, rows
 
 
+def of_fractions(store: Path) -> int:
+    """Bytes of the segments that hold FLOAT columns, in tables that grow with frames."""
+    sql = """
+        SELECT coalesce(sum(bytes) FILTER (segment_type = 'FLOAT' AND counts), 0) FROM (
+          SELECT segment_type, counts, lead(block_offset, 1, $1)
+                 OVER (PARTITION BY block_id ORDER BY block_offset) - block_offset AS bytes
+          FROM ({0}) WHERE block_id >= 0)
+    """
+    with duckdb.connect(str(store), read_only=True) as connection:
+        (block,) = connection.execute("SELECT block_size FROM pragma_database_size()").fetchone()
+        named = connection.execute(
+            "SELECT table_name FROM duckdb_tables() WHERE schema_name = 'inside'"
+        ).fetchall()
+        parts = [
+            f"SELECT segment_type, {not OF_MAPS.match(name)} AS counts, block_id, block_offset"
+            f" FROM pragma_storage_info('inside.{name}')"
+            for (name,) in named
+        ]
+        ((found,),) = connection.execute(sql.format(" UNION ALL ".join(parts)), [block]).fetchall()
+    return int(found)
+
+
 def bytes_of(path: Path, frames: int, folder: Path, aim: int) -> Iterator[Measure]:
     """Bytes a frame, whole and by table, beside the least that tables and their largest columns take."""
     table = list(sizes(path, folder))
@@ -201,4 +225,5 @@ def bytes_of(path: Path, frames: int, folder: Path, aim: int) -> Iterator[Measur
     yield Measure("  what else is in the file", rest / frames, "B/frame")
     lowest = sum(least for least, _ in floor.values())
     yield Measure("floor of all tables but maps", lowest, "B/frame", "columns packed one by one")
+    yield Measure("FLOAT columns as stored", of_fractions(path) / frames, "B/frame", BOUND)
     yield Measure("tables of maps", maps / 2**20, "MiB")
