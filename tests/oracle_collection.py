@@ -1,7 +1,9 @@
 """One store against collections of it: random questions have the same rows in the same order.
 
 ``python -m oracle_collection 1000`` (in this folder) asks that many, of collections of 1, 3 and 20 bundles;
-``python -m oracle_collection 1000 ray`` by an engine, ``python -m oracle_collection 1000 ray 3`` of 3 bundles.
+``python -m oracle_collection 1000 ray`` by an engine, ``python -m oracle_collection 1000 local+ray 3`` by two,
+of 3 bundles, ``python -m oracle_collection 500:1000 ray`` the second half of them. At the end it says how many
+questions there were of each sort, and how many of these had an answer.
 
 What is right is what one store says: it is held against exhaustive search in :mod:`oracle`, :mod:`oracle_after`
 and :mod:`oracle_over_time`.
@@ -34,6 +36,9 @@ if TYPE_CHECKING:
 
     import duckdb
 
+    Asked = tuple[Store, list[Collection]]
+    """A store, and collections that hold the same."""
+
 TRACES = 20
 BUNDLES = (1, 3, 20)
 QUESTIONS = 100
@@ -64,6 +69,7 @@ class CollectionWriter(AfterWriter):
             0.40: self.union,
             0.52: self.in_parts,
             0.57: lambda: self.settings() + self.of_classes(),
+            0.64: self.beside,
             1.00: self.pattern,
         }
         roll = self.rng.random()
@@ -78,6 +84,23 @@ class CollectionWriter(AfterWriter):
         if roll < 0.4:
             return text + self.after()
         return text + (self.values() if roll < 0.75 else self.form())
+
+    def beside(self) -> str:
+        """A question about tables of a user's own, which stand beside the store."""
+        score, label = self.rng.choice((2, 5, 8)), self.rng.choice(("good", "bad"))
+        happened = "EVENTUALLY[0s, 1s] HAPPENS takeover(e)"
+        tests = [f"labels.score > {score}", f"labels.label = '{label}'", "labels.label IS NULL"]
+        tests += [f"NOT labels.score < {score}", "HAPPENS takeover(v)", "HAPPENS takeover()"]
+        test = self.rng.choice(tests)
+        if self.rng.random() < 0.25:
+            formula = test.replace("(v)", "(ego)")
+            return f"CHECK c: {self.rng.choice(('ALWAYS', 'EVENTUALLY'))} ({formula})"
+        if self.rng.random() < 0.2:
+            return f"MATCH (e:Ego) WHERE {happened} RETURN trace.name, COUNT(*)"
+        told = ["labels.label, COUNT(*), AVG(labels.score)", "FRAMES, v", "INTERVALS", "v"]
+        told += ["v, labels.score ORDER BY labels.score DESC LIMIT 5", "DISTINCT labels.label"]
+        told += ["trace.name, MAX(labels.score)", "v.kind, labels.label SAMPLE 3 PER labels.label"]
+        return f"MATCH (v:Entity) WHERE {test} RETURN {self.rng.choice(told)}"
 
     def check(self) -> str:
         """A check, by how much it is met, or with values over its violations."""
@@ -240,14 +263,51 @@ def answers(asked: Store | Collection, text: str, form: str) -> list[Any]:
     return [tuple(one) if isinstance(one, tuple) else one for one in ask[form]()]
 
 
+SORTS = {
+    "no RETURN": r"^(?!.*(RETURN|CHECK))",
+    "RETURN *": r"RETURN (DISTINCT )?\*",
+    "FRAMES": "RETURN FRAMES",
+    "SUBGRAPHS": "SUBGRAPHS",
+    "INTERVALS": "INTERVALS",
+    "CLIPS": "CLIPS",
+    **{word: rf"\b{word}\(" for word in ("COUNT", "MIN", "MAX", "AVG", "SUM")},
+    "COUNT(DISTINCT …)": r"COUNT\(DISTINCT",
+    "DISTINCT": "RETURN DISTINCT",
+    "ORDER BY": "ORDER BY",
+    "LIMIT": r"LIMIT \d(?! PER)",
+    "LIMIT n PER": r"LIMIT \d PER",
+    "SKIP": "SKIP",
+    "SAMPLE": "SAMPLE",
+    "HAVING": "HAVING",
+    "median, percentile, stddev, collect": r"(?i)\b(median|percentile|stddev|collect)\(",
+    "class_count": "class_count",
+    "dataset_classes": "dataset_classes",
+    "DATASET": "USING.*DATASET",
+    "EGO": "USING.*EGO",
+    "ABSTRACTION": "ABSTRACTION",
+    "UNKNOWN": "UNKNOWN false",
+    "tables beside": r"labels\.|takeover",
+    "HAPPENS": "HAPPENS",
+    "sequences": r"\bTHEN\b",
+    "repeated or alternative steps": r"\)[+*{]|\}\s*\{|\| *\(",
+    "OPTIONAL MATCH": "OPTIONAL",
+    "WITH": r"\bWITH (?!IN)",
+    "UNION": "UNION",
+    "OVER": r"\bOVER\b",
+    "CHECK": "CHECK",
+    "CHECK … RETURN": "CHECK.*RETURN",
+    "CHECK … ROBUSTNESS": "CHECK.*ROBUSTNESS",
+}
+"""Sort of question → a pattern of its text."""
+
 FORMS = ("count", "frames", "clips", "intervals", "limited")
 """Forms in which an answer is asked for beside its rows: one of them for each second question."""
 
 
 def worlds(
-    seed: int, folder: Path, engine: str = "local", bundles: Sequence[int] = BUNDLES
-) -> tuple[Store, list[Collection]]:
-    """A store, and collections of it of so many bundles."""
+    seed: int, folder: Path, engines: str = "local", bundles: Sequence[int] = BUNDLES
+) -> tuple[Asked, Asked]:
+    """A store, and collections of it of so many bundles by each engine; the same with tables beside them."""
     path = folder / f"{seed}.sgstore"
     StoreFile.create(path)
     world = random_world(seed, traces=TRACES, frames=6 + seed % 5, maps=1 + seed % 2, path=path)
@@ -256,8 +316,33 @@ def worlds(
         size = -(-TRACES // number)
         done = pack(path, folder / f"{seed}-{number}", bundle_traces=size)
         assert len(done.bundles) == number
+    tables = tables_beside(path, folder, seed)
     places = [folder / f"{seed}-{number}" for number in bundles]
-    return Store(path), [Collection(place, engine=engine) for place in places]
+    made = [(place, engine) for engine in engines.split("+") for place in places]
+    plain = Store(path), [Collection(place, engine=engine) for place, engine in made]
+    return plain, (Store(path, tables=tables), [whole.joined(tables) for whole in plain[1]])
+
+
+def tables_beside(path: Path, folder: Path, seed: int) -> dict[str, object]:
+    """Labels of some frames, and takeovers by some who are in them."""
+    rng = random.Random(seed)
+    with Store(path) as store:
+        rows = store.find("MATCH (v:Entity) RETURN trace.name, frame.seq, v.id").rows()
+    frames = sorted({tuple(row[:2]) for row in rows})
+    labels = [
+        f"{name},{seq},{rng.choice(('good', 'bad', ''))},{rng.randrange(100) / 10}\n"
+        for name, seq in rng.sample(frames, len(frames) // 2)
+    ]
+    takeovers = [f"{name},{seq},{node}\n" for name, seq, node in rng.sample(rows, 20)]
+    tables = dict[str, object]()
+    for name, columns, lines in (
+        ("labels", "trace,seq,label,score\n", labels),
+        ("takeover", "trace,seq,node_id\n", takeovers),
+    ):
+        table = folder / f"{seed}-{name}.csv"
+        table.write_text(columns + "".join(lines))
+        tables[name] = table
+    return tables
 
 
 def renamed(connection: duckdb.DuckDBPyConnection, seed: int) -> None:
@@ -278,44 +363,47 @@ def texts(seed: int) -> Iterator[str]:
         yield CollectionWriter(seed * QUESTIONS + number).text()
 
 
-def compare(store: Store, wholes: Iterable[Collection], asked: Iterable[str]) -> Counter[str]:
-    """Ask random questions of a store and of collections; how many of each sort there were."""
-    seen = Counter[str]()
+def compare(plain: Asked, beside: Asked, asked: Iterable[str]) -> tuple[Counter[str], Counter[str]]:
+    """Ask random questions of a store and of collections; how many of each sort, and how many have answers."""
+    seen, some = Counter[str](), Counter[str]()
     for number, text in enumerate(asked):
+        store, wholes = beside if re.search(r"labels\.|takeover", text) else plain
         if reason := refused(store, text):
             seen["refused"] += 1
             assert {refused(whole, text) for whole in wholes} == {reason}, text
             continue
-        seen["asked"] += 1
         other = FORMS[number // 2 % len(FORMS)]
+        sorts = ["asked", *(name for name, word in SORTS.items() if re.search(word, text))]
         for form in ("rows",) if number % 2 or "CHECK" in text else ("rows", other):
             wanted = answers(store, text, form)
-            seen[f"{form} that are some"] += bool(wanted)
+            told = sorts if form == "rows" else [f"asked for {form}"]
+            seen.update(told)
+            some.update(told if wanted and wanted != [[0]] else ())
             for whole in wholes:
                 found = answers(whole, text, form)
                 assert close(wanted, found), (
                     f"{whole}: {text}\n{form} wanted\n{wanted}\nfound\n{found}"
                 )
-    return seen
+    return seen, some
 
 
-def run(
-    questions: int, folder: Path, engine: str = "local", *bundles: str, first: int = 0
-) -> Counter[str]:
-    """Ask so many questions, and say after each world how far it is."""
-    seen = Counter[str]()
-    for seed in range(first, -(-questions // QUESTIONS)):
+def run(questions: str, folder: Path, engines: str = "local", *bundles: str) -> str:
+    """Ask so many questions, and say after each world how far it is; what was asked, by sort."""
+    seen, some = Counter[str](), Counter[str]()
+    first, last = map(int, questions.split(":") if ":" in questions else (0, questions))
+    for seed in range(first // QUESTIONS, -(-last // QUESTIONS)):
         began = time.monotonic()
-        store, wholes = worlds(seed, folder, engine, [*map(int, bundles)] or BUNDLES)
-        with store.file.snapshot():
-            seen += compare(store, wholes, texts(seed))
-        told = f"world {seed}, {time.monotonic() - began:.0f} s: {dict(seen)}"
-        sys.stdout.write(f"{engine} {' '.join(bundles)} {told}\n")
+        plain, beside = worlds(seed, folder, engines, [*map(int, bundles)] or BUNDLES)
+        with plain[0].file.snapshot(), beside[0].file.snapshot():
+            more, answered = compare(plain, beside, texts(seed))
+        seen, some = seen + more, some + answered
+        told = f"world {seed}, {time.monotonic() - began:.0f} s: {seen['asked']} asked"
+        sys.stdout.write(f"{engines} {' '.join(bundles)} {told}, {some['asked']} with an answer\n")
         sys.stdout.flush()
-    return seen
+    return "\n".join(f"{sort}: {some[sort]} of {number}" for sort, number in seen.items())
 
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as made:
-        told = run(int(sys.argv[1]), Path(made), *sys.argv[2:])
-    sys.stdout.write(f"no difference: {dict(told)}\n")
+        told = run(sys.argv[1], Path(made), *sys.argv[2:])
+    sys.stdout.write(f"no difference; of each sort, how many have an answer:\n{told}\n")

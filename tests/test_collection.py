@@ -238,12 +238,10 @@ def test_sequences_that_end_together_come_by_what_they_return(
 @pytest.mark.skipif(not LONG, reason="make cluster asks them")
 def test_random_questions_have_the_rows_of_one_store(tmp_path: Path) -> None:
     """``make cluster`` asks a thousand."""
-    store, wholes = worlds(3, tmp_path)
-    with store.file.snapshot():
-        seen = compare(store, wholes, texts(3))
+    seen, some = compare(*worlds(3, tmp_path), texts(3))
 
-    assert seen["asked"] > 25
-    assert seen["with rows"] > 12
+    assert seen["asked"] > 50
+    assert some["asked"] > 20
 
 
 @pytest.mark.parametrize("text", CHECKS)
