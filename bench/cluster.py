@@ -26,6 +26,8 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from bench.ingest import recording
 from bench.measure import Measure
 from bench.replicas import given, replicate, sources
@@ -34,7 +36,7 @@ from sgstore.query import Store
 from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
 PATTERNS = (
     "MATCH (e:Ego)-[:near_coll]->(v:Vehicle) RETURN INTERVALS, v",
@@ -62,6 +64,8 @@ CHECKS = (
 NOTHING = "MATCH (e:Ego) WHERE e.speed > 1e6"
 AIMS = {4: 1.25, 10: 1.6}
 """Bundles → at most so many times the processor time of one store."""
+RECORDINGS = 16
+"""Recordings that are read in two shares."""
 EMPTY_MS, TASK_MS, BYTES, SHARES = 25.0, 5.0, 1.10, 1.10
 
 
@@ -97,12 +101,14 @@ def measures(folder: Path, traces: int, frames: int | None) -> Iterator[Measure]
     with Store(path) as store, store.file.snapshot():
         one = [*map(best, questions(store))]
     yield Measure("17 questions of one store", sum(one), "s", "processor time; the baseline")
+    spent_on = {1: sum(one)}
     for bundles, aim in AIMS.items():
         place = folder / f"of-{bundles}"
         pack(path, place, bundle_traces=-(-traces // bundles))
         whole = Collection(place)
         list(whole.find(NOTHING))  # each is looked at once whether it is what it was
         took = [*map(best, questions(whole))]
+        spent_on[bundles] = sum(took)
         label = f"the same of {bundles} bundles"
         yield Measure(label, sum(took) / sum(one), "times", f"{sum(took):.3g} s; aim ≤ {aim}")
         size = sum(one.stat().st_size for one in (place / "bundles").iterdir())
@@ -112,13 +118,22 @@ def measures(folder: Path, traces: int, frames: int | None) -> Iterator[Measure]
         nothing = partial(lambda of: list(of.find(NOTHING)), whole)
         empty = median(seconds(nothing) for _ in range(5)) / bundles
         yield Measure("a bundle that finds nothing", empty * 1e3, "ms", f"aim ≤ {EMPTY_MS:g}")
+    yield from model(spent_on, written, len(one))
     yield from of_ray(folder / "of-10")
-    yield from of_shares(folder, 300 if frames else 3_000)
+    yield from of_shares(folder, 300 if frames else 1_500)
+
+
+def model(spent_on: Mapping[int, float], frames: int, asked: int) -> Iterator[Measure]:
+    """The straight line through what was taken of so many bundles, by least squares."""
+    slope, rest = np.polyfit([*spent_on], [*spent_on.values()], 1)
+    told = "a straight line through 1, 4 and 10 files"
+    yield Measure("model: a bundle and question", slope / asked * 1e3, "ms", told)
+    yield Measure("model: a frame and question", rest / asked / frames * 1e6, "µs", told)
 
 
 def of_shares(folder: Path, frames: int) -> Iterator[Measure]:
     """What it costs to read recordings in two shares: each is a process, which has to start."""
-    paths = [str(recording(folder / f"{n}.mcap", frames + n)) for n in range(8)]
+    paths = [str(recording(folder / f"{n}.mcap", frames + n)) for n in range(RECORDINGS)]
     took: dict[int, float] = {}
     for shares in (1, 2):
         before = spent()
@@ -135,7 +150,9 @@ def of_shares(folder: Path, frames: int) -> Iterator[Measure]:
             subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
         took[shares] = spent() - before
     told = f"{took[2]:.3g} s, processor time; {frames} frames each; aim ≤ {SHARES}"
-    yield Measure("8 recordings in 2 shares, beside 1", took[2] / took[1], "times", told)
+    yield Measure(
+        f"{RECORDINGS} recordings in 2 shares, beside 1", took[2] / took[1], "times", told
+    )
 
 
 def spent() -> float:
