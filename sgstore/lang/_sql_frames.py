@@ -147,6 +147,7 @@ class Layers:
     conditions: list[Bound]
     early: set[Part] = field(default_factory=set["Part"])
     tested: int = 0
+    _stages: dict[Part, int] = field(default_factory=dict["Part", int])
 
     def __post_init__(self) -> None:
         cheap = [c for c in self.conditions if not any(is_dear(leaf) for leaf in leaves(c))]
@@ -160,8 +161,11 @@ class Layers:
         """The layer in which a number of a pair is computed; 0 for a raw column."""
         if not stage_of(name):
             return 0
-        found = 1 + max(self.stage(part, a, b) for part in parts_of(name))
-        return found if (name, a, b) in self.early else max(found, self.tested + 1)
+        part = name, a, b
+        if part not in self._stages:
+            found = 1 + max(self.stage(one, a, b) for one in parts_of(name))
+            self._stages[part] = found if part in self.early else max(found, self.tested + 1)
+        return self._stages[part]
 
     def stage_of_test(self, condition: Bound) -> int:
         """The layer after which a condition can be tested."""
