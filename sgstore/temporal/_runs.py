@@ -102,8 +102,11 @@ class FrameLine:
         starts = np.flatnonzero(np.diff(trace_of(ids), prepend=-1))
         traces, counts = trace_of(ids[starts]), np.diff(starts, append=len(ids))
         owners = np.repeat(np.arange(len(traces)), counts)
-        for low, high in zip(starts.tolist(), (starts + counts).tolist(), strict=True):
-            times[low:high] = ascending(times[low:high])
+        still = np.diff(times) <= 0
+        still[starts[1:] - 1] = False
+        for owner in np.unique(owners[1:][still]).tolist():
+            own = slice(starts[owner], starts[owner] + counts[owner])
+            times[own] = ascending(times[own])
         periods = [about[trace][2] for trace in traces.tolist()]
         longest = np.array([longest_step_ns(period) for period in periods])
         begins = np.diff(numbers, prepend=-2) != 1
