@@ -33,7 +33,7 @@ from bench.real import QUICK, TRACES, made
 from sgstore.demo import RECORDING
 from sgstore.ingest import ingest
 from sgstore.query import Store
-from sgstore.serve import report
+from sgstore.report import report
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator

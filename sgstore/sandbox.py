@@ -411,6 +411,35 @@ class Workshop(Sandbox):
     may_write: ClassVar[bool] = True
 
 
+class Errand:
+    """A longer piece of work in a :class:`Workshop` of its own; asked and cancelled as a :class:`SandboxPool`.
+
+    Parameters
+    ----------
+    store : str or Path
+    **limits
+        As :class:`Sandbox` takes them.
+    """
+
+    def __init__(self, store: str | Path, **limits: Any) -> None:
+        self._make = lambda: Workshop(store, **limits)
+        self._box: Workshop | None = None
+        self._gone = False
+
+    def ask(self, question: Mapping[str, object], _key: str) -> Iterator[dict[str, Any]]:
+        """Replies, as they come; none where it was cancelled before."""
+        with self._make() as self._box:
+            if not self._gone:
+                yield from self._box.replies(question)
+
+    def cancel(self, _key: str = "") -> bool:
+        """Stop it."""
+        self._gone = True
+        if self._box is not None:
+            self._box.stop()
+        return True
+
+
 class SandboxPool:
     """Sandboxes of one store, which answer several questions at a time; one more stands ready.
 

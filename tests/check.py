@@ -62,6 +62,7 @@ TESTS = {
     "selection": "selection selection_* prioritize sequences",
     "sumo_net": "sumo",
     "sgg": "sgg sgg_* crowds",
+    "notes": "serve",
     "serve": "serve live report explorer sandbox_pool",
     "step": "online",
     "store": "store store_* doors events",

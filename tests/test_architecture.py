@@ -41,7 +41,7 @@ LAYERS: tuple[frozenset[str], ...] = (
         }
     ),
     frozenset({"mcap", "vocabulary"}),
-    frozenset({"abstractions", "config", "files", "graph", "lang", "roads", "world"}),
+    frozenset({"abstractions", "config", "files", "graph", "lang", "notes", "roads", "world"}),
     frozenset({"contrib", "opendrive", "relations", "step", "trace_parts", "truth_lanes"}),
     frozenset({"lanelet2", "sumo_net"}),
     frozenset({"draw", "map_files", "readers", "sgg"}),
@@ -55,6 +55,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"criticality"}),
     frozenset({"assistant", "diff", "selection"}),
     frozenset({"serve"}),
+    frozenset({"report"}),
     frozenset({"cli"}),
 )
 OWNERS = {

@@ -20,7 +20,7 @@ import pytest
 from sgstore.demo import RECORDING
 from sgstore.ingest import ingest
 from sgstore.query import Store
-from sgstore.serve import inline, report
+from sgstore.report import inline, report
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -21,9 +21,9 @@ from columns_read import unpacked
 from sgstore.config import Config
 from sgstore.demo import RECORDING
 from sgstore.errors import QueryNameError, StoreError
-from sgstore.serve import LiveRun, live_application, paced
+from sgstore.serve import LiveRun, live_application
 from sgstore.step import Frame
-from sgstore.temporal import Monitor, MonitorEvent, opened
+from sgstore.temporal import Monitor, MonitorEvent, opened, paced
 
 if TYPE_CHECKING:
     from sgstore.query import Store
@@ -118,7 +118,7 @@ def test_graphs_and_why_not_are_those_of_a_store(watched: Any, open_town: Store)
     run, events, _ = watched
     found = next(event for event in events if event.kind == "found")
     for seq in (found.start.seq, FRAMES - 1):
-        graph, of = run.graph(seq), open_town.graph(f"town#{seq}")
+        graph, of = run.frame(seq), open_town.graph(f"town#{seq}")
         assert {node["id"]: node["kind"] for node in graph["nodes"] if node["id"] >= 0} == {
             node: about["kind"] for node, about in of.nodes(data=True) if node >= 0
         }
@@ -127,7 +127,7 @@ def test_graphs_and_why_not_are_those_of_a_store(watched: Any, open_town: Store)
         why = open_town.why_not(f"town#{seq}", NEAR).as_dict()
         assert run.why("pattern", seq)["failed"] == why["failed"]
     with pytest.raises(StoreError, match="not kept; those from #0 on are"):
-        run.graph(FRAMES)
+        run.frame(FRAMES)
 
 
 def test_curves_are_those_of_a_store(watched: Any, open_town: Store) -> None:
@@ -176,7 +176,7 @@ def test_a_part_over_time_is_not_known(open_town: Store) -> None:
     lanes = run.parts("pattern", events[0].nodes)["lanes"]
 
     assert [bool(lane["unknown"]) for lane in lanes] == [False, True]
-    assert lanes[0]["spans"] == [[0, 4]]
+    assert lanes[0]["spans"] == ((0, 4),)
     with pytest.raises(QueryNameError, match="no pattern 'other'"):
         run.parts("other", {})
 
@@ -190,9 +190,10 @@ def moving(i: int, speed: float) -> Frame:
 
 def test_what_is_kept_does_not_grow(monkeypatch: pytest.MonkeyPatch) -> None:
     import sgstore.serve._live as live
+    import sgstore.temporal._followed as followed
 
     monkeypatch.setattr(live, "MOST_FRAMES", 10)
-    monkeypatch.setattr(live, "MOST_EDGES", 12)
+    monkeypatch.setattr(followed, "MOST_EDGES", 12)
     run = LiveRun("x", None)
     monitor = Monitor("MATCH (v:Vehicle) WHERE v.speed > 1", on_event=run.event, on_step=run.step)
     run.follow(monitor)

@@ -16,7 +16,7 @@ import pytest
 from sgstore.cli import run
 from sgstore.errors import QueryError
 from sgstore.query import Store
-from sgstore.serve import report
+from sgstore.report import report
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -348,7 +348,8 @@ def _watched_on_a_page(
     port: int,
 ) -> tuple[Monitor, tuple[Verdict, ...]]:
     """A monitor that has watched, beside a page that shows it; and the verdicts, when both have ended."""
-    from sgstore.serve import LiveRun, paced, serve_live
+    from sgstore.serve import LiveRun, serve_live
+    from sgstore.temporal import paced
 
     page = LiveRun(source.name, source.road_map, source.cameras)
 

@@ -81,7 +81,7 @@ def report(
 
     Of checks it shows the violations.
     """
-    from sgstore.serve import report as write
+    from sgstore.report import report as write
 
     if not question:
         raise typer.BadParameter("give a QUERY, -f FILE or -p NAME")

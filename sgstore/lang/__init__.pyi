@@ -62,6 +62,7 @@ from ._parts import Pruning as Pruning
 from ._parts import class_questions as class_questions
 from ._parts import parted as parted
 from ._parse import joined as joined
+from ._completion import words as words
 from ._parse import keywords as keywords
 from ._parse import parse as parse
 from ._truth_parts import DrawnEdge as DrawnEdge
@@ -196,6 +197,7 @@ __all__ = [
     "unnumbered_text",
     "value_text",
     "why_not",
+    "words",
     "with_places",
 ]
 from ._symbols import CLASSES_GIVEN as CLASSES_GIVEN

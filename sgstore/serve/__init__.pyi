@@ -4,26 +4,24 @@ from ._app import Explorer as Explorer
 from ._app import application as application
 from ._live import LiveRun as LiveRun
 from ._live import live_application as live_application
-from ._live import paced as paced
-from ._notes import Note as Note
-from ._notes import NotesFile as NotesFile
-from ._report import PlayableMatches as PlayableMatches
-from ._report import inline as inline
-from ._report import report as report
+from ._reads import Reads as Reads
 from ._serve import serve as serve
 from ._serve import serve_live as serve_live
+from ._wire import PAGE as PAGE
+from ._wire import as_json as as_json
+from ._wire import packed as packed
+from ._worker import answer as answer
 
 __all__ = [
+    "PAGE",
     "Explorer",
     "LiveRun",
-    "Note",
-    "NotesFile",
-    "PlayableMatches",
+    "Reads",
+    "answer",
     "application",
-    "inline",
+    "as_json",
     "live_application",
-    "paced",
-    "report",
+    "packed",
     "serve",
     "serve_live",
 ]

@@ -7,29 +7,30 @@ import os
 import threading
 import time
 import uuid
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
+from dataclasses import astuple
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final, TypeVar
+from weakref import WeakSet
 
 from starlette.applications import Starlette
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from sgstore.errors import QueryError, SgstoreError, SqlError, StoreError
+from sgstore.notes import Note, NotesFile, write_table
 from sgstore.query import Store
-from sgstore.sandbox import SandboxPool, Workshop
+from sgstore.sandbox import Errand, SandboxPool
 from sgstore.serve._guard import Guard
-from sgstore.serve._notes import Note, NotesFile, write_table
-from sgstore.serve._reads import Reads
+from sgstore.serve._reads import READS, Reads
 from sgstore.serve._requests import Fields, RequestError
-from sgstore.serve._wire import as_json
+from sgstore.serve._wire import PAGE, as_json
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable, Iterator, Sequence
+    from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable, Mapping
 
     from starlette.requests import Request
     from starlette.types import Receive, Scope, Send
@@ -37,8 +38,6 @@ if TYPE_CHECKING:
     Endpoint = Callable[[Request], Awaitable[Response]]
 
 T = TypeVar("T")
-
-PAGE: Final = Path(__file__).parent / "page"
 
 MOST_QUESTIONS: Final = 8
 """Questions under way; one more is refused with 503."""
@@ -98,10 +97,10 @@ class _Question:
     """
 
     def __init__(
-        self, pool: Callable[[], SandboxPool | _Errand], question: Mapping[str, Any], key: str
+        self, pool: Callable[[], SandboxPool | Errand], question: Mapping[str, Any], key: str
     ) -> None:
         self._pool, self._question, self._key = pool, question, key
-        self._asked: SandboxPool | _Errand | None = None
+        self._asked: SandboxPool | Errand | None = None
         self._gone = threading.Event()
         self._loop = asyncio.get_running_loop()
         self._found: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
@@ -133,39 +132,6 @@ class _Question:
         self._gone.set()  # it may not have begun
         if self._asked is not None:
             self._asked.cancel(self._key)
-
-
-class _Errand:
-    """A longer piece of work in a process of its own, which ends when it is cancelled.
-
-    Parameters
-    ----------
-    explorer : Explorer
-    """
-
-    def __init__(self, explorer: Explorer) -> None:
-        self._explorer = explorer
-        self._box: Workshop | None = None
-        self._gone = False
-
-    def ask(self, question: Mapping[str, Any], _: str) -> Iterator[dict[str, Any]]:
-        """Replies, as those of a sandbox."""
-        path, under = self._explorer.store.file.path, self._explorer.errands
-        with Workshop(path, timeout_s=LONGEST_S, memory=1 << 30, worker=WORKER) as box:
-            self._box = box
-            under.add(self)
-            try:
-                if not self._gone:
-                    yield from box.replies(question)
-            finally:
-                under.discard(self)
-
-    def cancel(self, _: str = "") -> bool:
-        """Stop it."""
-        self._gone = True
-        if self._box is not None:
-            self._box.stop()
-        return True
 
 
 class Explorer:
@@ -211,7 +177,7 @@ class Explorer:
         self._threads = ThreadPoolExecutor(MOST_QUESTIONS + 4, "sgstore question")
         self._counting = threading.Lock()
         self._ended = threading.Event()
-        self.errands = set[_Errand]()
+        self.errands = WeakSet[Errand]()
         self.busy = 0
 
     def warm(self) -> None:
@@ -328,9 +294,10 @@ class Explorer:
         """The whole answer to a question: lanes of truth, why not, verdicts. An error is an answer, too."""
         fields = await Fields.of(request)
         side = fields.one_of("side", *self._pools)
-        question = {"ask": ask, **_QUESTIONS[ask](self, fields)}
-        if "frame" in question:
-            question["frame"] = await self.threaded(self.reads[side].frame_id, *question["frame"])
+        question = {"ask": ask, **fields.take(*_QUESTIONS[ask])}
+        if "seq" in question:
+            where = question["trace"], question["seq"]
+            question["frame"] = await self.threaded(self.reads[side].frame_id, *where)
         asked = self._ask(question, side=side)
 
         async def answer() -> AsyncGenerator[bytes]:
@@ -353,7 +320,8 @@ class Explorer:
         """Something that is read of a store: columns as bytes, a picture, or plain values."""
         fields = await Fields.of(request)
         reads = self.reads[fields.one_of("side", *self.reads)]
-        return answered(await self.threaded(getattr(reads, name), fields))
+        ask = partial(getattr(reads, name), **fields.take(*READS[name]))
+        return answered(await self.threaded(ask))
 
     async def about(self, _: Request) -> Response:
         """The stores: their traces, and what the page may do."""
@@ -373,17 +341,20 @@ class Explorer:
             gone = fields.one_of("do", "add", "remove") == "remove"
             await self.threaded(partial(self.notes.add, note, gone=gone))
         found = await self.threaded(self.notes.read)
-        return JSONResponse(
-            {
-                "notes": [[n.trace, n.seq, n.tag, n.note, n.who, n.at] for n in found],
-                "file": self.notes.path.name,
-            }
-        )
+        told = {"notes": [astuple(note) for note in found], "file": self.notes.path.name}
+        return JSONResponse(told)
 
     async def work(self, request: Request, name: str) -> Response:
         """A longer piece of work, as lines of JSON: what is done of it, then its result or an error."""
         fields = await Fields.of(request)
-        asked = _Question(partial(_Errand, self), {"ask": name, **_WORK[name](self, fields)}, "")
+        question = {"ask": name, **fields.take(*_WORK[name])}
+        if "name" in question:
+            question["to"] = str(self.target(question.pop("name")))
+        else:
+            question["other"] = str(self.compared.file.path.absolute())
+        errand = Errand(self.store.file.path, timeout_s=LONGEST_S, memory=1 << 30, worker=WORKER)
+        self.errands.add(errand)
+        asked = _Question(lambda: errand, question, "")
         self._begin(asked.ask)
 
         async def lines() -> AsyncGenerator[bytes]:
@@ -438,40 +409,17 @@ async def given_file(request: Request) -> Response:
     return FileResponse(path, media_type=kind, headers={"cache-control": "no-cache"})
 
 
-def _typed(_: Explorer, fields: Fields) -> dict[str, Any]:
-    return {"text": fields.text("text"), "parameters": fields.parameters()}
-
-
-def _at_frame(of: Explorer, fields: Fields) -> dict[str, Any]:
-    frame = fields.text("trace"), fields.whole("seq")
-    return {**_typed(of, fields), "frame": frame, "binding": fields.binding()}
-
-
-def _to_file(of: Explorer, fields: Fields) -> dict[str, Any]:
-    to = str(of.target(fields.text("name")))
-    return {"clips": fields.clips(), "to": to, "format": fields.text("format", "mcap")}
-
-
-def _of_classes(_: Explorer, fields: Fields, what: Sequence[str] = ()) -> dict[str, Any]:
-    told = {"what": fields.one_of("what", *what)} if what else {"clips": fields.clips()}
-    return {**told, "abstraction": fields.text("abstraction", "RSV")}
-
-
-def _of_both(of: Explorer, fields: Fields) -> dict[str, Any]:
-    other = str(of.compared.file.path.absolute())
-    return {"other": other, "abstraction": fields.text("text", "") or "RSV"}
-
-
-Needs = Mapping[str, "Callable[[Explorer, Fields], dict[str, Any]]"]
-_QUESTIONS: Final[Needs] = {
-    "parts": _at_frame,
-    "why": _at_frame,
-    "check": _typed,
-    "coverage": partial(_of_classes, what=("classes", "growth", "combos")),
-    "select": _of_classes,
+_QUESTIONS: Final[Mapping[str, tuple[str, ...]]] = {
+    **dict.fromkeys(("parts", "why"), ("text", "parameters", "trace", "seq", "binding")),
+    "check": ("text", "parameters"),
+    "coverage": ("what", "abstraction"),
+    "select": ("clips", "abstraction"),
 }
-_WORK: Final[Needs] = {"lock": _to_file, "export": _to_file, "diff": _of_both}
-"""What a question, and a longer piece of work, needs to be told, by its name."""
+_WORK: Final[Mapping[str, tuple[str, ...]]] = {
+    **dict.fromkeys(("lock", "export"), ("clips", "name", "format")),
+    "diff": ("abstraction",),
+}
+"""The fields of a question, and of a longer piece of work, by its name."""
 
 
 def answered(found: Any) -> Response:
@@ -502,8 +450,6 @@ def _files() -> dict[str, Path]:
 
 FILES: Final = _files()
 
-_READ: Final = "words", "library", "states", "static", "map", "frame", "picture", "series"
-
 
 def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: str) -> Guard:
     """The ASGI application of a store, behind a token.
@@ -525,8 +471,13 @@ def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: 
         ("DELETE /api/find/{key}", explorer.cancel),
         ("GET /api/notes", explorer.tags),
         ("POST /api/notes", explorer.tags),
-        ("POST /api/thumbs", partial(explorer.read, name="thumbs")),
-        *((f"GET /api/{name}", partial(explorer.read, name=name)) for name in _READ),
+        *(
+            (
+                f"{'POST' if 'frames' in told else 'GET'} /api/{name}",
+                partial(explorer.read, name=name),
+            )
+            for name, told in READS.items()
+        ),
         *((f"POST /api/{name}", partial(explorer.one, ask=name)) for name in _QUESTIONS),
         *((f"POST /api/{name}", partial(explorer.work, name=name)) for name in _WORK),
     ]
@@ -561,6 +512,5 @@ def _status(error: SgstoreError) -> int:
     """The status of an answer that tells of an error."""
     if isinstance(error, RequestError):
         return error.status
-    if isinstance(error, QueryError | SqlError):
-        return 422
-    return 404 if isinstance(error, StoreError) else 422
+    is_query = isinstance(error, QueryError | SqlError)
+    return 404 if isinstance(error, StoreError) and not is_query else 422

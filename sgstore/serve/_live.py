@@ -11,53 +11,45 @@ import asyncio
 import base64
 import math
 import threading
-import time
 from collections import OrderedDict, deque
 from functools import partial
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from starlette.applications import Starlette
 from starlette.responses import Response, StreamingResponse
 
-from sgstore.errors import QueryNameError, SgstoreError, StoreError
-from sgstore.lang import Binding, FrameView, ScopeSearch, parts_of, why_not
-from sgstore.pair_numbers import PAIR_FUNCTIONS
+from sgstore.errors import QueryNameError, StoreError
+from sgstore.lang import why_not
 from sgstore.serve._app import answered, given_file, page_of, routed
 from sgstore.serve._guard import Guard
-from sgstore.serve._reads import clean, drawn_map, shown_picture, told_graph
+from sgstore.serve._reads import drawn_map, shown_picture, told_graph
 from sgstore.serve._requests import Fields
-from sgstore.serve._wire import as_json, packed
-from sgstore.serve._worker import told_lane
+from sgstore.serve._wire import as_json, clean, packed
+from sgstore.serve._worker import told_lanes
+from sgstore.temporal import RecentGraphs
 from sgstore.vocabulary import KIND_CODE, KINDS, LIGHT_STATE_CODE, LIGHT_STATES
-from sgstore.world import INPUTS, POSE
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import AsyncIterator, Mapping, Sequence
 
     from starlette.requests import Request
 
     from sgstore.graph import SceneGraph
+    from sgstore.lang import FrameView
     from sgstore.lang.ir import Query
     from sgstore.readers import Cameras
     from sgstore.roads import RoadMap
     from sgstore.serve._app import Endpoint
-    from sgstore.step import Frame
     from sgstore.temporal import FrameTime, Monitor, MonitorEvent, Verdict
 
 MOST_FRAMES: Final = 3000
 """Frames that are kept for whoever opens the page later, and at most so many bytes of them."""
 MOST_BYTES: Final = 32 << 20
 
-MOST_EDGES: Final = 100_000
-"""Edges of the last graphs that are kept for lanes of truth; some 30 MB."""
-
 MOST_NAMES: Final = 20_000
 """Entities whose names are kept."""
-
-WATCHED: Final = 8
-"""Matches whose parts are followed on."""
 
 LOOK_S: Final = 0.02
 """How often is looked for a new frame; s."""
@@ -69,119 +61,17 @@ _STATES: Final = {
 }
 _NO_LIGHT: Final = len(LIGHT_STATES)
 
-OF_NODE: Final = (*POSE, *INPUTS, "speed", "accel")
-OF_PAIR: Final = tuple(PAIR_FUNCTIONS)
-"""Numbers that have a curve."""
 
-W = TypeVar("W", "WatchedMatch", "WatchedCurve")
-
-
-class NotKeptError(SgstoreError):
-    """A part asks for what was known of a frame only while it was the last one: its class, roles of lanes."""
-
-
-class WatchedMatch:
-    """Parts of a pattern for the nodes of a match, frame by frame.
-
-    Parameters
-    ----------
-    query : Query
-        As the monitor has bound it.
-    nodes : mapping of str to int
-
-    Raises
-    ------
-    QueryNameError
-        The pattern has no such variable.
-    """
-
-    def __init__(self, query: Query, nodes: Mapping[str, int]) -> None:
-        self._nodes = dict(nodes)
-        self._parts = tuple(parts_of(query, nodes))
-        self._spans: list[list[list[int]]] = [[] for _ in self._parts]
-        self._search = [
-            None
-            if part.query.steps  # it is about other frames, too
-            else ScopeSearch(part.query.scope, injective=part.query.injective)
-            for part in self._parts
-        ]
-        self._begun = self._seen = -1
-
-    def look(self, views: Iterable[FrameView]) -> None:
-        """Look at the frames that were not looked at yet."""
-        for view in views:
-            seq = view.frame["seq"]
-            if seq <= self._seen:
-                continue
-            self._begun = seq if self._begun < 0 else self._begun
-            self._seen = seq
-            for number, (search, spans) in enumerate(zip(self._search, self._spans, strict=True)):
-                try:
-                    holds = search is not None and any(True for _ in search.run(Binding(view)))
-                except NotKeptError:
-                    self._search[number], holds = None, False
-                if holds and spans and spans[-1][1] == seq - 1:
-                    spans[-1][1] = seq
-                elif holds:
-                    spans.append([seq, seq])
-
-    def lanes(self, first: int) -> dict[str, Any]:
-        """Lanes of truth from a frame on, as :meth:`sgstore.Store.parts` gives them of a whole trace."""
-        return {
-            "binding": self._nodes,
-            "known": [max(first, self._begun), self._seen],
-            "lanes": [
-                told_lane(part, [], ["what is asked of other frames"])
-                if search is None
-                else told_lane(part, [one for one in spans if one[1] >= first], [])
-                for part, search, spans in zip(self._parts, self._search, self._spans, strict=True)
-            ],
-        }
-
-
-class WatchedCurve:
-    """An attribute of an entity, or a number of two, frame by frame.
-
-    Parameters
-    ----------
-    attribute : str
-        As the views ``nodes`` and ``pairs`` call it.
-    node : int
-    other : int, optional
-
-    Raises
-    ------
-    StoreError
-        There is no such number.
-    """
-
-    def __init__(self, attribute: str, node: int, other: int | None) -> None:
-        known = OF_NODE if other is None else OF_PAIR
-        if attribute not in known:
-            told = f"no number {attribute!r} of {'a node' if other is None else 'two'}"
-            raise StoreError(f"{told}; there are {', '.join(known)}")
-        self._attribute, self._node, self._other = attribute, node, other
-        self._told: deque[tuple[int, float, float]] = deque(maxlen=MOST_FRAMES)
-        self._seen = -1
-
-    def look(self, views: Iterable[FrameView]) -> None:
-        """Look at the frames that were not looked at yet."""
-        for view in views:
-            seq, about = view.frame["seq"], view.nodes.get(self._node)
-            if seq <= self._seen or about is None:
-                continue
-            self._seen = seq
-            if self._other is None:
-                value = about.get(self._attribute)
-            else:
-                value = view.pair(self._attribute, self._node, self._other)
-            self._told.append((seq, view.frame["t"], math.nan if value is None else float(value)))
-
-    def columns(self) -> dict[str, Any]:
-        """Numbers of frames, their times (s), values; as :meth:`sgstore.store.StoreFile.series` has them."""
-        types = {"seq": np.uint32, "t": np.float64, "value": np.float32}
-        told = zip(*self._told, strict=True) if self._told else ((), (), ())
-        return {name: np.array(c, types[name]) for name, c in zip(types, told, strict=True)}
+ASKED: Final = {
+    "GET /api/store": ("about",),
+    "GET /api/map": ("map",),
+    "GET /api/frame": ("frame", "seq"),
+    "GET /api/series": ("series", "attribute", "node", "other"),
+    "GET /api/picture": ("picture", "seq", "channel"),
+    "POST /api/parts": ("parts", "text", "binding"),
+    "POST /api/why": ("why", "text", "seq"),
+}
+"""Requests of the page: the method of :class:`LiveRun` that answers each, and the fields that it takes."""
 
 
 class LiveRun:
@@ -205,13 +95,11 @@ class LiveRun:
         self._monitor: Monitor | None = None
         self._sent: deque[bytes] = deque()
         self._gone = self._bytes = 0
-        self._views: deque[FrameView] = deque()
-        self._edges = 0
+        self._recent = RecentGraphs()
         self._names: OrderedDict[int, list[str]] = OrderedDict()
         self._still: dict[int, list[Any]] = {}
         self._events: list[dict[str, Any]] = []
         self._origin: tuple[float, float] | None = None
-        self._watched: OrderedDict[tuple[Any, ...], WatchedMatch | WatchedCurve] = OrderedDict()
 
     # What the monitor tells ------------------------------------------------------------------------
 
@@ -255,14 +143,7 @@ class LiveRun:
             self._events = []
             data = packed(header, _columns(graph, self._origin))
             self._put("frame", base64.b64encode(data))
-            frame = {"id": here.seq, "seq": here.seq, "time_ns": here.time_ns, "t": here.t}
-            about = {"id": 0, "name": monitor.trace if monitor is not None else self.name}
-            self._views.append(FrameView(graph, frame, about, _not_kept, _not_kept))
-            self._edges += len(graph.edges)
-            while self._edges > MOST_EDGES and len(self._views) > 1:
-                self._edges -= len(self._views.popleft().graph.edges)
-            for watched in self._watched.values():
-                watched.look([self._views[-1]])
+            self._recent.add(here, graph, self.name if monitor is None else monitor.trace)
 
     def end(self, verdicts: Sequence[Verdict]) -> None:
         """Take the verdicts: there are no more frames."""
@@ -321,11 +202,11 @@ class LiveRun:
             "patterns": [name for name in names if name not in checks],
         }
 
-    def outlines(self) -> bytes:
+    def map(self) -> bytes:
         """Outlines of the road map; without points where there is none."""
         return self._map
 
-    def parts(self, name: str, nodes: Mapping[str, int]) -> dict[str, Any]:
+    def parts(self, text: str, binding: Mapping[str, int] | None) -> dict[str, Any]:
         """Lanes of truth of a match, over the frames whose graphs are kept; they are followed on.
 
         Raises
@@ -333,10 +214,11 @@ class LiveRun:
         QueryNameError
             There is no such pattern, or it has no such variable.
         """
-        query, key = self._query(name), (name, *sorted(nodes.items()))
+        query = self._query(text)
         with self._lock:
-            watched = self._watch(key, partial(WatchedMatch, query, nodes))
-            return {"trace": self.name, **watched.lanes(self._gone)}
+            match = self._recent.match(text, query, binding or {})
+            known = [max(self._gone, match.begun), match.seen]
+            return {**told_lanes(match.lanes(self.name, self._gone)), "known": known}
 
     def series(self, attribute: str, node: int, other: int | None = None) -> bytes:
         """An attribute over the frames whose graphs are kept, as the explorer gives it; it is followed on.
@@ -347,21 +229,10 @@ class LiveRun:
             There is no such number.
         """
         with self._lock:
-            make = partial(WatchedCurve, attribute, node, other)
-            columns = self._watch((attribute, node, other), make).columns()
+            columns = self._recent.curve(attribute, node, other).columns()
         return packed({"trace": self.name, "attribute": attribute}, columns)
 
-    def _watch(self, key: tuple[Any, ...], make: Callable[[], W]) -> W:
-        """Return what is followed under a key, the last ones that were asked for."""
-        if key not in self._watched:
-            self._watched[key] = make()
-            self._watched[key].look(self._views)
-        self._watched.move_to_end(key)
-        while len(self._watched) > WATCHED:
-            self._watched.popitem(last=False)
-        return cast("W", self._watched[key])
-
-    def picture(self, seq: int, topic: str) -> tuple[bytes, str]:
+    def picture(self, seq: int, channel: str) -> tuple[bytes, str]:
         """Picture of a camera at a frame, and its type; empty where there is none.
 
         Raises
@@ -371,11 +242,11 @@ class LiveRun:
         ExportError
             The message holds no picture that a browser shows.
         """
-        if self._cameras is None or topic not in self._cameras.topics:
-            raise StoreError(f"no camera {topic!r}")
-        return shown_picture(self._cameras.at(seq, topic), topic)
+        if self._cameras is None or channel not in self._cameras.topics:
+            raise StoreError(f"no camera {channel!r}")
+        return shown_picture(self._cameras.at(seq, channel), channel)
 
-    def graph(self, seq: int) -> dict[str, Any]:
+    def frame(self, seq: int) -> dict[str, Any]:
         """The scene graph of a frame, as the explorer gives it.
 
         Raises
@@ -383,9 +254,9 @@ class LiveRun:
         StoreError
             The graph of this frame is not kept.
         """
-        return told_graph(self._view(seq).graph)
+        return told_graph(self._kept(seq).graph)
 
-    def why(self, name: str, seq: int) -> dict[str, Any]:
+    def why(self, text: str, seq: int) -> dict[str, Any]:
         """The first part of a pattern that fails in a frame, as the explorer tells it.
 
         Raises
@@ -395,7 +266,7 @@ class LiveRun:
         StoreError
             The graph of this frame is not kept.
         """
-        return why_not(self._query(name), self._view(seq)).as_dict()
+        return why_not(self._query(text), self._kept(seq)).as_dict()
 
     def _query(self, name: str) -> Query:
         queries = self._monitor.patterns if self._monitor is not None else {}
@@ -403,14 +274,9 @@ class LiveRun:
             raise QueryNameError(f"no pattern {name!r} is watched")
         return queries[name]
 
-    def _view(self, seq: int) -> FrameView:
+    def _kept(self, seq: int) -> FrameView:
         with self._lock:
-            views = tuple(self._views)
-        for view in views:
-            if view.frame["seq"] == seq:
-                return view
-        first = views[0].frame["seq"] if views else 0
-        raise StoreError(f"the graph of frame #{seq} is not kept; those from #{first} on are")
+            return self._recent.view(seq)
 
     def _hello(self) -> tuple[int, bytes]:
         """The number of the first message that is kept, and what a page must know before it."""
@@ -435,41 +301,21 @@ class LiveRun:
             await asyncio.sleep(LOOK_S)
 
 
-def paced(frames: Iterable[Frame]) -> Iterator[Frame]:
-    """Frames of a recording as they would come from a running world: each in its time."""
-    begun = first = None
-    for frame in frames:
-        if begun is None or first is None:
-            begun, first = time.monotonic(), frame.time_ns
-        wait = begun + (frame.time_ns - first) / 1e9 - time.monotonic()
-        if wait > 0:
-            time.sleep(wait)
-        yield frame
-
-
 def live_application(run: LiveRun, token: str, hosts: tuple[str, ...], cookie: str) -> Guard:
     """The ASGI application of a monitor, behind a token; as :func:`sgstore.serve.application`."""
 
-    async def ask(request: Request, of: Callable[[Fields], Any]) -> Response:
-        return answered(await asyncio.to_thread(of, await Fields.of(request)))
+    async def ask(request: Request, name: str, fields: Sequence[str]) -> Response:
+        told = (await Fields.of(request)).take(*fields)
+        return answered(await asyncio.to_thread(partial(getattr(run, name), **told)))
 
     async def live(_: Request) -> Response:
         return StreamingResponse(run.messages(), media_type="text/event-stream")
 
-    asked: dict[str, Callable[[Fields], Any]] = {
-        "GET /api/store": lambda _: run.about(),
-        "GET /api/map": lambda _: run.outlines(),
-        "GET /api/frame": lambda fields: run.graph(fields.whole("seq")),
-        "GET /api/series": lambda fields: run.series(*fields.curve()),
-        "GET /api/picture": lambda f: run.picture(f.whole("seq"), f.text("channel")),
-        "POST /api/parts": lambda fields: run.parts(fields.text("text"), fields.binding() or {}),
-        "POST /api/why": lambda fields: run.why(fields.text("text"), fields.whole("seq")),
-    }
     table: list[tuple[str, Endpoint]] = [
         ("GET /", partial(page_of, script="live.js")),
         ("GET /static/{name:path}", given_file),
         ("GET /api/live", live),
-        *((where, partial(ask, of=of)) for where, of in asked.items()),
+        *((where, partial(ask, name=name, fields=told)) for where, (name, *told) in ASKED.items()),
     ]
     return Guard(Starlette(routes=routed(table)), token, hosts, cookie)
 
@@ -497,7 +343,3 @@ def _origin_of(graph: SceneGraph) -> tuple[float, float]:
     places = [a for n, a in graph.nodes.items() if n >= 0]
     first = graph.nodes[graph.ego] if graph.ego is not None else next(iter(places), {})
     return float(round(first.get("x", 0.0))), float(round(first.get("y", 0.0)))
-
-
-def _not_kept(*_: object) -> Any:
-    raise NotKeptError("it is known of the last frame only")

@@ -1,7 +1,11 @@
-"""Longer pieces of work of the page: coverage, ticked clips as a test set, two stores compared."""
+"""Longer pieces of work of the page: coverage, ticked clips as a test set, two stores compared.
+
+Each function is what a question of its name asks, and takes what is told with it.
+"""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -11,24 +15,24 @@ from sgstore.diff import by_frame, scenes
 from sgstore.errors import StoreError
 from sgstore.exporters import Export, write_export
 from sgstore.locks import lock_of
+from sgstore.query import Store
+from sgstore.sandbox import tell
+from sgstore.serve._wire import clean
 from sgstore.store import frame_ids, lengths_of_messages
 from sgstore.world import Clip
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
+    from collections.abc import Sequence
 
     from sgstore.coverage import ReportTable
-    from sgstore.query import Store
 
-    Progress = Callable[[int, int], None]
     Clips = Sequence[tuple[str, int, int]]
 
 MOST_ROWS: Final = 2000
 """Rows of a table that the page is sent; it says how many there are."""
 
 
-def measured(store: Store, what: str, abstraction: str) -> dict[str, Any]:
+def coverage(store: Store, what: str, abstraction: str) -> dict[str, Any]:
     """A table of coverage of a store: classes by rank, growth, or combinations of two features that lack.
 
     Parameters
@@ -49,7 +53,7 @@ def measured(store: Store, what: str, abstraction: str) -> dict[str, Any]:
     }
 
 
-def measured_clips(store: Store, clips: Clips, abstraction: str) -> dict[str, Any]:
+def select(store: Store, clips: Clips, abstraction: str) -> dict[str, Any]:
     """Size of clips, and share of the store's classes that they keep.
 
     Returns
@@ -68,34 +72,38 @@ def measured_clips(store: Store, clips: Clips, abstraction: str) -> dict[str, An
     return {**about, "bytes": size, "kept": kept}
 
 
-def locked_clips(store: Store, clips: Clips, to: Path, progress: Progress) -> dict[str, Any]:
+def lock(store: Store, clips: Clips, to: str, **_: str) -> dict[str, Any]:
     """Write a lock of clips."""
-    parts: list[Any] = []
+    path = Path(to if to.endswith(".lock") else f"{to}.lock")
     with store.file.snapshot():
-        for clip in _apart(clips):
-            frame_id, _ = _frames(store, [clip])
-            times = _log_times(store, clip)
-            parts.append((frame_id, times, ""))
-        lock = lock_of(store, parts, {"chosen": "in the explorer"}, progress=progress)
-    path = to.with_name(to.name if to.suffix == ".lock" else f"{to.name}.lock")
-    lock.write(path)
-    return {"file": str(path), "cases": len(lock.cases)}
+        parts = [
+            (_frames(store, [clip])[0], store.file.log_times(*clip), "") for clip in _apart(clips)
+        ]
+        made = lock_of(store, parts, {"chosen": "in the explorer"}, progress=_done)
+    made.write(path)
+    return {"result": {"file": str(path), "cases": len(made.cases)}}
 
 
-def exported(store: Store, clips: Clips, to: Path, form: str, progress: Progress) -> dict[str, Any]:
+def export(store: Store, clips: Clips, to: str, format: str) -> dict[str, Any]:
     """Write clips in a format of export."""
     with store.file.snapshot():
-        times = [(clip[0], _log_times(store, clip)) for clip in clips]
+        times = [(clip[0], store.file.log_times(*clip)) for clip in clips]
     cut = tuple(Clip(trace, int(log.min()), int(log.max())) for trace, log in times)
-    written = write_export(Export(store, cut, progress=progress), to, form)
+    written = write_export(Export(store, cut, progress=_done), Path(to), format)
     losses = [f"{one.file.name}: {loss.reason}" for one in written for loss in one.losses]
-    return {"folder": str(to), "files": [one.file.name for one in written], "losses": losses}
+    files = [one.file.name for one in written]
+    return {"result": {"folder": to, "files": files, "losses": losses}}
 
 
-def differing(a: Store, b: Store, abstraction: str) -> dict[str, Any]:
+def diff(store: Store, other: str, abstraction: str) -> dict[str, Any]:
     """Scenes and frames in which two stores differ."""
-    both = [classed(ChosenFrames(one.file.path.name, one), abstraction) for one in (a, b)]
-    return {"scenes": _table(scenes(*both)), "frames": _table(by_frame(*both))}
+    with Store(other) as second:
+        a, b = (classed(ChosenFrames(s.file.path.name, s), abstraction) for s in (store, second))
+        return {"result": {"scenes": _table(scenes(a, b)), "frames": _table(by_frame(a, b))}}
+
+
+def _done(done: int, whole: int) -> None:
+    tell({"progress": [done, whole]})
 
 
 def _frames(store: Store, clips: Clips) -> tuple[Any, float]:
@@ -121,18 +129,7 @@ def _apart(clips: Clips) -> list[tuple[str, int, int]]:
     return found
 
 
-def _log_times(store: Store, clip: tuple[str, int, int]) -> Any:
-    trace, first, last = clip
-    return store.file.log_times(trace, first, last)
-
-
 def _table(of: ReportTable) -> dict[str, Any]:
     """A table as the page shows it; it says how many rows there are."""
-    rows = [[_plain(value) for value in row] for row in of.rows[:MOST_ROWS]]
+    rows = clean(of.rows[:MOST_ROWS])
     return {"columns": of.columns, "rows": rows, "of": len(of.rows), "said": of.said}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -1,11 +1,10 @@
 """Readings of a store by trace and frame: columns of states, maps, pictures, graphs, words.
 
-Each method that takes the fields of a request looks at all of them before it reads.
+What each of them is asked with stands in :data:`READS`.
 """
 
 from __future__ import annotations
 
-import math
 import threading
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
@@ -13,33 +12,39 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import ExportError, SgstoreError, StoreError
-from sgstore.lang import patterns
+from sgstore.lang import patterns, words
 from sgstore.opendrive import read_map
 from sgstore.roads import drawn_outlines
 from sgstore.serve._requests import RequestError
-from sgstore.serve._wire import packed
-from sgstore.serve._words import words
+from sgstore.serve._wire import clean, packed
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from sgstore.graph import SceneGraph
     from sgstore.lang import Catalog
     from sgstore.query import Store
     from sgstore.readers import Media
     from sgstore.roads import RoadMap
-    from sgstore.serve._requests import Fields
     from sgstore.store import StoredTrace
 
 MOST_THUMBS: Final = 400
 """Frames whose states are sent for small pictures at once."""
 
-_PICTURES: Final = {
-    "jpeg": "image/jpeg",
-    "png": "image/png",
-    "webp": "image/webp",
-    "bmp": "image/bmp",
+READS: Final[Mapping[str, tuple[str, ...]]] = {
+    "words": (),
+    "library": (),
+    "thumbs": ("frames",),
+    "states": ("trace", "first", "last"),
+    "static": ("trace",),
+    "map": ("trace",),
+    "frame": ("trace", "seq"),
+    "picture": ("trace", "seq", "channel"),
+    "series": ("trace", "attribute", "node", "other"),
 }
+"""Methods of :class:`Reads` that a page asks, each with the fields that it takes."""
+
+_PICTURES: Final = "jpeg", "png", "webp", "bmp"
 """Forms of pictures that a browser shows."""
 
 
@@ -98,18 +103,16 @@ class Reads:
 
     # Columns -------------------------------------------------------------------------------------
 
-    def thumbs(self, fields: Fields) -> bytes:
+    def thumbs(self, frames: Sequence[tuple[str, int]]) -> bytes:
         """States in some frames, for small pictures."""
-        frames = fields.frames()
         if len(frames) > MOST_THUMBS:
             raise RequestError(f"frames: expected at most {MOST_THUMBS}")
         traces = self._traces()[0]  # asked for once: the store may change all the time
         of = [(_among(traces, trace).trace_id, seq) for trace, seq in frames]
         return packed({}, self._store.file.states_at(of))
 
-    def states(self, fields: Fields) -> bytes:
+    def states(self, trace: str, first: int, last: int) -> bytes:
         """States in a window of frames: ``frame.…`` of each frame, the others of each state."""
-        trace, first, last = fields.text("trace"), fields.whole("first"), fields.whole("last")
         frames, states = self._store.file.states(self._trace(trace).trace_id, first, last)
         # Where the states of each frame begin, so that the page need not look for them.
         start = np.searchsorted(states.pop("seq"), [*frames["seq"].tolist(), 1 << 31])
@@ -117,11 +120,7 @@ class Reads:
         columns["frame.start"] = start.astype(np.uint32)
         return packed({"trace": trace, "first": first, "last": last}, columns | states)
 
-    def static(self, fields: Fields) -> bytes:
-        """Things that never move in a trace, and the names of all entities."""
-        return self.still(fields.text("trace"))
-
-    def still(self, trace: str) -> bytes:
+    def static(self, trace: str) -> bytes:
         """Things that never move in a trace, and the names of all entities, as bytes."""
         of = self._trace(trace).trace_id
         with self._store.file.snapshot():
@@ -129,11 +128,7 @@ class Reads:
             columns = self._store.file.scenery(of)
         return packed({"trace": trace, "names": names}, columns)
 
-    def map(self, fields: Fields) -> bytes:
-        """Outlines of the road map of a trace; without points where it has none."""
-        return self.outlines(fields.text("trace"))
-
-    def outlines(self, trace: str) -> bytes:
+    def map(self, trace: str) -> bytes:
         """Outlines of the road map of a trace; without points where it has none."""
         places = self._store.file.places()
         if trace not in places:
@@ -141,12 +136,9 @@ class Reads:
         key = places[trace][2]
         with self._reading:  # one map at a time: two who ask for one do not read it twice
             if key not in self._maps:
-                self._maps[key] = self._outlines(trace)
+                found = self._store.file.road_map_text(trace)
+                self._maps[key] = drawn_map(None if found is None else read_map(found[1], found[0]))
             return self._maps[key]
-
-    def _outlines(self, trace: str) -> bytes:
-        found = self._store.file.road_map_text(trace)
-        return drawn_map(None if found is None else read_map(found[1], found[0]))
 
     def warm(self, ended: threading.Event) -> None:
         """Read the maps before they are asked for, until somebody has had enough."""
@@ -154,28 +146,21 @@ class Reads:
             for trace in self._traces()[0]:
                 if ended.is_set():
                     return
-                self.outlines(trace)
+                self.map(trace)
 
-    def series(self, fields: Fields) -> bytes:
+    def series(self, trace: str, attribute: str, node: int, other: int | None) -> bytes:
         """An attribute over time."""
-        trace, (attribute, node, other) = fields.text("trace"), fields.curve()
         columns = self._store.file.series(self._trace(trace).trace_id, attribute, node, other)
         return packed({"trace": trace, "attribute": attribute}, columns)
 
     # Plain values, pictures --------------------------------------------------------------------------
 
-    def frame(self, fields: Fields) -> dict[str, Any]:
+    def frame(self, trace: str, seq: int) -> dict[str, Any]:
         """The scene graph of a frame: all that is known of its nodes and edges."""
-        trace, seq = fields.text("trace"), fields.whole("seq")
         return told_graph(self._store.file.graph(self.frame_id(trace, seq)))
 
-    def picture(self, fields: Fields) -> tuple[bytes, str]:
-        """Picture of a camera at a frame, as it stands in the recording, and its type."""
-        trace, seq, channel = fields.text("trace"), fields.whole("seq"), fields.text("channel")
-        return self.picture_at(trace, seq, channel)
-
-    def picture_at(self, trace: str, seq: int, channel: str) -> tuple[bytes, str]:
-        """Picture of a camera at a frame, and its type.
+    def picture(self, trace: str, seq: int, channel: str) -> tuple[bytes, str]:
+        """Picture of a camera at a frame, as it stands in the recording, and its type.
 
         Raises
         ------
@@ -184,11 +169,11 @@ class Reads:
         """
         return shown_picture(self._store.file.carried(self.frame_id(trace, seq), channel), channel)
 
-    def words(self, _: Fields) -> dict[str, Any]:
+    def words(self) -> dict[str, Any]:
         """Words of the language, for completion."""
         return words(self._store.catalog())
 
-    def library(self, _: Fields) -> list[dict[str, Any]]:
+    def library(self) -> list[dict[str, Any]]:
         """Patterns that have names, with their drawings."""
         names = ("name", "kind", "text", "sentence", "library")
         return [
@@ -210,7 +195,7 @@ def shown_picture(media: Media | None, channel: str) -> tuple[bytes, str]:
         return b"", "application/octet-stream"
     if media.form not in _PICTURES:
         raise ExportError(f"{channel}: the message holds {media.form}, no picture")
-    return media.data, _PICTURES[media.form]
+    return media.data, f"image/{media.form}"
 
 
 def drawn_map(road_map: RoadMap | None) -> bytes:
@@ -231,16 +216,3 @@ def told_graph(graph: SceneGraph) -> dict[str, Any]:
         for src, relation, dst, about in graph.edges
     ]
     return clean({"nodes": nodes, "edges": edges})
-
-
-def clean(value: Any) -> Any:
-    """A value as JSON holds it: numbers that are none are ``None``."""
-    if isinstance(value, dict):
-        return {str(key): clean(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [clean(item) for item in value]
-    if isinstance(value, np.generic):
-        return clean(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value if value is None or isinstance(value, bool | int | float | str) else str(value)

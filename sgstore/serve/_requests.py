@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 from sgstore.errors import SgstoreError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
     from starlette.requests import Request
 
 MOST_BODY: Final = 1 << 20
@@ -22,6 +24,10 @@ MOST_ITEMS: Final = 10_000
 
 MOST_NUMBER: Final = 1 << 53
 """Greatest whole number that a page can tell from others."""
+
+
+LEAST_NODE: Final = -(1 << 31)
+"""Least id of a node."""
 
 
 class RequestError(SgstoreError):
@@ -77,6 +83,9 @@ class Fields:
             raise RequestError("expected an object of JSON")
         return cls(found)
 
+    def __contains__(self, name: str) -> bool:
+        return self._values.get(name) is not None
+
     def text(self, name: str, default: str | None = None) -> str:
         """A text; without a default it must be there."""
         value = self._values.get(name, default)
@@ -99,10 +108,6 @@ class Fields:
             raise RequestError(f"{name}: expected one of {', '.join(words)}")
         return str(value)
 
-    def has(self, name: str) -> bool:
-        """Tell whether there is a value."""
-        return self._values.get(name) is not None
-
     def parameters(self) -> dict[str, Any]:
         """Values of ``$name``: numbers, texts, truth values, lists of these."""
         found = self._values.get("parameters") or {}
@@ -114,6 +119,10 @@ class Fields:
                 raise RequestError(f"parameters: {name!r} is no value that a query can have")
         return found
 
+    def take(self, *names: str) -> dict[str, Any]:
+        """Values by name, each as :data:`FIELDS` says."""
+        return {name: FIELDS[name](self, name) for name in names}
+
     def binding(self) -> dict[str, int] | None:
         """Node ids by variable; ``None`` where none are told."""
         found = self._values.get("binding")
@@ -121,13 +130,11 @@ class Fields:
             return None
         if not isinstance(found, dict) or len(found) > 1000:
             raise RequestError("binding: expected an object of node ids")
-        return {str(k): _whole(v, f"binding of {k!r}", -(1 << 31)) for k, v in found.items()}
+        return {str(k): _whole(v, f"binding of {k!r}", LEAST_NODE) for k, v in found.items()}
 
-    def curve(self) -> tuple[str, int, int | None]:
-        """Name of a number, the node that it is of, and the other node if it is of two."""
-        least = -(1 << 31)
-        other = self.whole("other", least=least) if self.has("other") else None
-        return self.text("attribute"), self.whole("node", least=least), other
+    def node(self, name: str) -> int:
+        """Id of a node; those of the map are negative."""
+        return self.whole(name, least=LEAST_NODE)
 
     def frames(self) -> list[tuple[str, int]]:
         """Frames as trace and number."""
@@ -150,6 +157,22 @@ class Fields:
             for value in row[1:]:
                 _whole(value, name, 0)
         return rows
+
+
+FIELDS: Final[Mapping[str, Callable[[Fields, str], Any]]] = {
+    **dict.fromkeys(("text", "trace", "channel", "attribute", "name"), Fields.text),
+    **dict.fromkeys(("seq", "first", "last"), Fields.whole),
+    "node": Fields.node,
+    "other": lambda of, name: of.node(name) if name in of else None,
+    "what": lambda of, name: of.one_of(name, "classes", "growth", "combos"),
+    "abstraction": lambda of, name: of.text(name, "RSV"),
+    "format": lambda of, name: of.text(name, "mcap"),
+    "parameters": lambda of, _: of.parameters(),
+    "binding": lambda of, _: of.binding(),
+    "clips": lambda of, _: of.clips(),
+    "frames": lambda of, _: of.frames(),
+}
+"""What each field of a request is, whatever is asked."""
 
 
 def _plain(value: object) -> bool:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import math
 import struct
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -17,6 +18,10 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from numpy.typing import NDArray
+
+
+PAGE: Final = Path(__file__).parent / "page"
+"""Files of the page."""
 
 
 def packed(header: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]) -> bytes:
@@ -57,3 +62,16 @@ def _worded(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_worded(item) for item in value]
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def clean(value: Any) -> Any:
+    """A value as JSON holds it: numbers that are none are ``None``."""
+    if isinstance(value, dict):
+        return {str(key): clean(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [clean(item) for item in value]
+    if isinstance(value, np.generic):
+        return clean(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)

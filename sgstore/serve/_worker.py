@@ -10,14 +10,16 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from itertools import islice
-from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import QueryError
-from sgstore.lang import PatternPart, WhyNotSteps
+from sgstore.lang import WhyNotSteps
 from sgstore.query import Store
-from sgstore.sandbox import plain, rows_found, serve, tell
+from sgstore.sandbox import plain, rows_found, serve
 from sgstore.temporal import margin_cells
+
+if TYPE_CHECKING:
+    from sgstore.truth_lanes import TruthLanes
 
 Reply = dict[str, Any]
 Asked = Callable[[Store, dict[str, Any], int], Iterator[Reply]]
@@ -63,20 +65,21 @@ def _told_rows(store: Store, question: dict[str, Any], most: int) -> Iterator[Re
 def _told_parts(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
     """Lanes of truth."""
     binding = question["binding"]
-    lanes = store.parts(question["text"], question["frame"], binding, **question["parameters"])
-    yield {
-        "trace": lanes.trace,
-        "binding": lanes.binding,
-        "lanes": [told_lane(lane.part, lane.spans, lane.unknown) for lane in lanes.lanes],
-        "together": {step: lanes.together(step) for step in lanes.steps},
-    }
+    yield told_lanes(
+        store.parts(question["text"], question["frame"], binding, **question["parameters"])
+    )
 
 
-def told_lane(part: PatternPart, spans: Any, unknown: Any) -> Reply:
-    """A lane of truth as the page takes it."""
-    names = "text", "step", "nodes", "conditions"
-    about = {name: getattr(part, name) for name in names}
-    return about | {"edges": list(map(asdict, part.edges)), "spans": spans, "unknown": unknown}
+def told_lanes(lanes: TruthLanes) -> Reply:
+    """Lanes of truth as the page takes them."""
+    told: list[Reply] = []
+    for lane in lanes.lanes:
+        part = lane.part
+        about = {n: getattr(part, n) for n in ("text", "step", "nodes", "conditions")}
+        about |= {"edges": [*map(asdict, part.edges)], "spans": lane.spans}
+        told.append({**about, "unknown": lane.unknown})
+    together = {step: lanes.together(step) for step in lanes.steps}
+    return {"trace": lanes.trace, "binding": lanes.binding, "lanes": told, "together": together}
 
 
 def _told_why(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
@@ -118,23 +121,9 @@ def _told_check(store: Store, question: dict[str, Any], most: int) -> Iterator[R
 
 def _measured(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
     """Coverage, a selection, or work on clips; what is done of it is told before."""
-    from sgstore.serve import _measures as of  # not needed by the others
+    from sgstore.serve import _measures  # not needed by the others
 
-    def progress(done: int, whole: int) -> None:
-        tell({"progress": [done, whole]})
-
-    match question:
-        case {"ask": "coverage", "what": what, "abstraction": abstraction}:
-            yield of.measured(store, what, abstraction)
-        case {"ask": "select", "clips": clips, "abstraction": abstraction}:
-            yield of.measured_clips(store, clips, abstraction)
-        case {"ask": "lock", "clips": clips, "to": to}:
-            yield {"result": of.locked_clips(store, clips, Path(to), progress)}
-        case {"ask": "export", "clips": clips, "to": to, "format": form}:
-            yield {"result": of.exported(store, clips, Path(to), form, progress)}
-        case _:
-            with Store(question["other"]) as second:
-                yield {"result": of.differing(store, second, question["abstraction"])}
+    yield getattr(_measures, question.pop("ask"))(store, **question)
 
 
 QUESTIONS: Final[Mapping[str, Asked]] = {

@@ -14,7 +14,9 @@ from ._formula import Formula as Formula
 from ._matches import TemporalMatches as TemporalMatches
 from ._monitor import FrameSource as FrameSource
 from ._monitor import Monitor as Monitor
+from ._followed import RecentGraphs as RecentGraphs
 from ._monitor import opened as opened
+from ._monitor import paced as paced
 from ._robustness import Robustness as Robustness
 from ._sequence_monitor import FrameTime as FrameTime
 from ._sequence_monitor import MonitorEvent as MonitorEvent

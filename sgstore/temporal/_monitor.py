@@ -5,6 +5,7 @@ Frames come from a recording, as if it were live, or from a running CARLA.
 
 from __future__ import annotations
 
+import time
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
@@ -140,6 +141,18 @@ def opened(
 
         told.frames = frames()
         yield told
+
+
+def paced(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """Frames of a recording as they would come from a running world: each in its time."""
+    begun = first = None
+    for frame in frames:
+        if begun is None or first is None:
+            begun, first = time.monotonic(), frame.time_ns
+        wait = begun + (frame.time_ns - first) / 1e9 - time.monotonic()
+        if wait > 0:
+            time.sleep(wait)
+        yield frame
 
 
 @contextmanager

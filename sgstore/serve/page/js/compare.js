@@ -106,7 +106,7 @@ export function Compare() {
 
 /** @param {{found: any}} props */
 function OfStores({ found }) {
-  const told = useWork("api/diff", { text: abstraction.value });
+  const told = useWork("api/diff", { abstraction: abstraction.value });
   return html`${told.error ? html`<p class="sheet error" role="alert">${told.error}</p>` : null}<${Differing} found=${found} diff=${told.found} waits=${!told.found && !told.error} />`;
 }
 

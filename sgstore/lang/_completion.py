@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from sgstore.lang import attributes_of, keywords, patterns
+from sgstore.lang._catalog import attributes_of
+from sgstore.lang._parse import keywords
+from sgstore.lang.library import patterns
 from sgstore.pair_numbers import PAIR_FUNCTIONS
 from sgstore.vocabulary import KINDS, RELATIONS, labels
 
 if TYPE_CHECKING:
-    from sgstore.lang import Catalog
+    from sgstore.lang._catalog import Catalog
 
 
 def words(catalog: Catalog) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import hashlib
 import html
 import json
 import re
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -22,17 +22,14 @@ import numpy as np
 
 from sgstore.errors import SgstoreError
 from sgstore.files import write_bytes
-from sgstore.serve._notes import NotesFile
-from sgstore.serve._reads import Reads
-from sgstore.serve._wire import as_json, packed
-from sgstore.serve._worker import answer
+from sgstore.notes import NotesFile
+from sgstore.serve import PAGE, Reads, answer, as_json, packed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from sgstore.query import Store
 
-PAGE: Final = Path(__file__).parent / "page"
 CHUNK: Final = 300
 """Frames whose states the page asks for together (``CHUNK`` of ``data.js``)."""
 
@@ -187,7 +184,7 @@ def _kept(
         "find": told,
         "check": check,
         "parts": {} if is_check else _parts(store, question, found),
-        "notes": [[n.trace, n.seq, n.tag, n.note, n.who, n.at] for n in _notes(store)],
+        "notes": [astuple(note) for note in _notes(store)],
         "columns": dict(_columns(store, reads, traces, spans)),
         "pictures": {},
     }
@@ -254,10 +251,10 @@ def _columns(
     """Columns that the page asks for, by key: states in the spans, what never moves, maps."""
     maps: set[str] = set()
     for name, about in traces.items():
-        yield _key("api/static", name), _small(reads.still(name))
+        yield _key("api/static", name), _small(reads.static(name))
         if about["map_key"] and about["map_key"] not in maps:
             maps.add(about["map_key"])
-            yield _key("api/map", about["map_key"]), _small(reads.outlines(name))
+            yield _key("api/map", about["map_key"]), _small(reads.map(name))
         numbers = sorted({k for a, z in spans[name] for k in range(a // CHUNK, z // CHUNK + 1)})
         for number in numbers:
             first = number * CHUNK
@@ -307,7 +304,7 @@ def _pictures(
             kept = found[_key(trace, topic)] = {}
             for seq in sorted(wanted):
                 try:
-                    data, _ = reads.picture_at(trace, seq, topic)
+                    data, _ = reads.picture(trace, seq, topic)
                 except SgstoreError:
                     continue  # not every frame has one
                 kept[str(seq)] = base64.b64encode(data).decode()

@@ -1,0 +1,208 @@
+"""The last graphs of a run, and what is followed in them: parts of a match, numbers of entities."""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict, deque
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
+
+import numpy as np
+
+from sgstore.errors import SgstoreError, StoreError
+from sgstore.lang import Binding, FrameView, ScopeSearch, parts_of
+from sgstore.pair_numbers import PAIR_FUNCTIONS
+from sgstore.truth_lanes import TruthLane, TruthLanes
+from sgstore.world import INPUTS, POSE
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+
+    from sgstore.graph import SceneGraph
+    from sgstore.lang.ir import Query
+    from sgstore.temporal._sequence_monitor import FrameTime
+
+MOST_EDGES: Final = 100_000
+"""Edges of the last graphs that are kept; some 30 MB."""
+
+MOST_FOLLOWED: Final = 8
+"""Matches and curves that are followed on, the last ones that were asked for."""
+
+LONGEST_CURVE: Final = 3000
+"""Frames of a curve."""
+
+OF_NODE: Final = (*POSE, *INPUTS, "speed", "accel")
+OF_PAIR: Final = tuple(PAIR_FUNCTIONS)
+"""Numbers that have a curve."""
+
+W = TypeVar("W", "FollowedMatch", "FollowedCurve")
+
+
+class NotKeptError(SgstoreError):
+    """A part asks for what was known of a frame only while it was the last one: its class, roles of lanes."""
+
+
+class FollowedMatch:
+    """Parts of a pattern for the nodes of a match, frame by frame.
+
+    Parameters
+    ----------
+    query : Query
+        As the monitor has bound it.
+    nodes : mapping of str to int
+
+    Attributes
+    ----------
+    begun, seen : int
+        First and last frame that was looked at; -1: none was.
+
+    Raises
+    ------
+    QueryNameError
+        The pattern has no such variable.
+    """
+
+    def __init__(self, query: Query, nodes: Mapping[str, int]) -> None:
+        self._nodes = dict(nodes)
+        self._parts = tuple(parts_of(query, nodes))
+        self._spans: list[list[tuple[int, int]]] = [[] for _ in self._parts]
+        self._search = [
+            None
+            if part.query.steps  # it is about other frames, too
+            else ScopeSearch(part.query.scope, injective=part.query.injective)
+            for part in self._parts
+        ]
+        self.begun = self.seen = -1
+
+    def look(self, views: Iterable[FrameView]) -> None:
+        """Look at the frames that were not looked at yet."""
+        for view in views:
+            seq = view.frame["seq"]
+            if seq <= self.seen:
+                continue
+            self.begun = seq if self.begun < 0 else self.begun
+            self.seen = seq
+            for number, (search, spans) in enumerate(zip(self._search, self._spans, strict=True)):
+                try:
+                    holds = search is not None and any(True for _ in search.run(Binding(view)))
+                except NotKeptError:
+                    self._search[number], holds = None, False
+                if holds and spans and spans[-1][1] == seq - 1:
+                    spans[-1] = spans[-1][0], seq
+                elif holds:
+                    spans.append((seq, seq))
+
+    def lanes(self, trace: str, first: int) -> TruthLanes:
+        """Lanes of truth from a frame on, as :meth:`sgstore.Store.parts` gives them of a whole trace."""
+        lanes = (
+            TruthLane(part, (), ("what is asked of other frames",))
+            if search is None
+            else TruthLane(part, tuple(one for one in spans if one[1] >= first))
+            for part, search, spans in zip(self._parts, self._search, self._spans, strict=True)
+        )
+        return TruthLanes(trace, self._nodes, tuple(lanes))
+
+
+class FollowedCurve:
+    """An attribute of an entity, or a number of two, frame by frame.
+
+    Parameters
+    ----------
+    attribute : str
+        As the views ``nodes`` and ``pairs`` call it.
+    node : int
+    other : int, optional
+
+    Raises
+    ------
+    StoreError
+        There is no such number.
+    """
+
+    def __init__(self, attribute: str, node: int, other: int | None) -> None:
+        known = OF_NODE if other is None else OF_PAIR
+        if attribute not in known:
+            told = f"no number {attribute!r} of {'a node' if other is None else 'two'}"
+            raise StoreError(f"{told}; there are {', '.join(known)}")
+        self._attribute, self._node, self._other = attribute, node, other
+        self._told: deque[tuple[int, float, float]] = deque(maxlen=LONGEST_CURVE)
+        self._seen = -1
+
+    def look(self, views: Iterable[FrameView]) -> None:
+        """Look at the frames that were not looked at yet."""
+        for view in views:
+            seq, about = view.frame["seq"], view.nodes.get(self._node)
+            if seq <= self._seen or about is None:
+                continue
+            self._seen = seq
+            if self._other is None:
+                value = about.get(self._attribute)
+            else:
+                value = view.pair(self._attribute, self._node, self._other)
+            self._told.append((seq, view.frame["t"], math.nan if value is None else float(value)))
+
+    def columns(self) -> dict[str, Any]:
+        """Numbers of frames, their times (s), values; as :meth:`sgstore.store.StoreFile.series` has them."""
+        types = {"seq": np.uint32, "t": np.float64, "value": np.float32}
+        told = zip(*self._told, strict=True) if self._told else ((), (), ())
+        return {name: np.array(c, types[name]) for name, c in zip(types, told, strict=True)}
+
+
+class RecentGraphs:
+    """The last graphs of a run; what is followed in them goes on with each that comes.
+
+    Memory is bounded: at most :data:`MOST_EDGES` edges, or one graph, and :data:`MOST_FOLLOWED` matches and
+    curves. For one thread at a time.
+    """
+
+    def __init__(self) -> None:
+        self._views: deque[FrameView] = deque()
+        self._edges = 0
+        self._followed: OrderedDict[tuple[Any, ...], FollowedMatch | FollowedCurve] = OrderedDict()
+
+    def add(self, here: FrameTime, graph: SceneGraph, trace: str) -> None:
+        """Take the graph of the next frame."""
+        frame = {"id": here.seq, "seq": here.seq, "time_ns": here.time_ns, "t": here.t}
+        view = FrameView(graph, frame, {"id": 0, "name": trace}, _not_kept, _not_kept)
+        self._views.append(view)
+        self._edges += len(graph.edges)
+        while self._edges > MOST_EDGES and len(self._views) > 1:
+            self._edges -= len(self._views.popleft().graph.edges)
+        for one in self._followed.values():
+            one.look([view])
+
+    def view(self, seq: int) -> FrameView:
+        """A frame that is kept.
+
+        Raises
+        ------
+        StoreError
+            It is not.
+        """
+        for view in self._views:
+            if view.frame["seq"] == seq:
+                return view
+        first = self._views[0].frame["seq"] if self._views else 0
+        raise StoreError(f"the graph of frame #{seq} is not kept; those from #{first} on are")
+
+    def match(self, name: str, query: Query, nodes: Mapping[str, int]) -> FollowedMatch:
+        """What is known of a match, which is followed from now on; raises what :class:`FollowedMatch` does."""
+        return self._follow((name, *sorted(nodes.items())), partial(FollowedMatch, query, nodes))
+
+    def curve(self, attribute: str, node: int, other: int | None = None) -> FollowedCurve:
+        """A curve, which is followed from now on; raises what :class:`FollowedCurve` does."""
+        key = attribute, node, other
+        return self._follow(key, partial(FollowedCurve, *key))
+
+    def _follow(self, key: tuple[Any, ...], make: Callable[[], W]) -> W:
+        if key not in self._followed:
+            self._followed[key] = made = make()
+            made.look(self._views)
+        self._followed.move_to_end(key)
+        while len(self._followed) > MOST_FOLLOWED:
+            self._followed.popitem(last=False)
+        return cast("W", self._followed[key])
+
+
+def _not_kept(*_: object) -> Any:
+    raise NotKeptError("it is known of the last frame only")
