@@ -144,14 +144,14 @@ export function nextMatch(direction) {
   if (next) openMatch(next);
 }
 
-/** @param {string} attribute @param {number} node @param {number} [other] */
-export async function showSeries(attribute, node, other) {
+/** @param {string} attribute @param {string} unit @param {number} node @param {number} [other] */
+export async function showSeries(attribute, unit, node, other) {
   const trace = open.value?.trace;
   if (!trace || (offline.value && !live.value)) return;
   try {
     const body = { trace, attribute, node, ...(other === undefined ? {} : { other }) };
     const path = api.address("api/series", body), { columns } = await api.columns(path);
-    series.value = { path, attribute, node, other, columns, label: `${attribute} · ${nameOf(trace, node)}${other === undefined ? "" : ` → ${nameOf(trace, other)}`}` };
+    series.value = { path, attribute, unit, node, other, columns, label: `${attribute} · ${nameOf(trace, node)}${other === undefined ? "" : ` → ${nameOf(trace, other)}`}` };
   } catch (error) { say(reasonOf(error)); }
 }
 

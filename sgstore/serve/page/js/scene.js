@@ -121,7 +121,7 @@ function Above({ trace }) {
     const box = canvas.current.getBoundingClientRect();
     const node = nodeAt(seen.current, look.current, e.clientX - box.left, e.clientY - box.top);
     chosen.value = node < 0 ? null : node;
-    if (node >= 0) { panel.value = "node"; showSeries("speed", node); }
+    if (node >= 0) { panel.value = "node"; showSeries("speed", "m/s", node); }
   };
   return html`<div class="panel above">
     <div class="caption">
@@ -147,8 +147,8 @@ function trackOf(trace, node, at) {
 
 // Pattern, tables ---------------------------------------------------------------------------------------------------
 
-const PAIRS = ["distance", "gap", "ttc", "headway", "bearing", "closing_speed"];
-const OF_NODE = ["speed", "accel", "yaw_rate", "heading", "steer", "brake"];
+const OF_NODE = { speed: "m/s", accel: "m/s²", yaw_rate: "°/s", heading: "°", steer: "", brake: "" };
+const PAIRS = { distance: "m", gap: "m", ttc: "s", headway: "s", bearing: "°", closing_speed: "m/s" };
 
 function Details() {
   const tabs = [["pattern", "pattern"], ...(offline.value && !live.value ? [] : [["near", "neighbours"], ["nodes", "nodes"], ["edges", "edges"]]), ...(chosen.value === null ? [] : [["node", nameOf(open.value?.trace || "", chosen.value)]])];
@@ -171,8 +171,8 @@ function NodePanel() {
   return html`<div class="scroll" style=${{ padding: "8px 12px" }}>
     <table><tbody>${about.map(([name, value]) => html`<tr><td class="faint">${name}</td><td>${value}</td></tr>`)}</tbody></table>
     ${offline.value && !live.value ? null : html`<div class="row wrap" style=${{ marginTop: "8px" }}>
-      ${OF_NODE.map((name) => html`<button class="small" aria-pressed=${series.value?.attribute === name} onClick=${() => showSeries(name, node)}>${name}</button>`)}
-      ${other === undefined ? null : PAIRS.map((name) => html`<button class="small" onClick=${() => showSeries(name, other, node)}>${name} from ego</button>`)}
+      ${Object.entries(OF_NODE).map(([name, unit]) => html`<button class="small" aria-pressed=${series.value?.attribute === name} onClick=${() => showSeries(name, unit, node)}>${name}</button>`)}
+      ${other === undefined ? null : Object.entries(PAIRS).map(([name, unit]) => html`<button class="small" onClick=${() => showSeries(name, unit, other, node)}>${name} from ego</button>`)}
     </div>
     ${live.value ? null : html`<p class="row wrap"><button class="small" onClick=${() => { editing.set(`MATCH (e:Ego), (x) WHERE x.id = ${node} AND trace.name = '${now.trace.replace(/'/g, "\\'")}' AND dist(e, x) < 30`); find(); }}>as a query</button></p>`}`}
   </div>`;
@@ -206,9 +206,9 @@ function GraphTable({ what }) {
       ${some.length > 600 ? html`<p class="faint">600 of ${some.length} edges</p>` : null}</div>`;
   }
   const listed = graph.nodes.filter((/** @type {any} */ n) => n.id >= 0).sort((/** @type {any} */ a, /** @type {any} */ b) => Number(bound.has(b.id)) - Number(bound.has(a.id)));
-  return html`<div class="scroll"><table><thead><tr><th>node</th><th>kind</th><th>speed</th></tr></thead><tbody>
+  return html`<div class="scroll"><table><thead><tr><th>node</th><th>kind</th><th class="number">speed (m/s)</th></tr></thead><tbody>
     ${listed.map((/** @type {any} */ n) => html`<tr class=${chosen.value === n.id ? "chosen" : ""} onMouseEnter=${() => { lit.value = new Set([n.id]); }}
-      onMouseLeave=${() => { lit.value = new Set(); }} onClick=${() => { chosen.value = n.id; panel.value = "node"; showSeries("speed", n.id); }}>
+      onMouseLeave=${() => { lit.value = new Set(); }} onClick=${() => { chosen.value = n.id; panel.value = "node"; showSeries("speed", "m/s", n.id); }}>
       <td>${n.name || n.id}</td><td>${n.kind}</td><td class="number">${n.speed === undefined || n.speed === null ? "" : `${n.speed.toFixed(1)}`}</td></tr>`)}</tbody></table></div>`;
 }
 

@@ -100,10 +100,10 @@ function Chart({ table, x, lines }) {
   const at = table.columns.indexOf(x), xs = table.rows.map((/** @type {any[]} */ r) => r[at]);
   const all = lines.map((name) => table.rows.map((/** @type {any[]} */ r) => r[table.columns.indexOf(name)]));
   const right = Math.max(...xs, 1), top = Math.max(...all.flat().filter(Number.isFinite), 1);
-  const colours = ["var(--accent)", "var(--ego)"];
+  const colours = ["var(--accent)", "var(--ego)"], said = (/** @type {number} */ v) => v.toLocaleString("en", { maximumFractionDigits: 1 });
   return html`<svg class="chart" viewBox="0 0 900 240" role="img" aria-label=${`${lines.join(" and ")} by ${x}`}>
-    ${[0, 0.5, 1].map((s) => html`<line class="axis" x1="50" x2="890" y1=${206 - s * 170} y2=${206 - s * 170} /><text class="axis-text" x="44" y=${210 - s * 170} text-anchor="end">${Math.round(top * s).toLocaleString("en")}</text>
-      <text class="axis-text" x=${50 + s * 840} y="221" text-anchor=${s === 1 ? "end" : "middle"}>${Math.round(right * s).toLocaleString("en")}</text>`)}
+    ${[0, 0.5, 1].map((s) => html`<line class="axis" x1="50" x2="890" y1=${206 - s * 170} y2=${206 - s * 170} /><text class="axis-text" x="44" y=${210 - s * 170} text-anchor="end">${said(top * s)}</text>
+      <text class="axis-text" x=${50 + s * 840} y="221" text-anchor=${s === 1 ? "end" : "middle"}>${said(right * s)}</text>`)}
     ${all.map((ys, k) => html`<polyline class="series" style=${{ stroke: colours[k] }} points=${ys.map((/** @type {number} */ v, /** @type {number} */ i) => `${50 + (xs[i] / right) * 840},${206 - (v / top) * 170}`).join(" ")} />
       <text x=${50 + k * 110} y="18" font-size="12" font-weight="600" fill=${colours[k]}>${(lines[k] || "").replace(/_/g, " ")}</text>`)}
     <text class="axis-text" x="470" y="235" text-anchor="middle">${x}</text></svg>`;

@@ -24,7 +24,7 @@ export function Bars({ spans, kind, height = 21 }) {
 }
 
 function Series() {
-  const { columns, label } = series.value, [from, to] = range.value;
+  const { columns, label, unit } = series.value, [from, to] = range.value;
   let low = Infinity, high = -Infinity;
   for (const v of columns.value) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); }
   if (high === low) { high += 1; low -= 1; }
@@ -35,7 +35,7 @@ function Series() {
     path += `${pen ? "L" : "M"}${columns.seq[i]} ${(48 - ((v - low) / (high - low)) * 42).toFixed(2)}`;
     pen = true;
   });
-  return html`<div class="lane tall"><div class="label" title=${label}>${label}<br /><b>${Number.isFinite(now) ? now.toFixed(2) : "–"}</b>
+  return html`<div class="lane tall"><div class="label" title=${label}>${label}<br /><b>${Number.isFinite(now) ? `${now.toFixed(2)} ${unit}` : "–"}</b>
       <span class="faint"> ${Number.isFinite(low) ? `${low.toFixed(1)} … ${high.toFixed(1)}` : "never known"}</span></div>
     <svg viewBox=${`${from} 0 ${to - from + 1} 54`} preserveAspectRatio="none" aria-hidden="true"><path class="series" d=${path} vector-effect="non-scaling-stroke" />
       <line class="cursor" x1=${frame.value + 0.5} x2=${frame.value + 0.5} y1="0" y2="54" vector-effect="non-scaling-stroke" /></svg></div>`;
