@@ -508,11 +508,17 @@ def pair(name: str, a: dict[str, Any], b: dict[str, Any]) -> float | None:
     raise NotImplementedError(name)
 
 
-def assignments(match: s.MatchClause, world: World) -> Iterator[tuple[Search, Binding]]:
-    """Every match of a query in every frame of the traces that can answer it; ``ego`` bound if named."""
+def assignments(
+    match: s.MatchClause, world: World, whole: s.MatchClause | None = None
+) -> Iterator[tuple[Search, Binding]]:
+    """Every match of a query in every frame of the traces that can answer it; ``ego`` bound if named.
+
+    ``whole``: the query of which this one is a part, which says what a trace must know.
+    """
+    whole = whole or match
     injective = not any(setting.name.lower() == "nodes" for setting in match.settings)
     unknown_is_false = any(setting.name.lower() == "unknown" for setting in match.settings)
-    needed = set[str]() if unknown_is_false else relations_of(match)
+    needed = set[str]() if unknown_is_false else relations_of(whole)
     egos = [setting.value for setting in match.settings if setting.name.lower() == "ego"]
     for frame in world.frames:
         if egos and egos != [frame.trace.hero]:
@@ -523,7 +529,7 @@ def assignments(match: s.MatchClause, world: World) -> Iterator[tuple[Search, Bi
         outside: Binding = {}
         apart: tuple[str, ...] = ()
         # Named anywhere, it is a node of the pattern: the one that has that label, or (ego:Ego).
-        if "ego" in free_names(match):
+        if "ego" in free_names(whole):
             if frame.ego is None:
                 continue
             outside["ego"] = frame.ego
@@ -682,14 +688,16 @@ WORLD = 50
 """Patterns that are tried on one world."""
 
 
-def with_worlds(first: int, count: int) -> Iterator[tuple[int, World]]:
+def with_worlds(
+    first: int, count: int, *, traces: int = 3, frames: int = 6
+) -> Iterator[tuple[int, World]]:
     """So many numbers, each with its random world; some numbers in a row share one."""
     from oracle_worlds import random_world
 
     for start in range(first, first + count, WORLD):
         seed = start // WORLD
         world = random_world(
-            start, traces=3, frames=6, static=seed % 2 == 0, maps=1 + seed // 2 % 2
+            start, traces=traces, frames=frames, static=seed % 2 == 0, maps=1 + seed // 2 % 2
         )
         world.connection.execute("SET threads = 1")
         for number in range(start, min(start + WORLD, first + count)):
@@ -702,6 +710,7 @@ def try_each(
     made: Callable[[int], tuple[str, Compared]],
     found: str = "with rows",
     rows: Mapping[str, str] = MappingProxyType({}),
+    **size: int,
 ) -> Counter[str]:
     """Random queries on random worlds; how many, how many find something, how many are refused.
 
@@ -712,12 +721,15 @@ def try_each(
     found : str
         The word for those that find something.
     rows : mapping of str to str
-        Regular expressions by name: how many queries have them is told, too.
+        Regular expressions by name: how many queries have them is told, too, and
+        how many of these find something.
+    **size : int
+        Traces of a world, and frames of a trace.
     """
     from sgstore.errors import QueryError
 
     seen = Counter[str]()
-    for number, world in with_worlds(first, count):
+    for number, world in with_worlds(first, count, **size):
         text, compared = made(number)
         REMEMBERED.clear()
         about = f"query {number}, world {number - (number - first) % WORLD}: {text}"
@@ -732,7 +744,9 @@ def try_each(
             raise
         seen["tried"] += 1
         seen[found] += many > 0
-        seen.update(name for name, told in rows.items() if re.search(told, text))
+        for name in (name for name, told in rows.items() if re.search(told, text)):
+            seen[name] += 1
+            seen[f"{name} {found}"] += many > 0
         assert not problem, f"{about}\n{problem}"
     return seen
 

@@ -21,7 +21,7 @@ from oracle import (
     shown,
     try_each,
 )
-from oracle_patterns import Writer
+from oracle_patterns import SIMPLE, Writer
 
 from sgstore.lang import parse
 from sgstore.lang import syntax as s
@@ -216,6 +216,14 @@ def first_of_each(rows: list[Single], top: s.Sample) -> list[Single]:
 class AfterWriter(Writer):
     """Writes what is done with the matches of a random pattern."""
 
+    def query(self) -> str:
+        """A random pattern, or more often one that most frames have."""
+        if self.rng.random() < 0.4:
+            return super().query()
+        text, nodes = self.rng.choice(SIMPLE)
+        self.nodes += nodes
+        return f"MATCH {text}"
+
     def after(self) -> str:
         names = [name for name in self.nodes if name != "ego"] or ["ego"]
         a, b = self.rng.choice(names), self.rng.choice(names)
@@ -229,7 +237,7 @@ class AfterWriter(Writer):
         chosen = self.rng.sample(keys, self.rng.choice((0, 1, 1, 2)))
         names = [*(f"k{i}" for i in range(len(chosen)))]
         items = [f"{key} AS {name}" for key, name in zip(chosen, names, strict=True)]
-        told = self.rng.sample(counted, self.rng.randint(1, len(counted)))
+        told = self.rng.sample(counted, self.rng.randint(3, len(counted)))
         items += [f"{value} AS n{i}" for i, value in enumerate(told)]
         if chosen and self.rng.random() < 0.2:
             items.append(f"CASE WHEN COUNT(*) > 1 THEN {chosen[0]} END AS mixed")

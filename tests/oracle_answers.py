@@ -11,13 +11,14 @@ import re
 import sys
 import tempfile
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from oracle import REMEMBERED, answer, returned, rounded
 from oracle_over_time import compare_sequence, random_sequence, worlds
-from oracle_parts import online
-from oracle_patterns import Writer
+from oracle_parts import lenient, online, online_of
+from oracle_patterns import SIMPLE, Writer
 
 from sgstore.errors import QueryError
 
@@ -29,26 +30,28 @@ if TYPE_CHECKING:
     from sgstore.query import Store
 
 Rows = Counter[tuple[Any, ...]]
+POOL = 5
+"""Queries of which a case takes some."""
 
 
-def two_queries(rng: random.Random) -> list[str]:
-    """Queries that return columns of the same names and types."""
+def bare_queries(store: Store, rng: random.Random) -> tuple[list[str], list[str]]:
+    """Some queries, and what follows ``MATCH`` so that they return columns of the same names and types."""
     kinds = rng.sample(("{}.kind", "{}.x", "frame.seq", "trace.name", "{}.speed", "{}.is_ego"), 2)
-    made: list[str] = []
-    for _ in range(2):
+    bare: list[str] = []
+    returns: list[str] = []
+    while len(bare) < POOL:
         writer = Writer(rng.randrange(10**9))
-        text = lenient(writer.query())
-        name = rng.choice(writer.nodes or ["ego"])
-        made.append(
-            f"{text} RETURN " + ", ".join(f"{k.format(name)} AS k{i}" for i, k in enumerate(kinds))
-        )
-    return made
-
-
-def lenient(text: str) -> str:
-    """A query of which no trace is left out."""
-    start, using, rest = text.partition("USING ")
-    return f"USING UNKNOWN false, {rest}" if using else f"USING UNKNOWN false {start}"
+        text, names = writer.query(), writer.nodes
+        if rng.random() < 0.5:
+            simple, names = rng.choice(SIMPLE)
+            text = f"MATCH {simple}"
+        text, name = lenient(text), rng.choice(names or ["ego"])
+        told = ", ".join(f"{kind.format(name)} AS k{i}" for i, kind in enumerate(kinds))
+        with suppress(QueryError):
+            store.find(f"{text} RETURN {told}")
+            bare.append(text)
+            returns.append(f"{text} RETURN {told}")
+    return bare, returns
 
 
 def rows_of(text: str, world: World) -> Rows:
@@ -59,29 +62,46 @@ def seen(rows: Any) -> Rows:
     return rounded(Counter(tuple(row) for row in rows))
 
 
-def of_union(world: World, store: Store, rng: random.Random) -> int:
-    """Rows of both: each once, or all of them."""
-    one, other = two_queries(rng)
-    both = rows_of(one, world) + rows_of(other, world)
-    assert seen(store.find(f"{one} UNION ALL {other}")) == both, (one, other)
-    once = Counter(dict.fromkeys(both, 1))
-    assert seen(store.find(f"{one} UNION {other}")) == once, (one, other)
-    return len(both)
+def of_union(world: World, store: Store, rng: random.Random) -> Counter[str]:
+    """Rows of some queries: each once, or all of them; a monitor watches all."""
+    bare, texts = bare_queries(store, rng)
+    wanted = [rows_of(text, world) for text in texts]
+    told = Counter[str]()
+    for _ in range(POOL):
+        some = rng.sample(range(POOL), rng.choice((2, 2, 3)))
+        every = sum((wanted[n] for n in some), Rows())
+        text = " UNION ALL ".join(texts[n] for n in some)
+        assert seen(store.find(text)) == every, text
+        text = " UNION ".join(texts[n] for n in some)
+        assert seen(store.find(text)) == Counter(dict.fromkeys(every, 1)), text
+        told += Counter({"UNION": 1, "UNION with rows": int(bool(every))})
+    problem, _ = online_of(
+        [text.replace("UNKNOWN false, ", "").replace("USING UNKNOWN false ", "") for text in bare],
+        world,
+    )
+    assert not problem, (bare, problem)
+    return told
 
 
-def of_sql(world: World, store: Store, rng: random.Random) -> int:
-    """A query as a table, alone and joined with another one."""
-    one, other = two_queries(rng)
-    left, right = rows_of(one, world), rows_of(other, world)
-    assert seen(store.sql(f"SELECT * FROM sgql($${one}$$)").values) == left, one
-    quoted = other.replace("'", "''")
-    asked = f"SELECT s.k0, t.k1 FROM sgql($${one}$$) AS s JOIN sgql('{quoted}') AS t ON s.k0 = t.k0"
-    wanted = Rows()
-    for (k, _), many in left.items():
-        for (same, last), more in right.items():
-            wanted[k, last] += many * more * (k is not None and k == same)
-    assert seen(store.sql(asked).values) == +wanted, asked
-    return len(left)
+def of_sql(world: World, store: Store, rng: random.Random) -> Counter[str]:
+    """Queries as tables, alone and joined with another one."""
+    _, texts = bare_queries(store, rng)
+    wanted = [rows_of(text, world) for text in texts]
+    told = Counter[str]()
+    for text, rows in zip(texts, wanted, strict=True):
+        assert seen(store.sql(f"SELECT * FROM sgql($${text}$$)").values) == rows, text
+        told += Counter({"sgql()": 1, "sgql() with rows": int(bool(rows))})
+    for _ in range(POOL):
+        one, other = rng.sample(range(POOL), 2)
+        quoted = texts[other].replace("'", "''")
+        asked = f"SELECT s.k0, t.k1 FROM sgql($${texts[one]}$$) AS s JOIN sgql('{quoted}') AS t ON s.k0 = t.k0"
+        joined = Rows()
+        for (k, _), many in wanted[one].items():
+            for (same, last), more in wanted[other].items():
+                joined[k, last] += many * more * (k is not None and k == same)
+        assert seen(store.sql(asked).values) == +joined, asked
+        told += Counter({"sgql()": 1, "sgql() with rows": int(bool(+joined))})
+    return told
 
 
 def of_second(world: World, store: Store, rng: random.Random) -> int:
@@ -118,7 +138,7 @@ def of_scenario(world: World, store: Store, rng: random.Random) -> int:
     return compare_sequence(world, store, renamed, rng.choice(("all", "first", "longest")), called)
 
 
-CONSTRUCTS: dict[str, Callable[[World, Store, random.Random], int]] = {
+CONSTRUCTS: dict[str, Callable[[World, Store, random.Random], Any]] = {
     "union": of_union,
     "sql": of_sql,
     "second": of_second,
@@ -142,7 +162,7 @@ def run(seeds: range, questions: int, folder: Path) -> Counter[str]:
                         told[f"{name} refused"] += 1
                         continue
                     told[name] += 1
-                    told[f"{name} with rows"] += rows > 0
+                    told[f"{name} with rows"] += bool(rows)
     return told
 
 

@@ -2,15 +2,18 @@
 
 So many random cases of each are asked of random worlds: of a store (SQL, and columns over time), of graphs in
 memory, frame by frame by a monitor, and of an exhaustive definition that shares no code with them. Printed is a
-table: who was asked, how many cases there were, how many queries found something, and what a case costs.
+table: who was asked, how many cases there were, which share of them is about something that was found, how many
+queries were refused, and the time of the processor. "monitor": a monitor searches the graph of each frame in
+memory. "at end": about rows of all traces, which only a store has.
 
 A case is one random expression of the construct, asked of all traces of a world; a query asks several at once.
-Names behind the number choose constructs: ``python oracle_constructs.py 5000 windows happens``.
+Names behind the number choose constructs: ``python oracle_constructs.py 5000 UNION HAPPENS``.
 """
 
 from __future__ import annotations
 
 import random
+import re
 import sys
 import tempfile
 import time
@@ -37,6 +40,7 @@ from oracle_over_time import (
     compare_over_sequence,
     over_values,
     random_check,
+    short_expression,
     worlds,
 )
 
@@ -49,8 +53,8 @@ if TYPE_CHECKING:
 
     from sgstore.query import Store
 
-    Asked = Callable[[World, Store, random.Random], int]
-    """Asks a query; how much it found."""
+    Asked = Callable[[World, Store, random.Random], int | Counter[str]]
+    """Asks a query; how much it found, or cases of constructs, and how many of these found something."""
 
 MANY = 12
 """Cases that a query asks at once."""
@@ -58,10 +62,9 @@ MANY = 12
 
 # Random values ------------------------------------------------------------------------------------
 
-NUMBERS = (
-    *("e.speed", "v.speed", "e.x", "v.y", "e.width", "v.length", "frame.t", "v.vx"),
-    *("dist(e, v)", "lat(e, v)", "lon(v, e)", "e.speed - v.speed", "e.x * 0.25 - v.x"),
-)
+OF_NODES = ("e.speed", "v.speed", "e.x", "v.y", "e.width", "v.length", "frame.t", "v.vx")
+OF_PAIRS = ("dist(e, v)", "lat(e, v)", "lon(v, e)", "e.speed - v.speed", "e.x * 0.25 - v.x")
+NUMBERS = OF_NODES + OF_PAIRS
 LENGTHS = ("0.1s", "0.2s", "0.3s", "0.5s", "1s", "1.4s", "1frames", "2frames", "3frames", "5frames")
 EDGES = (
     ("(v:Entity)-[r:follows]->(e:Ego)", ("r.gap",)),
@@ -125,6 +128,19 @@ def happening(rng: random.Random) -> str:
     )
 
 
+def hops(rng: random.Random) -> str:
+    """Whether, or by how many lanes, so many lanes after one another are led to."""
+    low = rng.choice((1, 1, 2, 3))
+    way = f"[:travelsTo*{low}..{low + rng.choice((0, 1, 2))}]"
+    shapes = ("(e)-[:isIn]->(:Lane)-{}->(:Lane)", "(:Lane)<-{}-(:Lane)<-[:isIn]-(v)")
+    shapes += (
+        "(e)-[:isIn]->(:Lane)-{}->(:Lane)<-[:isIn]-(v)",
+        "(v)-[:isIn]->(:Lane)-{}->(:Lane)<-[:isIn]-(e)",
+    )
+    block = rng.choice(shapes).format(way)
+    return rng.choice((f"CASE WHEN EXISTS {{{block}}} THEN 1 ELSE 0 END", f"COUNT {{{block}}}"))
+
+
 FUNCTIONS = ("sin", "cos", "tan", "exp", "log", "sqrt", "sign", "degrees", "radians", "abs")
 
 
@@ -168,18 +184,31 @@ def of_edges(world: World, store: Store, rng: random.Random) -> int:
     return compare_over_pattern(world, store, rng, asked, pattern)
 
 
+STEPS = {"steps A | B": r" \| ", "steps {m,n}": r"\{\d"}
+"""Constructs, and how they are told in an expression of steps."""
+
+
+def of_steps(world: World, store: Store, rng: random.Random) -> Counter[str]:
+    text = short_expression(rng)
+    found = compare_expression(world, store, rng, text) > 0
+    told = [name for name, sign in STEPS.items() if re.search(sign, text)]
+    return Counter(told) + Counter(f"{name} with rows" for name in told if found)
+
+
 def of_checks(world: World, store: Store, rng: random.Random) -> int:
     return compare_check(world, store, *(random_check(rng) for _ in range(MANY)))
 
 
 ASKED: dict[str, Asked] = {
-    "windows": of_values(window),
+    "windows of nodes": of_values(partial(window, values=OF_NODES)),
+    "windows of pairs": of_values(partial(window, values=OF_PAIRS)),
     "windows of edges": of_edges,
     "robustness()": of_values(margin),
     "ROBUSTNESS": of_checks,
     "HAPPENS": of_values(happening),
     "functions": of_values(of_numbers),
     "CASE": of_values(conditional),
+    "k lane hops": of_values(hops),
 }
 """Queries that have so many cases as :data:`MANY` says."""
 
@@ -198,28 +227,38 @@ class Program:
     """What was seen on the world of a number: queries, refused ones, those with rows, and cases of each row."""
 
 
-def of_store(name: str, faces: tuple[str, str, str], asked: Asked, cases: int) -> Program:
-    """Random queries of stores of random worlds, each of so many cases."""
+def of_store(
+    rows: str | Collection[str],
+    faces: tuple[str, str, str],
+    asked: Asked,
+    cases: int,
+    **size: int,
+) -> Program:
+    """Random queries of stores of random worlds of some size, each of so many cases."""
+    rows = (rows,) if isinstance(rows, str) else tuple(rows)
 
     def tried(number: int) -> Counter[str]:
         seen = Counter[str]()
         with tempfile.TemporaryDirectory() as folder:
-            world, store = worlds(number, Path(folder))
-            rng = random.Random(f"{name} {number}")
+            world, store = worlds(number, Path(folder), **size)
+            rng = random.Random(f"{rows[0]} {number}")
             with store.file.snapshot():
-                for _ in range(WORLD):
+                for _ in range(WORLD if cases == 1 else 10):
                     REMEMBERED.clear()
                     try:
                         found = asked(world, store, rng)
                     except QueryError:
                         seen["refused"] += 1
                         continue
-                    seen[name] += cases
                     seen["tried"] += 1
-                    seen["with rows"] += found > 0
+                    if isinstance(found, Counter):
+                        seen.update(found)
+                    else:
+                        seen[rows[0]] += cases
+                        seen[f"{rows[0]} with rows"] += cases * (found > 0)
         return seen
 
-    return Program((name,), faces, tried)
+    return Program(rows, faces, tried)
 
 
 def of_writer(
@@ -238,8 +277,9 @@ def of_writer(
 ALL = ("yes", "yes", "yes")
 WATCHED = ("yes", "monitor", "yes")
 """A monitor searches the graph of each frame in memory."""
-OF_ROWS = ("yes", "-", "-")
-"""About the rows of all traces, which are known when the last of them has ended."""
+OF_ROWS = ("yes", "at end", "at end")
+"""About the rows of all traces, which are known when the last of them has ended: only a store answers."""
+SMALL = {"traces": 2, "frames": 7}
 
 PROGRAMS = (
     of_store(
@@ -261,11 +301,11 @@ PROGRAMS = (
         MANY + 2,
     ),
     *(of_store(name, WATCHED, asked, MANY) for name, asked in ASKED.items()),
-    of_store("steps", WATCHED, compare_expression, 1),
-    of_store("scenario", WATCHED, oracle_answers.of_scenario, 1),
-    of_store("second MATCH", WATCHED, oracle_answers.of_second, 1),
-    of_store("UNION", OF_ROWS, oracle_answers.of_union, 1),
-    of_store("sgql()", OF_ROWS, oracle_answers.of_sql, 1),
+    of_store(STEPS, WATCHED, of_steps, 1, **SMALL),
+    of_store("MATCH s(v = w)", WATCHED, oracle_answers.of_scenario, 1, **SMALL),
+    of_store("second MATCH", WATCHED, oracle_answers.of_second, 1, **SMALL),
+    of_store("UNION", WATCHED, oracle_answers.of_union, oracle_answers.POOL, **SMALL),
+    of_store("sgql()", OF_ROWS, oracle_answers.of_sql, 2 * oracle_answers.POOL, **SMALL),
     of_writer(ALL, oracle_parts.ROWS, oracle_parts.try_many_parts),
     of_writer(OF_ROWS, oracle_after.ROWS, oracle_after.try_many_after),
     Program(oracle_lanes.ROWS, ("yes", "yes", "yes"), oracle_lanes.tried),
@@ -278,8 +318,7 @@ COLUMNS = (
     "online",
     "definition",
     "cases",
-    "queries",
-    "found",
+    "answered",
     "refused",
     "CPU s",
 )
@@ -287,6 +326,10 @@ COLUMNS = (
 
 def main(count: int, names: Collection[str], first: int) -> None:
     """Try so many cases of some constructs, or of all; print a line for each as soon as it is known."""
+    rows = [row for program in PROGRAMS for row in program.rows]
+    unknown = [name for name in names if name not in rows]
+    if unknown:
+        raise SystemExit(f"no construct is called {unknown[0]!r}; there are: {', '.join(rows)}")
     print(LINE.format(*COLUMNS))
     for program in PROGRAMS:
         if names and not set(program.rows) & set(names):
@@ -297,11 +340,12 @@ def main(count: int, names: Collection[str], first: int) -> None:
             number += 1
         spent = time.process_time() - began
         for name in program.rows:
-            about = seen[name], seen["tried"], seen["with rows"], seen["refused"], round(spent)
+            share = f"{seen[f'{name} with rows'] / seen[name]:.0%}"
+            about = seen[name], share, seen["refused"], round(spent)
             print(LINE.format(name, *program.faces, "yes", *about), flush=True)
 
 
-LINE = "| {:<16} | {:<8} | {:<8} | {:<9} | {:<10} | {:>6} | {:>7} | {:>6} | {:>7} | {:>5} |"
+LINE = "| {:<16} | {:<8} | {:<8} | {:<9} | {:<10} | {:>6} | {:>8} | {:>7} | {:>5} |"
 
 if __name__ == "__main__":
     options = [int(one) for one in sys.argv[1:] if one.isdecimal()]

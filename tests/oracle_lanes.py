@@ -121,13 +121,13 @@ def compared(store: Store, name: str) -> Counter[str]:
                 )
                 same(value, expected, (name, frame, node, which))
                 seen[ROWS[2 if which in COURSES else 1]] += 1
-                seen["with rows"] += value is not None
+                seen[f"{ROWS[2 if which in COURSES else 1]} with rows"] += value is not None
         for _, a, b in [key for key in pairs if key[0] == frame]:
             far = pairs[frame, a, b]
             assert far == view.pair("lane_dist", a, b) == told[a, b][0], (name, frame, a, b, far)
             same(far, wanted.between(a, b), (name, frame, a, b))
             seen["lane_dist"] += 1
-            seen["with rows"] += far is not None
+            seen["lane_dist with rows"] += far is not None
     return seen
 
 

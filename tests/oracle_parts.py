@@ -11,7 +11,7 @@ import math
 import sys
 from collections import Counter
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from itertools import groupby, product
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +30,7 @@ from oracle import (
 )
 from oracle_after import is_counted, rounded, said
 from oracle_over_time import graph_of
-from oracle_patterns import Writer
+from oracle_patterns import SIMPLE, Writer
 
 from sgstore.lang import FrameView, StageSearch, bind_query, parse
 from sgstore.lang import syntax as s
@@ -159,7 +159,8 @@ def begun(match: s.MatchClause, world: World) -> Iterator[tuple[Search, Binding]
         return assignments(match, world)
     (step,) = match.sequence.steps
     bare = replace(step, block=replace(match.block, where=None))
-    return assignments(replace(match, sequence=replace(match.sequence, steps=(bare,))), world)
+    part = replace(match, sequence=replace(match.sequence, steps=(bare,)))
+    return assignments(part, world, match)
 
 
 def first(match: s.MatchClause, search: Search, binding: Binding) -> Iterator[Row]:
@@ -266,6 +267,7 @@ def aggregated(e: Any, members: list[Row]) -> Any:
     return {"min": min, "max": max, "sum": math.fsum}[e.name.lower()](known)
 
 
+@lru_cache(1)
 def returned(text: str, world: World) -> Counter[tuple[Any, ...]]:
     """The rows after ``RETURN``, as often as they are returned."""
     match = parse(text)[-1]
@@ -305,15 +307,6 @@ def listed(text: str, world: World) -> set[tuple[Any, ...]]:
 # Random queries -----------------------------------------------------------------------------------
 
 
-SIMPLE = (
-    ("(a:Car)", ["a"]),
-    ("(a:Entity)", ["a"]),
-    ("(a)-[:near]->(b)", ["a", "b"]),
-    ("(a:Vehicle)-[:isIn]->(b:Lane)", ["a", "b"]),
-    ("(a:Car), (b:Entity)", ["a", "b"]),
-    ("(a:Vehicle)-[:near|visible]-()", ["a"]),
-    ("(a:Ego)", ["a"]),
-)
 PATHS = (
     ("{} = (a)-[:near*1..2]->(b)", ["a", "b"]),
     ("{} = (a:Lane)-[:travelsTo*1..3]->(b)", ["a", "b"]),
@@ -511,25 +504,31 @@ def in_memory(text: str, world: World) -> tuple[str, int]:
 
 def online(text: str, world: World) -> tuple[str, int]:
     """The same of the frames in which matches begin, frame by frame."""
+    return online_of([text], world)
+
+
+def lenient(text: str) -> str:
+    """A query of which no trace is left out."""
     start, using, rest = text.partition("USING ")
-    text = f"USING UNKNOWN false, {rest}" if using else f"USING UNKNOWN false {start}"
-    if "EGO '" in text:
-        return "", 0
-    match, many = parse(text)[-1], 0
-    assert isinstance(match, s.MatchClause)
-    for trace in world.traces:
+    return f"USING UNKNOWN false, {rest}" if using else f"USING UNKNOWN false {start}"
+
+
+def online_of(texts: list[str], world: World) -> tuple[str, int]:
+    """The same of the parts of a ``UNION``: each of its queries is watched."""
+    texts, many = [lenient(text) for text in texts if "EGO '" not in text], 0
+    for trace in world.traces if texts else []:
         frames = [replace(frame, seq=n) for n, frame in enumerate(trace.frames)]
-        rows: dict[int, dict[Any, list[Any]]] = {n: {} for n in range(-1, len(frames))}
-        for row in rows_of(match, replace(world, traces=[replace(trace, frames=frames)]), text):
-            told = tuple(sorted((n, shown_node(v)) for n, v in row.binding.items() if n[:1] != "#"))
-            rows[row.frame.seq].setdefault(told, []).append(rounded(tuple(row.passed.values())))
-        wanted = Counter(begun_in(frames, rows))
-        monitor, found = Monitor(text, trace=trace.name, period_s=0.1), Counter[tuple[Any, ...]]()
+        alone = replace(world, traces=[replace(trace, frames=frames)])
+        rows = [rows_by_frame(text, alone) for text in texts]
+        wanted = Counter((k, *one) for k, own in enumerate(rows) for one in begun_in(frames, own))
+        monitor = Monitor(" UNION ".join(texts), trace=trace.name, period_s=0.1)
+        found = Counter[tuple[Any, ...]]()
         for n, frame in enumerate(frames):
             for event in monitor.look([graph_of(frame)]):
                 nodes = sorted((k, v) for k, v in event.nodes.items() if k != "ego")
-                found[event.start.seq, tuple(nodes)] += 1
-                known = [values for some in rows[n].values() for values in some]
+                part = int(event.name.split()[-1]) - 1 if len(texts) > 1 else 0
+                found[part, event.start.seq, tuple(nodes)] += 1
+                known = [values for some in rows[part][n].values() for values in some]
                 passed = rounded(tuple(event.values.values()))
                 if sorted(map(str, passed)) not in [sorted(map(str, one)) for one in known]:
                     return f"frame {n}: {event.values}, wanted one of {known}", 0
@@ -537,6 +536,17 @@ def online(text: str, world: World) -> tuple[str, int]:
             return difference(f"online {trace.name}", found, wanted), 0
         many += sum(wanted.values())
     return "", many
+
+
+def rows_by_frame(text: str, world: World) -> dict[int, dict[Any, list[Any]]]:
+    """What is bound in each frame of a trace, and the values that are passed on with it."""
+    match = parse(text)[-1]
+    assert isinstance(match, s.MatchClause)
+    rows: dict[int, dict[Any, list[Any]]] = {n: {} for n in range(-1, len(world.frames))}
+    for row in rows_of(match, world, text):
+        told = tuple(sorted((n, shown_node(v)) for n, v in row.binding.items() if n[:1] != "#"))
+        rows[row.frame.seq].setdefault(told, []).append(rounded(tuple(row.passed.values())))
+    return rows
 
 
 def begun_in(frames: list[Frame], rows: dict[int, dict[Any, Any]]) -> Iterator[tuple[Any, ...]]:
@@ -573,7 +583,7 @@ def answering(match: Any, world: World) -> Iterator[Frame]:
 ROWS = {
     "OPTIONAL MATCH": r"OPTIONAL MATCH",
     "WITH": r" WITH ",
-    "MATCH after WITH": r" (?<!OPTIONAL )MATCH .* (?<!OPTIONAL )MATCH ",
+    "MATCH after WITH": r" WITH .*(?<!OPTIONAL) MATCH ",
     "named paths": r"\b[pq]\d* = \(",
     "WITH of many": r" WITH [^W]*(COUNT\(|MAX\(|SUM\(|median|percentile|stddev|collect)",
 }
@@ -593,7 +603,7 @@ def try_many_parts(first: int, count: int) -> Counter[str]:
         told = [partial(one, text) for one in (disagreement_of_parts, in_memory)]
         return text, partial(all_agree, told + bare)
 
-    return try_each(first, count, made, rows=ROWS)
+    return try_each(first, count, made, rows=ROWS, traces=2, frames=5)
 
 
 if __name__ == "__main__":

@@ -44,6 +44,18 @@ PROPERTIES = dict.fromkeys(("", ":Car", ":Vehicle", ":Entity", ":%"), OF_ENTITIE
 PROPERTIES[":Lane"] = ["", "", " {type: 'driving'}"]
 
 
+SIMPLE = (
+    ("(a:Car)", ["a"]),
+    ("(a:Entity)", ["a"]),
+    ("(a)-[:near]->(b)", ["a", "b"]),
+    ("(a:Vehicle)-[:isIn]->(b:Lane)", ["a", "b"]),
+    ("(a:Car), (b:Entity)", ["a", "b"]),
+    ("(a:Vehicle)-[:near|visible]-()", ["a"]),
+    ("(a:Ego)", ["a"]),
+)
+"""Patterns that most frames have, and their variables."""
+
+
 OF_ONE = ("sin", "cos", "tan", "exp", "log", "sqrt", "sign", "degrees", "radians")
 
 

@@ -224,7 +224,7 @@ def lasting(trace: Trace, node: int) -> dict[str, Any]:
     return {**found, **common, **STILL, "name": f"{entity['kind']} {node}"}
 
 
-@dataclass
+@dataclass(eq=False)
 class World:
     """Traces, a database that holds them, and the catalogue of it."""
 
