@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.coverage import UNKNOWN, ReportTable, names_of, of_unknown, shared
+from sgstore.coverage import UNKNOWN, ReportTable, names_of, of_unknown, shared, traces_of
 from sgstore.store import seq_of, trace_of
 from sgstore.temporal import unknown_notes
 from sgstore.vocabulary import natural
@@ -16,6 +16,7 @@ from sgstore.vocabulary import natural
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from sgstore.collection import Collection
     from sgstore.coverage import Classed
     from sgstore.query import Store
     from sgstore.temporal import Verdict
@@ -98,7 +99,7 @@ _NONE: Final = np.zeros(0, np.int64)
 
 
 def _traces(of: Classed) -> dict[str, tuple[Ints, Ints]]:
-    names = {one.trace_id: one.name for one in of.chosen.store.info()}
+    names = {one.trace_id: one.name for one in traces_of(of.chosen.store)}
     trace = trace_of(of.frame_id)
     found: dict[str, tuple[Ints, Ints]] = {}
     for one in np.unique(trace).tolist():
@@ -124,8 +125,10 @@ def has_checks(text: str) -> bool:
     return _CHECK.search(text) is not None
 
 
-def verdicts(a: Store, b: Store, text: str, values: Mapping[str, Any]) -> ReportTable:
-    """Verdicts of checks on the traces of two stores, which are told apart by their names.
+def verdicts(
+    a: Store | Collection, b: Store | Collection, text: str, values: Mapping[str, Any]
+) -> ReportTable:
+    """Verdicts of checks on the traces of two stores or collections, which are told apart by their names.
 
     Returns
     -------
@@ -166,8 +169,10 @@ def _spans(verdict: Verdict | None) -> Any:
     return verdict.verdict, sorted((one.start_seq, one.end_seq) for one in verdict.violations)
 
 
-def matches(a: Store, b: Store, query: str, values: Mapping[str, Any]) -> ReportTable:
-    """Frames that a query finds in the traces of two stores, which are told apart by their names.
+def matches(
+    a: Store | Collection, b: Store | Collection, query: str, values: Mapping[str, Any]
+) -> ReportTable:
+    """Frames that a query finds in the traces of two stores or collections, told apart by their names.
 
     Returns
     -------
@@ -192,7 +197,7 @@ def matches(a: Store, b: Store, query: str, values: Mapping[str, Any]) -> Report
             of.setdefault(frame.trace, set()).add(frame.seq)
         found.append(of)
     rows: list[tuple[Any, ...]] = []
-    known = [{one.name for one in store.info()} for store in (a, b)]
+    known = [{one.name for one in traces_of(store)} for store in (a, b)]
     for name in sorted((known[0] | known[1]) - lost.keys(), key=natural):
         was, now = (of.get(name, set[int]()) for of in found)
         if not was and not now:

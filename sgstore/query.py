@@ -12,7 +12,14 @@ from sgstore.errors import StoreError, place_named
 from sgstore.lang import CONSTANTS, about_frame, compile_query, union_parts
 from sgstore.matches import UnionMatches
 from sgstore.records import dataclass
-from sgstore.store import IN_NOTEBOOK, FrameRef, StoreFile, UserTables
+from sgstore.store import (
+    IN_NOTEBOOK,
+    FrameRef,
+    StoreFile,
+    UserTables,
+    example_of,
+    frames_like,
+)
 from sgstore.vocabulary import normalize_name
 
 if TYPE_CHECKING:
@@ -31,25 +38,6 @@ if TYPE_CHECKING:
     from sgstore.temporal import CheckRun, ShortestClip
     from sgstore.truth_lanes import TruthLanes
     from sgstore.world import Clip
-
-
-def open(
-    path: str | Path,
-    *,
-    create: bool = False,
-    memory: int = 0,
-    tables: Mapping[str, object] | None = None,
-    max_spill: int = 0,
-    root: str | Path | None = None,
-) -> Store:
-    """Open a store; parameters and errors are those of :class:`Store`.
-
-    ::
-
-        with sgstore.open("drives.sgstore", create=True) as store:
-            store.ingest("recordings/")
-    """
-    return Store(path, create=create, memory=memory, tables=tables, max_spill=max_spill, root=root)
 
 
 class StoreFrame:
@@ -200,6 +188,13 @@ class Store:
             else None,
             root=root,
         )
+
+    @classmethod
+    def of(cls, file: StoreFile) -> Self:
+        """The store of a file that is open."""
+        found = cls.__new__(cls)
+        found.file = file
+        return found
 
     def __repr__(self) -> str:
         return f"Store({str(self.file.path)!r})"
@@ -471,7 +466,8 @@ class Store:
         AbstractionError
             There is no such abstraction, or nothing is called as what is to be ignored.
         """
-        return self.file.like(_ref(frame), abstraction, ignore, limit, each_trace=each_trace)
+        example = example_of(self.file, _ref(frame), abstraction, ignore)
+        return frames_like(self.file, example, limit, each_trace=each_trace)
 
     def pattern(self, frame: int | str | FrameRef, *, ignore: Sequence[str] = ()) -> str:
         """The text of a pattern that describes a frame around its ego, and matches it.

@@ -21,6 +21,7 @@ from sgstore.cli._completion import words_before
 from sgstore.cli._help import spare_packages
 from sgstore.cli._options import ERROR, USAGE, Verbs, app
 from sgstore.cli._output import complain, talk_as_usual, write_error
+from sgstore.cli._places import forget_asked, with_missing
 from sgstore.cli._process import take_streams
 from sgstore.errors import ConfigError, QueryError, SgstoreError, SqlError
 from sgstore.files import ReaderGoneError
@@ -138,6 +139,7 @@ def run(arguments: list[str]) -> int:
     finally:
         ending.clear_deadline()
         talk_as_usual()
+        forget_asked()
     if code == ending.INTERRUPTED:  # which typer, too, makes of Ctrl-C
         more = (
             "; what was finished is in the store" if {*_verb_in(arguments)} & {*_PUBLISHING} else ""
@@ -152,6 +154,7 @@ def _ran(arguments: list[str]) -> int:
     try:
         asked = application(arguments)
         code = int(asked(args=arguments, prog_name="sgstore", standalone_mode=False) or 0)
+        code = with_missing(code)
         if code != ending.INTERRUPTED:
             sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as error:

@@ -42,7 +42,7 @@ from sgstore.cli._options import (
     text_of,
 )
 from sgstore.cli._output import json_text, say
-from sgstore.cli._places import collection_at, say_missing, url_of
+from sgstore.cli._places import collection_at, url_of
 from sgstore.cli._process import was_ended
 from sgstore.files import without_controls, write_bytes
 
@@ -155,8 +155,7 @@ def check(
     if (url := url_of(store)) is not None:
         with collection_at(url, ask, engine, None, partial=partial, safe=False) as whole:
             asked_of = whole.check(text, sgsm_compat=statements.sgsm_compat, **values)
-            code = _reported(asked_of, ask, explain=explain, require=require, junit=junit)
-            return say_missing(whole) or code
+            return _reported(asked_of, ask, explain=explain, require=require, junit=junit)
     run = ask.opened(store).check(text, sgsm_compat=statements.sgsm_compat, **values)
     return _reported(run, ask, explain=explain, require=require, junit=junit)
 

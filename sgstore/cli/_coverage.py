@@ -15,18 +15,19 @@ from sgstore.cli._options import (
     ERROR,
     NO_MATCH,
     Abstraction,
+    AskedPath,
     AskOptions,
     Budget,
     CaseUnit,
     EngineName,
     LongestClip,
     Parameters,
+    Partial,
     Picture,
     PrintedRows,
     QueryLimits,
     QueryText,
     RowOptions,
-    StorePath,
     Verbs,
     app,
     asked_of,
@@ -35,10 +36,12 @@ from sgstore.cli._options import (
     seconds_of,
 )
 from sgstore.cli._output import count_bar, say
+from sgstore.cli._places import note_asked, opened_at
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from sgstore.collection import Collection
     from sgstore.coverage import ChosenFrames, Classed, ReportTable, Specification
     from sgstore.locks import Lock
     from sgstore.query import Store
@@ -111,6 +114,7 @@ class FrameAskOptions(AskOptions):
     """Options of a verb that asks stores or collections for classes of frames."""
 
     engine: EngineName = "local"
+    partial: Partial = False
 
     def frames(self, *texts: str) -> Iterator[ChosenFrames]:
         """Frames that each of some texts means."""
@@ -118,7 +122,9 @@ class FrameAskOptions(AskOptions):
 
         spill = self.spill()
         for text in texts:
-            yield selection_of(text, max_spill=spill, engine=self.engine)
+            chosen = selection_of(text, max_spill=spill, engine=self.engine, partial=self.partial)
+            note_asked(chosen.store)
+            yield chosen
 
 
 @dataclass(frozen=True)
@@ -306,14 +312,13 @@ def sequences_(
     ] = False,
     limit: Limit = None,
     *,
-    ask: AskOptions,
+    ask: FrameAskOptions,
 ) -> None:
     """Count the sequences of k manoeuvres, such as (car stops, ego stops): who did what after what."""
-    from sgstore.coverage import manoeuvres_named, selection_of, sequences
+    from sgstore.coverage import manoeuvres_named, sequences
 
     named = manoeuvres_named(manoeuvres or ())
-    spill = ask.spill()
-    ours, *others = (selection_of(text, max_spill=spill) for text in (a, by) if text is not None)
+    ours, *others = ask.frames(*(text for text in (a, by) if text is not None))
     say_left_out(ours)
     found = sequences(ours, k, others[0] if others else None, named, _within(within))
     listed = found.missing if missing else found.covered if covered else found.shares
@@ -611,7 +616,7 @@ class ChoiceOptions:
 
 @app.command(rich_help_panel=PANEL)
 def select(
-    store: StorePath,
+    store: AskedPath,
     choice: ChoiceOptions,
     query: QueryText = None,
     parameters: Parameters = None,
@@ -628,6 +633,8 @@ def select(
     picture: Annotated[
         Path | None, Option("--picture", metavar="FILE", help="Draw the curve: .png or .svg.")
     ] = None,
+    engine: EngineName = "local",
+    partial: Partial = False,
     *,
     out: PrintedRows,
     bounds: QueryLimits,
@@ -646,7 +653,7 @@ def select(
     if output is not None and output.suffix != ENDING:  # before anything is searched
         raise typer.BadParameter(f"--output {output}: the name of a lock ends in {ENDING}")
     shares = parse_split(split) if split else {}
-    opened = bounds.opened(store)
+    opened = opened_at(store, bounds, engine, partial=partial)
     found = choose(chosen_frames(opened, str(store), query, parameters), spec)
     parts = split_up(found, shares) if shares else {}
     for text in found.said:
@@ -663,7 +670,7 @@ def select(
 
 
 def chosen_frames(
-    opened: Store, name: str, query: str | None, parameters: list[str] | None
+    opened: Store | Collection, name: str, query: str | None, parameters: list[str] | None
 ) -> ChosenFrames:
     """The frames that are selected from."""
     from sgstore.coverage import ChosenFrames, frames_of
@@ -723,11 +730,13 @@ def _lock(
 @lock.command("verify")
 def verify_(
     path: LockPath,
-    store: StorePath,
+    store: AskedPath,
     no_payloads: NoPayloads = False,
     strict: Annotated[
         bool, Option("--strict", help="Count another version of sgstore as a difference.")
     ] = False,
+    engine: EngineName = "local",
+    partial: Partial = False,
     *,
     ask: AskOptions,
 ) -> int:
@@ -739,7 +748,8 @@ def verify_(
     from sgstore.locks import read_lock, verify
 
     known = read_lock(path)
-    found = list(verify(known, ask.opened(store), payloads=not no_payloads))
+    opened = opened_at(store, ask, engine, partial=partial)
+    found = list(verify(known, opened, payloads=not no_payloads))
     ask.write(("where", "what", "detail"), [(one.where, one.what, one.detail) for one in found])
     wrong = [one for one in found if strict or one.matters]
     unread = sum(case.payload is None for case in known.cases)
@@ -792,7 +802,9 @@ def say_made(made: Lock, output: Path) -> None:
 
 @app.command(rich_help_panel=PANEL)
 def diff(
-    a: Annotated[str, Argument(metavar="A", help="Before: a store, STORE:QUERY, or a lock.")],
+    a: Annotated[
+        str, Argument(metavar="A", help="Before: a store or collection, STORE:QUERY, or a lock.")
+    ],
     b: Annotated[str, Argument(metavar="B", help="After, as A.")],
     name: Annotated[
         str | None,
@@ -817,26 +829,25 @@ def diff(
         bool, Option("--require", help="End with exit code 4 if anything is different.")
     ] = False,
     *,
-    ask: AskOptions,
+    ask: FrameAskOptions,
 ) -> int:
     """Compare two stores or runs: which scenes, verdicts or matches appeared, vanished, changed."""
     from sgstore import diff as differences
-    from sgstore.coverage import classed, selection_of
-    from sgstore.query import Store
+    from sgstore.coverage import classed
 
     if (name is not None) + (query is not None) + by_frame > 1:
         raise typer.BadParameter("give one of -p NAME, -q TEXT, --by-frame")
-    values, spill = parameters_of(parameters), ask.spill()
+    values = parameters_of(parameters)
     if name is not None or query is not None:
         text, values = asked_of(query, None, name, values)
         compare = differences.verdicts if differences.has_checks(text) else differences.matches
-        before, after = (Store(one, max_spill=spill) for one in (a, b))
+        before, after = (
+            opened_at(Path(one), ask, ask.engine, partial=ask.partial) for one in (a, b)
+        )
         table = compare(before, after, text, values)
     else:
         compare = differences.by_frame if by_frame else differences.scenes
-        table = compare(
-            *(classed(selection_of(one, max_spill=spill), abstraction) for one in (a, b))
-        )
+        table = compare(*(classed(one, abstraction) for one in ask.frames(a, b)))
     # People read the reasons below the table, each once.
     ask.report(table.without(*differences.REASONS) if ask.for_people else table)
     different = any(row[0] != differences.SAME for row in table.rows)

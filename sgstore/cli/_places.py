@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 import typer
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from sgstore.collection import Collection
+    from sgstore.query import Store
 
 
 def url_of(store: Path) -> str | None:
@@ -46,11 +47,37 @@ def collection_at(
         raise typer.BadParameter("--max-spill bounds a question to one store, not to a collection")
     bounds.spill()
     with Collection(url, engine=engine, tables=tables_of(tables), partial=partial) as whole:
+        note_asked(whole)
         yield whole
 
 
-def say_missing(whole: Collection) -> int:
-    """Say which bundles did not answer; the exit code."""
-    for bundle, why in whole.missing.items():
+def opened_at(
+    place: Path, bounds: QueryLimits, engine: str, *, partial: bool
+) -> Store | Collection:
+    """Open a store or a collection within bounds."""
+    if (url := url_of(place)) is None:
+        return bounds.opened(place)
+    with collection_at(url, bounds, engine, None, partial=partial, safe=False) as whole:
+        return whole
+
+
+_asked: Final[list[Any]] = []  # Collection
+
+
+def note_asked(store: Store | Collection) -> None:
+    """Note what a verb asks: of a collection, some bundles may not answer."""
+    if hasattr(store, "missing"):
+        _asked.append(store)
+
+
+def with_missing(code: int) -> int:
+    """Say which bundles did not answer a verb, which ends with this exit code; the exit code then."""
+    missing = {name: why for whole in _asked for name, why in whole.missing.items()}
+    for bundle, why in missing.items():
         say(f"bundle {bundle[:12]}… did not answer: {why}")
-    return LOSS if whole.missing else 0
+    return LOSS if missing else code
+
+
+def forget_asked() -> None:
+    """Forget what a verb asked, which is over."""
+    _asked.clear()

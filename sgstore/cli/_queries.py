@@ -40,7 +40,7 @@ from sgstore.cli._options import (
     text_of,
 )
 from sgstore.cli._output import BINARY, Format, say, write_binary, write_document, write_text
-from sgstore.cli._places import collection_at, say_missing, url_of
+from sgstore.cli._places import collection_at, opened_at, url_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -176,10 +176,9 @@ def _found_in(
     else:
         number = ask.write(*_as_shown(matches, matches, ask.chosen))
     say_left_out(matches)
-    missing = say_missing(whole)
-    if missing or (count and not require):
-        return missing
-    return _ended(number, ask, require=require) if not count else NO_MATCH * (not number)
+    if count:
+        return NO_MATCH if require and not number else 0
+    return _ended(number, ask, require=require)
 
 
 def _ended(number: int, ask: AskOptions, *, require: bool) -> int:
@@ -233,7 +232,7 @@ def why_not(
 
 @app.command(rich_help_panel=PANEL)
 def like(
-    store: StorePath,
+    store: AskedPath,
     frame: FrameName,
     ignore: Annotated[
         list[str] | None,
@@ -250,6 +249,8 @@ def like(
     pattern: Annotated[
         bool, Option("--pattern", help="Print a pattern that describes the frame instead.")
     ] = False,
+    engine: EngineName = "local",
+    partial: Partial = False,
     *,
     out: RowOptions,
     bounds: QueryLimits,
@@ -260,7 +261,7 @@ def like(
     many, how like, whether the graphs are the same, and what only the example has, or only they.
     Frames less than 5 s from the example are left out; --all takes them, and every run, too.
     """
-    opened = bounds.opened(store)
+    opened = opened_at(store, bounds, engine, partial=partial)
     if pattern:
         write_text(f"{opened.pattern(frame, ignore=ignore or ())}\n", out.output)
         return 0
@@ -355,7 +356,7 @@ def sql(
             rows = whole.sql(query_of(statement, file), each=each)
             ask.write(rows.columns, rows)
             say_left_out(rows)
-            return say_missing(whole)
+            return 0
     if safe:
         with _sandbox(store, ask, max_rows, tables) as box:
             answer = box.sql(query_of(statement, file))

@@ -135,6 +135,11 @@ class Snapshot:
         found = (dict(zip(names, row, strict=True)) for row in self.facts["trace"])
         return tuple(sorted(found, key=lambda row: natural(row["name"])))
 
+    @cached_property
+    def homes(self) -> dict[int, str]:
+        """Trace → its bundle."""
+        return {row["trace_id"]: row["bundle"] for row in self.traces}
+
     def of(self, table: str, bundle: str) -> list[tuple[Any, ...]]:
         """The rows of a table that speak of a bundle."""
         return self._by_bundle(table).get(bundle, [])

@@ -1,45 +1,124 @@
-"""Frames of a collection as abstractions have them: what coverage is made of, told by all bundles together."""
+"""Frames of a collection, told by all bundles together, as a store tells its own.
+
+Coverage, selections and locks are made of them.
+"""
 
 from __future__ import annotations
 
 import json
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, Protocol, Self
 
 from sgstore.arrays import np
+from sgstore.collection import _worker as worker
 from sgstore.files import working_folder
 from sgstore.lang import PARTS
-from sgstore.store import PartFile, Triples, merged_arrays, merged_classes, merged_parts, trace_of
+from sgstore.store import (
+    PartFile,
+    Rows,
+    Triples,
+    merged_arrays,
+    merged_classes,
+    merged_parts,
+    trace_of,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Generator, Iterator
+    from contextlib import AbstractContextManager
 
+    from numpy.typing import NDArray
+
+    from sgstore.collection._catalogue import Snapshot
+    from sgstore.lang import Catalog
     from sgstore.store import CodedClasses
-    from sgstore.world import Ints
+    from sgstore.world import Floats, Ints
 
-    Ask = Callable[
-        [dict[str, Any], Sequence[str], Mapping[str, dict[str, Any]]], Iterator[dict[str, Any]]
-    ]
+    Parameters = Sequence[Any] | Mapping[str, Any]
+    Words = Mapping[str, Sequence[str]]
 
-_TIMES: Final = "SELECT frame_id, time_ns FROM parts ORDER BY frame_id"
-_IMPORTS: Final = "SELECT graph, frame_id FROM parts ORDER BY frame_id"
-_FEATURES: Final = "FROM parts ORDER BY ALL"
+_TIMES: Final = "SELECT frame_id, time_ns FROM frame"
+_IMPORTS: Final = "SELECT graph, frame_id FROM imports"
+_ALL: Final = f"FROM {PARTS} ORDER BY ALL"
+
+
+class Bundles(Protocol):
+    """What frames are asked of; see :class:`sgstore.collection.Collection`."""
+
+    snapshot: Snapshot
+
+    def bundles(self) -> list[str]: ...
+
+    def ask(
+        self,
+        question: dict[str, Any],
+        bundles: Sequence[str],
+        each: Mapping[str, dict[str, Any]],
+    ) -> Iterator[dict[str, Any]]: ...
 
 
 class CollectionFrames:
-    """The frames of a collection as abstractions have them, as :class:`sgstore.store._classes.Abstracted`.
+    """The frames of a collection, as :class:`StoreFile` and its :class:`Abstracted` tell those of a store.
 
     Parameters
     ----------
-    ask : function
-        Gives the answers of some bundles to a question, with what only one of them is asked.
-    bundles : sequence of str
-    homes : mapping of int to str
-        Trace → its bundle.
+    whole : Collection
+    catalog : function
+        Gives what all bundles hold together, for the compiler of queries.
     """
 
-    def __init__(self, ask: Ask, bundles: Sequence[str], homes: Mapping[int, str]) -> None:
-        self._ask, self._bundles, self._homes = ask, bundles, homes
+    def __init__(self, whole: Bundles, catalog: Callable[[], Catalog]) -> None:
+        self._whole, self.catalog = whole, catalog
+        self._words, self._homes = whole.snapshot.words, whole.snapshot.homes
+        self._bundles = whole.bundles() or [worker.EMPTY]
+
+    @property
+    def abstracted(self) -> Self:
+        """The same: its frames as abstractions have them."""
+        return self
+
+    def snapshot(self) -> AbstractContextManager[object]:
+        """Do nothing: a collection does not change while it is asked."""
+        return nullcontext()
+
+    def arrays(self, sql: str, parameters: Parameters = ()) -> dict[str, NDArray[np.generic]]:
+        """All columns of a statement of ours whose rows are each of one trace, by the values in them.
+
+        Parameters
+        ----------
+        sql : str
+        parameters : sequence or mapping
+            Of ``frames``, their ids, each bundle is given its own, and who has none is not asked.
+        """
+        with self._told(sql, parameters) as parts:
+            return merged_arrays({PARTS: parts}, self._words, _ALL, ())
+
+    def rows(self, sql: str, parameters: Parameters = ()) -> Rows:
+        """All rows of such a statement; see :meth:`arrays`."""
+        with self._told(sql, parameters) as parts:
+            values = [*_rows(parts, self._words)]
+            return Rows(parts[0].columns, parts[0].types, values)
+
+    @contextmanager
+    def _told(self, sql: str, parameters: Parameters) -> Generator[list[PartFile]]:
+        asked: dict[str, dict[str, Any]] = {one: {"values": parameters} for one in self._bundles}
+        if isinstance(parameters, Mapping) and "frames" in parameters:
+            each = self.by_bundle(np.array(parameters["frames"], np.int64))
+            asked = {b: {"values": {**parameters, "frames": of.tolist()}} for b, (_, of) in each}
+            asked = asked or {worker.EMPTY: {"values": parameters}}
+        with self._parts({"kind": "rows", "sql": sql}, asked) as parts:
+            yield parts
+
+    def by_bundle(self, frame_id: Ints) -> list[tuple[str, tuple[Ints, Ints]]]:
+        """Bundles of some frames, and of each: which of them, and their ids."""
+        traces, number = np.unique(trace_of(frame_id), return_inverse=True)
+        homes = [self._homes[trace] for trace in traces.tolist()]
+        of = {bundle: place for place, bundle in enumerate(dict.fromkeys(homes))}
+        bundle = np.array([of[home] for home in homes], np.int64)[number]
+        rows = ((name, np.flatnonzero(bundle == place)) for name, place in of.items())
+        return [(name, (some, frame_id[some])) for name, some in rows]
 
     def coded(self, name: str) -> CodedClasses:
         """The class of each frame in an abstraction as a number; in bundles that lack it it is made anew."""
@@ -48,40 +127,48 @@ class CollectionFrames:
 
     def times(self) -> tuple[Ints, Ints]:
         """Ids of all frames, ascending, and their simulation times; ns."""
-        with self._parts({"kind": "times"}) as parts:
-            found = merged_arrays({PARTS: parts}, {}, _TIMES, ())
-        return np.asarray(found["frame_id"], np.int64), np.asarray(found["time_ns"], np.int64)
+        frame_id, time_ns = self.arrays(_TIMES).values()
+        return np.asarray(frame_id, np.int64), np.asarray(time_ns, np.int64)
 
     def imported_names(self) -> dict[str, int]:
         """Names of graphs in imported files, and the ids of the frames that these became."""
-        with self._parts({"kind": "imports"}) as parts:
-            return dict(_rows(parts, _IMPORTS))
+        found = sorted(self.rows(_IMPORTS).values, key=lambda row: row[1])
+        return dict(found)
 
     def features(self, name: str, frame_id: Ints) -> Iterator[tuple[Ints, Triples]]:
         """Features of the graphs of frames in an abstraction, those of a bundle at a time.
 
         Parameters and what it yields are those of :meth:`sgstore.store._classes.Abstracted.features`.
         """
-        rows: dict[str, list[int]] = {}
-        for row, trace in enumerate(trace_of(frame_id).tolist()):
-            rows.setdefault(self._homes[trace], []).append(row)
-        each = {bundle: {"frames": frame_id[some].tolist()} for bundle, some in rows.items()}
+        homes = dict(self.by_bundle(frame_id))
+        each = {bundle: {"frames": of.tolist()} for bundle, (_, of) in homes.items()}
         question = {"kind": "features", "abstraction": name}
-        for result in self._ask(question, [*rows], each):
+        for result in self._whole.ask(question, [*homes], each):
             number: dict[str, int] = {}
             found = [
                 (frame, number.setdefault(feature, len(number)), often)
-                for frame, feature, often in _rows(_parts_of(result), _FEATURES)
+                for frame, feature, often in _rows(_parts_of(result), self._words)
             ]
             columns = np.array(found, np.int64).reshape(-1, 3).T
             names = [tuple(json.loads(feature)) for feature in number]
-            yield np.array(rows[result["bundle"]]), Triples(names, *columns)
+            yield homes[result["bundle"]][0], Triples(names, *columns)
+
+    def margins(self, question: dict[str, Any]) -> Iterator[tuple[Ints, Floats]]:
+        """Margins by which traces meet a check, as :meth:`sgstore.temporal.CheckRun.margins` tells them."""
+        with self._parts({"kind": "margins"} | question) as parts:
+            found = merged_arrays({PARTS: parts}, self._words, _ALL, ())
+        yield (
+            found["frame_id"].astype(np.int64),
+            np.ma.filled(found["margin"].astype(np.float64), np.nan),
+        )
 
     @contextmanager
-    def _parts(self, question: dict[str, Any]) -> Generator[list[PartFile]]:
-        """The answers of all bundles to a question."""
+    def _parts(
+        self, question: dict[str, Any], each: Mapping[str, dict[str, Any]] = MappingProxyType({})
+    ) -> Generator[list[PartFile]]:
+        """The answers to a question of all bundles, or of those of which each is asked something."""
         with working_folder("parts") as folder:
-            answers = self._ask(question, self._bundles, {})
+            answers = self._whole.ask(question, [*each] or self._bundles, each)
             yield [part.moved(folder) for answer in answers for part in _parts_of(answer)]
 
 
@@ -89,7 +176,7 @@ def _parts_of(answer: Mapping[str, Any]) -> list[PartFile]:
     return [PartFile.from_dict(part) for part in answer["parts"]]
 
 
-def _rows(parts: list[PartFile], sql: str) -> Iterator[tuple[Any, ...]]:
-    with merged_parts({PARTS: parts}, {}, sql, ()) as batches:
+def _rows(parts: list[PartFile], words: Words) -> Iterator[tuple[Any, ...]]:
+    with merged_parts({PARTS: parts}, words, _ALL, ()) as batches:
         for batch in batches:
             yield from batch.values

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import replace
@@ -45,18 +46,23 @@ from sgstore.lang import (
     union_parts,
 )
 from sgstore.matches import Interval, UnionMatches, merged, row_type
+from sgstore.query import Store
 from sgstore.store import (
     SEQ_BITS,
     FrameRef,
     PartFile,
+    SimilarFrames,
     StoreFile,
     Tabular,
     UserTables,
     merged_arrays,
     merged_file,
     merged_parts,
+    most_like,
+    trace_among,
     write_parquet,
 )
+from sgstore.temporal import TemporalMatches, kept_throughout
 from sgstore.vocabulary import natural
 from sgstore.world import Clip, tolerance_ns
 
@@ -69,6 +75,7 @@ if TYPE_CHECKING:
     from sgstore.collection._engines import Engine
     from sgstore.lang import Catalog, CheckInCatalog, ClassQuestion, Compiled, Pattern, Triple
     from sgstore.temporal import Verdict
+    from sgstore.world import Floats, Ints
 
 _SHOWN: Final = 8
 """Bundles that a message names; the others are counted."""
@@ -178,10 +185,9 @@ class Collection:
         return {name: _facts_of_table(name, one) for name, one in told.items()}
 
     @cached_property
-    def abstracted(self) -> CollectionFrames:
-        """Its frames as abstractions have them."""
-        homes = {row["trace_id"]: row["bundle"] for row in self.snapshot.traces}
-        return CollectionFrames(self.ask, self.bundles() or [worker.EMPTY], homes)
+    def file(self) -> CollectionFrames:
+        """Its frames, as the file of a store has them."""
+        return CollectionFrames(self, lambda: self.catalog)
 
     def bundles(self) -> list[str]:
         """All bundles, the largest first."""
@@ -256,7 +262,79 @@ class Collection:
             )
         return PartedRows(self, text)
 
+    def like(
+        self,
+        frame: str,
+        *,
+        abstraction: str = "RSV",
+        ignore: Sequence[str] = (),
+        limit: int = 10,
+        each_trace: bool = False,
+    ) -> list[SimilarFrames]:
+        """Frames like one that is given, as ``TRACE#SEQ`` or ``TRACE@12.3s``; see :meth:`sgstore.Store.like`.
+
+        Raises
+        ------
+        StoreError, AbstractionError
+            As for a store.
+        """
+        about = {"ref": frame, "name": abstraction, "ignored": [*ignore]}
+        example = self._at_home(frame, worker.example_in, about)
+        how = {"example": example, "limit": limit, "each_trace": each_trace}
+        found: list[SimilarFrames] = []
+        for _, some in self.each(worker.like_in, dict.fromkeys(self.bundles(), how)):
+            found += map(_similar, some)
+        return most_like(found, limit)
+
+    def pattern(self, frame: str, *, ignore: Sequence[str] = ()) -> str:
+        """The text of a pattern that describes a frame around its ego; see :meth:`sgstore.Store.pattern`."""
+        return self._at_home(frame, Store.pattern, {"frame": frame, "ignore": [*ignore]})
+
+    def _at_home(self, frame: str, step: Callable[..., Any], values: dict[str, Any]) -> Any:
+        """What a function makes of the bundle that has a frame; its errors are those of one store."""
+        home = self._home_of(frame)
+        try:
+            for _, value in self.each(step, {home: values}):
+                return value
+        except PartialAnswerError as error:
+            raise StoreError(error.bundles[home]) from None
+        raise StoreError(self.missing[home])
+
+    def _home_of(self, frame: str) -> str:
+        """The bundle of the trace of a frame, as :meth:`sgstore.Store.graph` takes its name.
+
+        Raises
+        ------
+        StoreError
+            There is no such trace.
+        """
+        name = re.split("[#@](?=[^#@]*$)", frame)[0]
+        known = {row["name"]: row["trace_id"] for row in self.snapshot.traces}
+        if name == frame and frame.isdecimal():
+            if (home := self.snapshot.homes.get(int(frame) >> SEQ_BITS)) is None:
+                raise StoreError(f"no frame {frame} in the collection")
+            return home
+        return self.snapshot.homes[trace_among(known, name.strip())[0]]
+
     # How a question is asked ----------------------------------------------------------------------
+
+    def each(
+        self, step: Callable[..., Any], asked: Mapping[str, Mapping[str, Any]]
+    ) -> Iterator[tuple[str, Any]]:
+        """Yield what a function makes of some bundles, and which bundle it is, as they come.
+
+        Parameters
+        ----------
+        step : function
+            Of a module, called with the :class:`sgstore.Store` of a bundle and with values; what it returns is
+            as plain as JSON.
+        asked : mapping of str to mapping
+            Bundle → plain values, by the names of parameters.
+        """
+        name = f"{step.__module__}:{step.__qualname__}"
+        values = {bundle: {"values": dict(given)} for bundle, given in asked.items()}
+        for answer in self.ask({"kind": "step", "step": name}, [*asked], values):
+            yield answer["bundle"], answer["value"]
 
     def ask(
         self,
@@ -389,6 +467,11 @@ class Collection:
         return lambda bundle: (triples.get(bundle, nothing), kinds[bundle])
 
 
+def _similar(values: dict[str, Any]) -> SimilarFrames:
+    values["frame"] = FrameRef(**values["frame"])
+    return SimilarFrames(**values)
+
+
 def _facts_of_table(name: str, told: Mapping[str, Any]) -> TableFacts:
     """Facts for the compiler of a table of one's own, given how its rows fit the frames of all bundles."""
     refused = None
@@ -411,7 +494,11 @@ class PartedMatches(Tabular):
         Names of the columns of the rows.
     graphs : bool
         Whether each row ends in a graph, as ``RETURN SUBGRAPHS`` asks.
+    of_match : bool
+        Whether one value is returned, and that is of each match as a whole.
     """
+
+    of_match = TemporalMatches.of_match
 
     def __init__(self, whole: Collection, text: str, parameters: Mapping[str, object]) -> None:
         self._file, self.snapshot = _NoFile(), whole.snapshot
@@ -679,6 +766,16 @@ class PartedChecks:
     def quantitative(self) -> bool:
         """Tell whether it is asked of some check by how much it is met."""
         return any(one.check.robustness for one in self._checks)
+
+    @property
+    def lasting(self) -> bool:
+        """Tell whether frames have margins; see :attr:`sgstore.temporal.CheckRun.lasting`."""
+        return all(kept_throughout(one.check) is not None for one in self._checks)
+
+    def margins(self) -> Iterator[tuple[Ints, Floats]]:
+        """Margins by which traces meet the one check; see :meth:`sgstore.temporal.CheckRun.margins`."""
+        question = {"text": self._text, "parameters": self._parameters}
+        return self._whole.file.margins(question)
 
     @property
     def returned(self) -> dict[str, tuple[str, ...]]:

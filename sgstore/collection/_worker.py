@@ -10,8 +10,9 @@ import base64
 import json
 import secrets
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
+from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -22,11 +23,14 @@ from sgstore.errors import StoreError
 from sgstore.files import working_folder
 from sgstore.lang import Compiled, Type, parted
 from sgstore.matches import Interval
-from sgstore.query import UserStatement, matches_of
+from sgstore.query import Store, UserStatement, matches_of
 from sgstore.store import (
+    Example,
     PartFile,
     StoreFile,
     UserTables,
+    example_of,
+    frames_like,
     write_classes,
     write_coded,
     write_part,
@@ -123,8 +127,7 @@ def answer(task: dict[str, Any]) -> dict[str, Any]:
     Parameters
     ----------
     task : dict
-        ``kind``: ``find``, ``check``, ``classes`` or ``sql``; ``url`` and ``bundle``; ``whole``: see
-        :class:`Whole`;
+        ``kind``: one of those in ``_KINDS``; ``url`` and ``bundle``; ``whole``: see :class:`Whole`;
         ``text``, ``parameters``, ``limit``; ``tables``: name → Parquet file, or its bytes as base64; ``to``:
         the folder for parts, which the caller reads, empty: rows come with the result; and what the kind
         needs.
@@ -133,7 +136,7 @@ def answer(task: dict[str, Any]) -> dict[str, Any]:
     -------
     dict
         ``parts``: rows in Parquet files; ``lines``: a file of JSON lines; ``reasons``: traces that cannot
-        answer, and why.
+        answer, and why; ``value``: plain values.
 
     Raises
     ------
@@ -334,19 +337,37 @@ def _features(
     return {"parts": [part.as_dict()], "reasons": {}}
 
 
-_FRAMES: Final = {
-    "times": ("SELECT frame_id, time_ns FROM frame", ("frame_id", "time_ns")),
-    "imports": ("SELECT graph, frame_id FROM imports", ("graph", "frame_id")),
-}
+def _margins(
+    task: dict[str, Any], file: StoreFile, catalog: Callable[[], Catalog], to: Path
+) -> dict[str, Any]:
+    """The margin by which each frame meets a check, or its trace as a whole."""
+    from sgstore.arrays import np
+
+    run = CheckRun(file, catalog, task["text"], task["parameters"])
+    found = ((ids, np.broadcast_to(margins, len(ids))) for ids, margins in run.margins())
+    rows = (row for one in found for row in zip(*(of.tolist() for of in one), strict=True))
+    columns = {"frame_id": "BIGINT", "margin": "DOUBLE"}
+    part = write_rows(columns, rows, to / f"{secrets.token_hex(8)}.parquet")
+    return {"parts": [part.as_dict()], "reasons": {}}
 
 
-def _frames(
+def _rows(
     task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
-    """The times of all frames, or the names that they had in imported files."""
-    sql, columns = _FRAMES[task["kind"]]
-    part = write_part(file, (sql, ()), columns, (), to / f"{secrets.token_hex(8)}.parquet")
+    """The rows of a statement of ours."""
+    statement = task["sql"], task["values"]
+    columns = [row[0] for row in file.rows(f"DESCRIBE {task['sql']}", task["values"]).values]
+    part = write_part(file, statement, columns, (), to / f"{secrets.token_hex(8)}.parquet")
     return {"parts": [part.as_dict()], "reasons": {}}
+
+
+def _step(
+    task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], _to: Path
+) -> dict[str, Any]:
+    """What a function of another room makes of a bundle."""
+    module, _, name = task["step"].partition(":")
+    step = attrgetter(name)(import_module(module))
+    return {"value": step(Store.of(file), **task["values"])}
 
 
 def _tables(
@@ -366,6 +387,16 @@ def _tables(
     return {"tables": told}
 
 
+def example_in(store: Store, **asked: Any) -> dict[str, Any]:
+    """A frame of a bundle as an example for others."""
+    return asdict(example_of(store.file, **asked))
+
+
+def like_in(store: Store, example: dict[str, Any], **how: Any) -> list[dict[str, Any]]:
+    """The frames of a bundle that are most like an example."""
+    return [asdict(one) for one in frames_like(store.file, Example(**example), **how)]
+
+
 _KINDS: Final[dict[str, Any]] = {
     "find": _find,
     "check": _check,
@@ -374,8 +405,9 @@ _KINDS: Final[dict[str, Any]] = {
     "tables": _tables,
     "coded": _coded,
     "features": _features,
-    "times": _frames,
-    "imports": _frames,
+    "margins": _margins,
+    "rows": _rows,
+    "step": _step,
 }
 
 

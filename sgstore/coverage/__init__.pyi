@@ -29,6 +29,8 @@ from ._frames import ChosenFrames as ChosenFrames
 from ._frames import ReportTable as ReportTable
 from ._frames import frames_of as frames_of
 from ._frames import names_of as names_of
+from ._frames import recordings_of as recordings_of
+from ._frames import traces_of as traces_of
 from ._frames import of_unknown as of_unknown
 from ._frames import periods_of as periods_of
 from ._frames import run_begins as run_begins
@@ -76,6 +78,8 @@ __all__ = [
     "happenings",
     "manoeuvres_named",
     "names_of",
+    "recordings_of",
+    "traces_of",
     "novel",
     "novel_clips",
     "novel_frames",

@@ -108,7 +108,7 @@ class Classed:
 
     def in_order(self) -> Ints:
         """(N,) int64: rows in the order in which traces came into the store, frame after frame."""
-        rank = {trace.trace_id: i for i, trace in enumerate(traces_of(self.chosen.source))}
+        rank = {trace.trace_id: i for i, trace in enumerate(traces_of(self.chosen.store))}
         traces, number = np.unique(trace_of(self.frame_id), return_inverse=True)
         ranks = np.array([rank.get(trace, len(rank)) for trace in traces.tolist()], np.int64)
         return np.argsort(ranks[number], kind="stable") if len(traces) else np.zeros(0, np.int64)
@@ -147,7 +147,7 @@ def classed(
     if not 1 <= window <= LONGEST_WINDOW:
         raise AbstractionError(f"a window has 1 to {LONGEST_WINDOW:,} frames")
     if slots is not None:
-        frame_id, names, code = slot_sets(ChosenFrames(chosen.text, chosen.source), slots)
+        frame_id, names, code = slot_sets(ChosenFrames(chosen.text, chosen.store), slots)
         whole = Classed(chosen, tuple(names), frame_id, code)
     else:
         coded = chosen.abstracted.coded(abstraction)
@@ -163,7 +163,7 @@ def _windows(whole: Classed, window: int, missing: Missing) -> Classed:
     frame_id, code = whole.frame_id, whole.code
     ids, time_ns = whole.chosen.abstracted.times()
     time_ns = time_ns[np.searchsorted(ids, frame_id)]
-    fresh = run_begins(whole.chosen.source, frame_id, time_ns)
+    fresh = run_begins(whole.chosen.store, frame_id, time_ns)
     within = np.arange(len(code)) - np.maximum.accumulate(np.where(fresh, np.arange(len(code)), 0))
     state = code + 1  # 0: missing
     parts = [state]

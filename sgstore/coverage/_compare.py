@@ -169,7 +169,7 @@ def classes(a: Classed, unit: CountedUnit = "frame") -> ReportTable:
         sizes[order].tolist(),
         (sizes[order] / max(total, 1)).tolist(),
         cumulative,
-        names_of(a.chosen.source, first[order]),
+        names_of(a.chosen.store, first[order]),
         strict=True,
     )
     columns = ("rank", "class", f"{unit}s", "share", "cumulative", "frame")
@@ -244,7 +244,7 @@ def novel(a: Classed, than: Classed) -> ReportTable:
     new = np.flatnonzero((sizes > 0) & (than.sizes() == 0))
     order = new[np.lexsort((first[new], sizes[new]))]
     names = [a.names[code] for code in order.tolist()]
-    frames = names_of(a.chosen.source, first[order])
+    frames = names_of(a.chosen.store, first[order])
     rows = list(zip(names, sizes[order].tolist(), frames, strict=True))
     total, many = int(sizes.sum()), int((sizes > 0).sum())
     said = [
@@ -267,7 +267,7 @@ def novel_frames(a: Classed, than: Classed) -> ReportTable:
     sizes = a.sizes()
     rows = np.flatnonzero(is_novel(a, than))
     rows = rows[np.lexsort((a.frame_id[rows], sizes[a.code[rows]]))]
-    frames = names_of(a.chosen.source, a.frame_id[rows])
+    frames = names_of(a.chosen.store, a.frame_id[rows])
     listed = zip(frames, a.frame_id[rows].tolist(), a.code[rows].tolist(), strict=True)
     table = [(frame, number, a.names[code], int(sizes[code])) for frame, number, code in listed]
     said = [f"{len(rows)} frames of {a.chosen.text} of classes that are not in {than.chosen.text}"]
@@ -288,7 +288,7 @@ def novel_clips(a: Classed, than: Classed) -> ReportTable:
     fresh = begins(ids)
     starts = np.flatnonzero(fresh)
     ends = np.append(starts[1:], len(rows)) - 1
-    first, last = names_of(a.chosen.source, ids[starts]), names_of(a.chosen.source, ids[ends])
+    first, last = names_of(a.chosen.store, ids[starts]), names_of(a.chosen.store, ids[ends])
     number = np.cumsum(fresh) - 1
     pairs = np.unique(np.stack([number, a.code[rows]]), axis=1)[0]
     kinds = np.bincount(pairs, minlength=len(starts))
@@ -428,7 +428,7 @@ def told_outcomes(
     failed, known = (np.zeros(len(frame_id), np.bool_) for _ in range(2))
     place = {int(frame): row for row, frame in enumerate(frame_id.tolist())}
     ids = chosen.abstracted.times()[0]
-    called = dict(zip(names_of(chosen.source, ids), ids.tolist(), strict=True))
+    called = dict(zip(names_of(chosen.store, ids), ids.tolist(), strict=True))
     called |= chosen.abstracted.imported_names()
     for name, fails in outcomes.items():
         row = place.get(called.get(name, int(name) if _ID.fullmatch(name) else -1))
@@ -555,7 +555,7 @@ def failures(
 
 def _listed(test: Classed, novel: Bools, inputs: Ints) -> ReportTable:
     rows = np.flatnonzero(novel)
-    frames = names_of(test.chosen.source, test.frame_id[rows])
+    frames = names_of(test.chosen.store, test.frame_id[rows])
     columns = zip(frames, test.code[rows].tolist(), inputs[rows].tolist(), strict=True)
     listed = [(frame, test.names[code], many) for frame, code, many in columns]
     return ReportTable(("frame", "class", "in_training"), listed)

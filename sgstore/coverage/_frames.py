@@ -6,7 +6,6 @@ Features and values of slots as queries: what is missing is asked for by text th
 from __future__ import annotations
 
 import re
-from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -174,7 +173,7 @@ class ChosenFrames:
     ----------
     text : str
         What they were called.
-    source : Store or Collection
+    store : Store or Collection
     frame_id : int64 or None
         Ascending; ``None``: all.
     reasons : mapping of str to str
@@ -182,7 +181,7 @@ class ChosenFrames:
     """
 
     text: str
-    source: Store | Collection
+    store: Store | Collection
     frame_id: Ints | None = None
     reasons: Mapping[str, str] = field(default_factory=dict[str, str])
 
@@ -192,7 +191,7 @@ class ChosenFrames:
         return tuple(self.reasons)
 
     @property
-    def store(self) -> Store:
+    def one_store(self) -> Store:
         """The store that they are of.
 
         Raises
@@ -200,37 +199,33 @@ class ChosenFrames:
         StoreError
             They are of a collection.
         """
-        if isinstance(self.source, Store):
-            return self.source
-        raise one_store_needed(self.source.place.url)
+        if isinstance(self.store, Store):
+            return self.store
+        raise one_store_needed(self.store.place.url)
 
     def joined(self, tables: Mapping[str, Path]) -> ChosenFrames:
         """The same frames, with tables of one's own that patterns can ask; see :class:`sgstore.query.Store`."""
         if not tables:
             return self
-        if isinstance(self.source, Store):
-            return replace(self, source=Store(self.source.file.path, tables=tables))
-        return replace(self, source=self.source.joined(tables))
+        if isinstance(self.store, Store):
+            return replace(self, store=Store(self.store.file.path, tables=tables))
+        return replace(self, store=self.store.joined(tables))
 
     @property
     def abstracted(self) -> Abstracted | CollectionFrames:
         """The frames of its store as abstractions have them."""
-        return (
-            self.source.file.abstracted
-            if isinstance(self.source, Store)
-            else self.source.abstracted
-        )
+        return self.store.file.abstracted
 
     @property
     def place(self) -> str:
         """Where its store lies."""
-        if isinstance(self.source, Store):
-            return str(self.source.file.path.resolve())
-        return self.source.place.url
+        if isinstance(self.store, Store):
+            return str(self.store.file.path.resolve())
+        return self.store.place.url
 
     def snapshot(self) -> AbstractContextManager[object]:
         """Keep a store open for several questions; a collection does not change while it is asked."""
-        return self.source.file.snapshot() if isinstance(self.source, Store) else nullcontext()
+        return self.store.file.snapshot()
 
     def rows_of(self, frame_id: Ints) -> Ints:
         """Rows of the chosen ones among frames with ascending ids."""
@@ -242,19 +237,21 @@ class ChosenFrames:
         return at[known].astype(np.int64)
 
 
-def selection_of(text: str, *, max_spill: int = 0, engine: str = "local") -> ChosenFrames:
+def selection_of(
+    text: str, *, max_spill: int = 0, engine: str = "local", partial: bool = False
+) -> ChosenFrames:
     """The frames that a text means: a store, those of it in which a query holds, or those of a lock.
 
     Parameters
     ----------
     text : str
         ``STORE``, ``STORE:QUERY``, ``STORE:LOCK``; or ``LOCK``, if one store beside it has all its traces. A
-        lock is a file that is called ``….lock``. ``URL`` and ``URL:QUERY`` mean a collection, in a folder or an
-        object store.
+        lock is a file that is called ``….lock``. For ``STORE`` may stand a collection: a folder, or a URL.
     max_spill : int
         As of :class:`sgstore.query.Store`; bytes.
-    engine : str
-        Who asks the bundles of a collection; as of :class:`sgstore.collection.Collection`.
+    engine, partial : str, bool
+        Who asks the bundles of a collection, and whether some may lack; as of
+        :class:`sgstore.collection.Collection`.
 
     Raises
     ------
@@ -269,9 +266,7 @@ def selection_of(text: str, *, max_spill: int = 0, engine: str = "local") -> Cho
         store = Store(store_beside(whole, lock), max_spill=max_spill)
         return ChosenFrames(text, store, frames_of_lock(lock, store))
     place, query = _place_and_query(text)
-    if _is_collection(place):
-        return _of_collection(text, place, query, engine)
-    store = Store(place, max_spill=max_spill)
+    store = _opened(place, max_spill=max_spill, engine=engine, partial=partial)
     if not query:
         return ChosenFrames(text, store)
     if Path(query).suffix == LOCK and Path(query).is_file():
@@ -310,15 +305,15 @@ _BEFORE_QUERY: Final = re.compile(r":(?![/\d])")
 """The colon before a query, behind a URL, which has colons of its own."""
 
 
-def _of_collection(text: str, url: str, query: str, engine: str) -> ChosenFrames:
+def _opened(
+    place: str, *, max_spill: int = 0, engine: str = "local", partial: bool = False
+) -> Store | Collection:
+    """A store, or a collection; options as :func:`selection_of` takes them."""
+    if not _is_collection(place):
+        return Store(place, max_spill=max_spill)
     from sgstore.collection import Collection
 
-    whole = Collection(url, engine=engine)
-    if Path(query).suffix == LOCK:
-        raise one_store_needed(url, "a lock names frames of one store")
-    if not query:
-        return ChosenFrames(text, whole)
-    return ChosenFrames(text, whole, frames_of(whole, query), whole.find(query).reasons)
+    return Collection(place, engine=engine, partial=partial)
 
 
 def frames_of(store: Store | Collection, query: str, /, **parameters: object) -> Ints:
@@ -333,6 +328,13 @@ def frames_of(store: Store | Collection, query: str, /, **parameters: object) ->
 def traces_of(store: Store | Collection) -> Sequence[StoredTrace | TraceFacts]:
     """The traces of a store, or of a collection, by name."""
     return store.info() if isinstance(store, Store) else store.catalog.traces
+
+
+def recordings_of(store: Store | Collection) -> dict[int, str]:
+    """The digest of the recording of each trace, by its id."""
+    if isinstance(store, Store):
+        return {one.trace_id: one.digest for one in store.info()}
+    return {one["trace_id"]: one["digest"] for one in store.traces()}
 
 
 def periods_of(store: Store | Collection, frame_id: Ints) -> Floats:

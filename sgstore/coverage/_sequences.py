@@ -16,7 +16,14 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.coverage._features import MOST
-from sgstore.coverage._frames import SHARES, ChosenFrames, ReportTable, names_of, share
+from sgstore.coverage._frames import (
+    SHARES,
+    ChosenFrames,
+    ReportTable,
+    names_of,
+    share,
+    traces_of,
+)
 from sgstore.errors import ConfigError
 from sgstore.lang import parse, pattern_named, patterns
 from sgstore.lang.syntax import MatchClause
@@ -25,6 +32,7 @@ from sgstore.store import SEQ_BITS, trace_of
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from sgstore.collection import Collection
     from sgstore.matches import Interval
     from sgstore.query import Store
     from sgstore.world import Ints
@@ -141,8 +149,8 @@ def _steps(text: str) -> int:
 class _Cast:
     """Who takes part in matches of a store."""
 
-    def __init__(self, store: Store) -> None:
-        self._ids = {trace.name: trace.trace_id for trace in store.info()}
+    def __init__(self, store: Store | Collection) -> None:
+        self._ids = {trace.name: trace.trace_id for trace in traces_of(store)}
         rows = store.file.rows("SELECT trace_id, node_id, kind FROM entities").values
         self._kinds = {(trace, node): kind for trace, node, kind in rows}
         rows = store.file.rows(

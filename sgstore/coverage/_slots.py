@@ -64,7 +64,7 @@ def cells(chosen: ChosenFrames, query: str) -> tuple[tuple[str, ...], dict[tuple
     QueryError
         The query is none, or returns no values.
     """
-    store = chosen.source
+    store = chosen.store
     matches = store.find(query)
     if matches.columns[: len(_FRAME)] != _FRAME:
         matches = store.find(_with_frames(query))
@@ -325,7 +325,7 @@ class _Held:
         if pattern not in self._known:
             there = np.ones(len(self._ids), np.bool_)
             if pattern:
-                there = np.isin(self._ids, frames_of(self._chosen.source, pattern))
+                there = np.isin(self._ids, frames_of(self._chosen.store, pattern))
             self._known[pattern] = there
         return self._known[pattern]
 

@@ -24,11 +24,14 @@ from sgstore.world import tolerance_ns
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
+    from sgstore.collection import Collection, PartedMatches, PartedUnion
     from sgstore.exporters._transforms import Mount
     from sgstore.matches import Matches
     from sgstore.query import Store
     from sgstore.store import StoredTrace
     from sgstore.world import Clip, Ints
+
+    AnyMatches = Matches | PartedMatches | PartedUnion
 
 
 NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,62}")
@@ -86,13 +89,17 @@ class Labels:
 
     @classmethod
     def asked(
-        cls, store: Store, texts: Mapping[str, str], frame_id: Ints, **parameters: object
+        cls,
+        store: Store | Collection,
+        texts: Mapping[str, str],
+        frame_id: Ints,
+        **parameters: object,
     ) -> Labels:
         """Ask a store for the labels of some frames.
 
         Parameters
         ----------
-        store : Store
+        store : Store or Collection
         texts : mapping
             Name → expression or query.
         frame_id : int64
@@ -120,15 +127,16 @@ class Labels:
 
 
 def _asked(
-    store: Store, name: str, text: str, wanted: Ints, parameters: Mapping[str, object]
+    store: Store | Collection, name: str, text: str, wanted: Ints, parameters: Mapping[str, object]
 ) -> np.ndarray[Any, np.dtype[np.object_]]:
     values = np.full(len(wanted), None, object)
     if _QUERY.match(text):
         matches = store.find(text, **parameters)
         if matches.of_match:
             return _over_matches(store, name, matches, wanted)
-        left_out = {store.file.trace(trace).trace_id for trace in matches.left_out}
-        values[~np.isin(trace_of(wanted), list(left_out))] = False
+        traces = _trace_ids(store)
+        left_out = [traces[name] for name in matches.left_out]
+        values[~np.isin(trace_of(wanted), left_out)] = False
         found = np.fromiter((frame.frame_id for frame in matches.frames()), np.int64)
         values[_rows(wanted, found)[1]] = True
         return values
@@ -139,13 +147,20 @@ def _asked(
     return values
 
 
+def _trace_ids(store: Store | Collection) -> dict[str, int]:
+    return {trace.name: trace.trace_id for trace in store.file.catalog().traces}
+
+
 def _over_matches(
-    store: Store, name: str, matches: Matches, wanted: Ints
+    store: Store | Collection,
+    name: str,
+    matches: AnyMatches,
+    wanted: Ints,
 ) -> np.ndarray[Any, np.dtype[np.object_]]:
     """A value of each match in its frames; nothing in the others."""
     values = np.full(len(wanted), None, object)
     taken = np.zeros(len(wanted), np.bool_)
-    traces = {trace.name: trace.trace_id for trace in store.info()}
+    traces = _trace_ids(store)
     for one in matches.intervals():
         (value,) = one.values.values()
         ends = frame_ids(traces[one.trace], np.array([one.start_seq, one.end_seq]))
@@ -160,7 +175,7 @@ def _over_matches(
 
 
 def _answers(
-    store: Store, text: str, wanted: Ints, parameters: Mapping[str, object]
+    store: Store | Collection, text: str, wanted: Ints, parameters: Mapping[str, object]
 ) -> Iterator[tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]]:
     """Rows of frames and values of an expression: of those with an ego, then of those without."""
     value = f"{text}) AS label"
@@ -196,7 +211,9 @@ def _of_expression(error: QueryError, text: str) -> QueryError:
     return QueryError(reason, text=text, span=TextSpan(start, stop), hint=error.hint)
 
 
-def _columns(matches: Matches, wanted: Ints) -> tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]:
+def _columns(
+    matches: AnyMatches, wanted: Ints
+) -> tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]:
     """Rows of the frames that are wanted, and what was found of them."""
     found = matches.numpy()
     of, row = _rows(wanted, found["frame_of_label"].astype(np.int64))

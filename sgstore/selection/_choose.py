@@ -13,7 +13,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.coverage import UNKNOWN, WITHIN_S, ReportTable, classed, expected_classes, names_of
+from sgstore.coverage import (
+    UNKNOWN,
+    WITHIN_S,
+    ReportTable,
+    classed,
+    expected_classes,
+    names_of,
+    recordings_of,
+)
 from sgstore.errors import ConfigError
 from sgstore.locks import lock_of
 from sgstore.selection._cover import affordable, cheapest, has_solver, minimal, within
@@ -612,7 +620,7 @@ def split(selection: Selection, shares: dict[str, float]) -> dict[int, str]:
         Number of unit → name of its part.
     """
     units = selection.units
-    recording = {one.trace_id: one.digest for one in units.chosen.store.info()}
+    recording = recordings_of(units.chosen.store)
     of = [recording[trace] for trace in trace_of(units.first[selection.picked]).tolist()]
     rows = units.rows_of(selection.picked)
     traces, often = np.unique(trace_of(units.frame_id[rows]), return_counts=True)
@@ -657,7 +665,7 @@ def split_table(
         name: np.bincount(code[own][code[own] != UNKNOWN], minlength=len(of.names))
         for name, own in rows.items()
     }
-    digests = {one.trace_id: one.digest for one in units.chosen.store.info()}
+    digests = recordings_of(units.chosen.store)
     columns = ["split", "units", "frames", "share", "wanted", "recordings", "classes"]
     columns += [f"{what}_in_{name}" for name in shares for what in ("classes", "frames")]
     listed: list[tuple[object, ...]] = []

@@ -66,7 +66,7 @@ def features_of(units: Units, rows: Ints) -> Singles:
     told = np.full((len(frames), NEIGHBOURS * wide + 2), np.nan, np.float32)
     told[:, -1] = 0
     for start, part in frames_in_parts(frames):
-        found = units.chosen.store.file.arrays(_sql(), [int(part[0]), int(part[-1])])
+        found = units.chosen.one_store.file.arrays(_sql(), [int(part[0]), int(part[-1])])
         at = np.searchsorted(part, found["frame_id"].astype(np.int64))
         here = part[np.minimum(at, len(part) - 1)] == found["frame_id"].astype(np.int64)
         at, turn = start + at[here], found["place"].astype(np.int64)[here]

@@ -220,7 +220,7 @@ class Prioritized:
         The store is asked at once, and not again.
         """
         sql = "SELECT trace_id, node_id, kind FROM entities"
-        found = self.units.chosen.store.file.rows(sql).values
+        found = self.units.chosen.one_store.file.rows(sql).values
         kinds = {tuple(one): kind for *one, kind in found}
         times = _times(self.units) if self.worst else np.zeros(0)
         return self._told(kinds, times, names_of_units(self.units, self.picked))
@@ -429,7 +429,7 @@ def _worst_of_encounters(units: Units, measures: Sequence[str]) -> dict[str, Wor
     if not measures:
         return {}
     value, other = (np.full((len(measures), len(units.frame_id)), fill) for fill in (np.inf, -1))
-    store = units.chosen.store
+    store = units.chosen.one_store
     sql = "SELECT frame_id, t FROM frames WHERE trace = ? ORDER BY t"
     here = set(trace_of(units.frame_id[units.asked]).tolist())
     for trace in [one for one in store.file.traces() if one.trace_id in here]:
@@ -481,7 +481,7 @@ def _worst_of_pairs(
     """  # noqa: S608  names of ours
     value, other = (np.full((len(measures), len(units.frame_id)), fill) for fill in (np.inf, -1))
     for start, part in frames_in_parts(units.frame_id):
-        found = units.chosen.store.file.arrays(sql, [int(part[0]), int(part[-1])])
+        found = units.chosen.one_store.file.arrays(sql, [int(part[0]), int(part[-1])])
         frame_id = found["frame_id"].astype(np.int64)
         at = np.minimum(np.searchsorted(part, frame_id), len(part) - 1)
         here = part[at] == frame_id
@@ -512,7 +512,7 @@ def _worst_of(units: Units, name: str, frames: Floats, who: Ints) -> WorstValues
 
 def _times(units: Units) -> Floats:
     """(N,): seconds since their traces began, of the frames of units."""
-    found = units.chosen.store.file.arrays("SELECT frame_id, t FROM frames ORDER BY frame_id")
+    found = units.chosen.one_store.file.arrays("SELECT frame_id, t FROM frames ORDER BY frame_id")
     at = np.searchsorted(found["frame_id"].astype(np.int64), units.frame_id)
     return found["t"].astype(np.float64)[at]
 
@@ -579,7 +579,7 @@ def locked_order(
         how["learned"] = order.said[-1]
     how |= {"order": names, "reasons": dict(zip(names, order.reasons(), strict=True))}
     return lock_of(
-        units.chosen.store, units.cases(order.picked), how, payloads=payloads, progress=progress
+        units.chosen.one_store, units.cases(order.picked), how, payloads=payloads, progress=progress
     )
 
 

@@ -62,7 +62,7 @@ def situations(units: Units, rows: Ints) -> tuple[Ints, list[str]]:
     frames, place = np.unique(units.frame_id[rows], return_inverse=True)
     told = Situations(len(frames))
     for start, part in frames_in_parts(frames):
-        found = units.chosen.store.file.arrays(_SQL, [int(part[0]), int(part[-1])])
+        found = units.chosen.one_store.file.arrays(_SQL, [int(part[0]), int(part[-1])])
         ids = found["frame_id"].astype(np.int64)
         at = np.minimum(np.searchsorted(part, ids), len(part) - 1)
         here = part[at] == ids

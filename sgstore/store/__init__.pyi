@@ -64,12 +64,17 @@ from ._rows import count_parquet as count_parquet
 from ._rows import write_csv as write_csv
 from ._rows import write_batches as write_batches
 from ._rows import write_parquet as write_parquet
+from ._similarity import Example as Example
 from ._similarity import SimilarFrames as SimilarFrames
+from ._similarity import example_of as example_of
+from ._similarity import frames_like as frames_like
+from ._similarity import most_like as most_like
 from ._staging import Sealed as Sealed
 from ._traces import FrameRef as FrameRef
 from ._traces import Identity as Identity
 from ._traces import StoredTrace as StoredTrace
 from ._traces import free_name as free_name
+from ._traces import trace_among as trace_among
 from ._traces import trace_id_of as trace_id_of
 from ._verify import verify_file as verify_file
 from ._write import OnMap as OnMap
@@ -83,6 +88,7 @@ __all__ = [
     "Batches",
     "CATALOGUE",
     "DIGEST_BYTES",
+    "Example",
     "Facts",
     "Folder",
     "FrameRef",
@@ -114,8 +120,10 @@ __all__ = [
     "as_told_batches",
     "begins",
     "count_parquet",
+    "example_of",
     "facts_of",
     "frame_ids",
+    "frames_like",
     "free_name",
     "graph_digests",
     "join_bundles",
@@ -127,6 +135,7 @@ __all__ = [
     "merged_file",
     "merged_parts",
     "messages_of",
+    "most_like",
     "names_of_traces",
     "named_as",
     "parquet_rows",
@@ -136,6 +145,7 @@ __all__ = [
     "split_segment",
     "subset_catalogs",
     "take_place",
+    "trace_among",
     "trace_id_of",
     "trace_of",
     "verify_file",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
@@ -224,7 +224,13 @@ def messages_of(file: StoreFile, frame_id: Ints) -> MessagePlaces:
     )
 
 
-def lengths_of_messages(file: StoreFile, frame_id: Ints) -> Iterator[tuple[Ints, Ints]]:
+class FileOfFrames(Protocol):
+    """A store's file, or what asks the bundles of a collection."""
+
+    def arrays(self, sql: str, parameters: Any) -> dict[str, NDArray[Any]]: ...
+
+
+def lengths_of_messages(file: FileOfFrames, frame_id: Ints) -> Iterator[tuple[Ints, Ints]]:
     """Bytes of messages that belong to frames, whose ids ascend; a message once, with its first frame."""
     ends = np.append(np.flatnonzero(np.diff(trace_of(frame_id))) + 1, len(frame_id))
     low = 0

@@ -60,7 +60,6 @@ if TYPE_CHECKING:
     from sgstore.store._locking import Stamp
     from sgstore.store._packing import Columns
     from sgstore.store._rows import ArrowStream, Parameters, UserTablesGiven
-    from sgstore.store._similarity import SimilarFrames
     from sgstore.store._staging import Sealed
     from sgstore.store._verify import Verification
     from sgstore.store._write import Segment
@@ -811,15 +810,6 @@ class StoreFile:
 
             self._abstracted = Abstracted(self.path, self.access)
         return self._abstracted
-
-    def like(
-        self, ref: int | str, abstraction: str, ignored: Sequence[str], limit: int, **how: bool
-    ) -> list[SimilarFrames]:
-        """Frames like another; see :func:`sgstore.store._similarity.frames_like`."""
-        from sgstore.store._similarity import frames_like
-
-        with translated(self.path):
-            return frames_like(self.access, ref, abstraction, ignored, limit, **how)
 
     @property
     def deriving(self) -> Deriving:

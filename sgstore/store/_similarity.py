@@ -20,17 +20,25 @@ from sgstore.abstractions import (
 )
 from sgstore.errors import AbstractionError
 from sgstore.store._graphs import Graphs
+from sgstore.store._locking import translated
 from sgstore.store._traces import FrameRef, frame_named, stored_traces
-from sgstore.vocabulary import RELATION_ALIASES, RELATIONS, kinds_labelled, labels, suggestion
+from sgstore.vocabulary import (
+    RELATION_ALIASES,
+    RELATIONS,
+    kinds_labelled,
+    labels,
+    natural,
+    suggestion,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
 
     from sgstore.abstractions import Labelled
-    from sgstore.store._locking import Access
+    from sgstore.store._file import StoreFile
     from sgstore.store._traces import StoredTrace
 
 
@@ -79,36 +87,47 @@ class _FrameRun:
     features: Counter[str]
 
 
+@dataclass(frozen=True, slots=True)
+class Example:
+    """What frames are compared with: plain values, which a store elsewhere understands.
+
+    Attributes
+    ----------
+    features : dict of str to int
+        How often which features are there; without what is ignored.
+    graph_class : str or None
+        Its class; ``None``: so symmetric that it was given up.
+    trace_id : int
+    beside : (int, int)
+        The first and the last frame around it, itself among them, by their numbers in its trace.
+    abstraction : str
+    ignored : list of str
+    """
+
+    features: dict[str, int]
+    graph_class: str | None
+    trace_id: int
+    beside: tuple[int, int]
+    abstraction: str
+    ignored: list[str]
+
+
 BESIDE_S: Final = 5.0
 """Frames of the same trace that are nearer than this are beside an example, and like it for that reason; s."""
 
 
-def frames_like(
-    access: Access,
-    ref: int | str,
-    name: str,
-    ignored: Sequence[str],
-    limit: int,
-    *,
-    each_trace: bool = False,
-) -> list[SimilarFrames]:
-    """Runs of frames, the most like an example first, then in the order of the store.
-
-    Memory does not grow with the store: graphs are read window by window.
+def example_of(file: StoreFile, ref: int | str, name: str, ignored: Sequence[str]) -> Example:
+    """A frame as an example.
 
     Parameters
     ----------
-    access : Access
+    file : StoreFile
     ref : int or str
-        The example, as :meth:`sgstore.store.StoreFile.frame` takes it.
+        As :meth:`sgstore.store.StoreFile.frame` takes it.
     name : str
         The abstraction whose graphs are compared.
     ignored : sequence of str
         Labels and relations that do not count; see :func:`sgstore.abstractions._features.without`.
-    limit : int
-        How many runs to give.
-    each_trace : bool
-        Whether only the best run of each trace counts, and frames beside the example do not.
 
     Raises
     ------
@@ -117,21 +136,58 @@ def frames_like(
     AbstractionError
         There is no such abstraction, or nothing of it is called as what is to be ignored.
     """
-    abstraction, graphs = abstraction_named(name), Graphs()
-    with access.reading() as connection:
+    abstraction = abstraction_named(name)
+    with translated(file.path), file.access.reading() as connection:
         frame = frame_named(connection, ref)
-        _, seen = graphs.of_frames(connection, frame.frame_id, frame.frame_id)
-        whole = abstraction.function(seen)
-        _check(ignored, whole)
-        search = _RunSearch(without(whole, ignored), max(limit, 0), each_trace=each_trace)
+        _, seen = Graphs().of_frames(connection, frame.frame_id, frame.frame_id)
+        beside = _beside(connection, frame)
+    whole = abstraction.function(seen)
+    _check(ignored, whole)
+    example = without(whole, ignored)
+    (own,) = Classes().of(example)
+    features = dict(GraphFeatures.of(example).counts(0))
+    return Example(features, own, frame.trace_id, beside, name, [*ignored])
+
+
+def frames_like(
+    file: StoreFile, example: Example, limit: int, *, each_trace: bool = False
+) -> list[SimilarFrames]:
+    """Runs of frames, the most like an example first, then by name of the trace and time.
+
+    Memory does not grow with the store: graphs are read window by window.
+
+    Parameters
+    ----------
+    file : StoreFile
+    example : Example
+        A frame of this store, or of another one.
+    limit : int
+        How many runs to give.
+    each_trace : bool
+        Whether only the best run of each trace counts, and frames beside the example do not.
+    """
+    abstraction, graphs = abstraction_named(example.abstraction), Graphs()
+    search = _RunSearch(example, max(limit, 0), each_trace=each_trace)
+    first, last = example.beside
+    beside = range(first, last + 1) if each_trace else range(0)
+    with translated(file.path), file.access.reading() as connection:
         traces = stored_traces(connection)
-        beside = _beside(connection, frame) if each_trace else range(0)
         for number, trace in enumerate(traces):
-            left_out = beside if trace.trace_id == frame.trace_id else range(0)
+            left_out = beside if trace.trace_id == example.trace_id else range(0)
             for seq, block in _blocks(connection, graphs, trace, abstraction):
-                search.look(number, seq, without(block, ignored), left_out)
+                search.look(number, seq, without(block, example.ignored), left_out)
         search.close()
         return [_like(connection, run, traces, search.example) for run in search.best()]
+
+
+def most_like(found: Iterable[SimilarFrames], limit: int) -> list[SimilarFrames]:
+    """The first of what several stores found, in the order in which one with all their traces has them."""
+
+    def place(one: SimilarFrames) -> tuple[Any, ...]:
+        likeness = one.similarity + (one.same is True)
+        return -likeness, natural(one.frame.trace), one.frame.seq
+
+    return sorted(found, key=place)[:limit]
 
 
 def _blocks(
@@ -141,21 +197,20 @@ def _blocks(
         yield seq, abstraction.function(seen)
 
 
-def _beside(connection: DuckDBPyConnection, frame: FrameRef) -> range:
+def _beside(connection: DuckDBPyConnection, frame: FrameRef) -> tuple[int, int]:
     """Numbers of the frames around one, itself among them."""
     sql = "SELECT min(seq), max(seq) FROM frames WHERE trace_id = ? AND abs(t - ?) < ?"
     found = connection.execute(sql, [frame.trace_id, frame.t, BESIDE_S]).fetchone()
-    first, last = found or (0, -1)
-    return range(first, last + 1)
+    return found or (0, -1)
 
 
 class _RunSearch:
     """The best runs so far, of all or of each trace, in a heap whose first is the worst of them."""
 
-    def __init__(self, example: Labelled, limit: int, *, each_trace: bool) -> None:
-        self.example = GraphFeatures.of(example).counts(0)
+    def __init__(self, example: Example, limit: int, *, each_trace: bool) -> None:
+        self.example = Counter(example.features)
         self._classes = Classes()
-        (self._class,) = self._classes.of(example)
+        self._class = example.graph_class
         self._limit = limit
         self._each: dict[int, tuple[float, int, int, _FrameRun]] | None = {} if each_trace else None
         self._heap: list[tuple[float, int, int, _FrameRun]] = []

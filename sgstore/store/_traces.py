@@ -19,7 +19,7 @@ from sgstore.vocabulary import natural, suggestion
 from sgstore.world import tolerance_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from datetime import datetime
 
     from duckdb import DuckDBPyConnection
@@ -384,7 +384,12 @@ def trace_named(connection: DuckDBPyConnection, ref: str) -> tuple[int, str]:
     StoreError
         None or several are meant.
     """
-    known = dict(connection.execute("SELECT name, trace_id FROM trace ORDER BY name").fetchall())
+    found = connection.execute("SELECT name, trace_id FROM trace ORDER BY name").fetchall()
+    return trace_among(dict(found), ref)
+
+
+def trace_among(known: Mapping[str, int], ref: str) -> tuple[int, str]:
+    """As :func:`trace_named` among traces whose names and ids are known, in the order of the names."""
     if ref in known:
         return known[ref], ref
     found = [name for name, trace_id in known.items() if str(trace_id) == ref]

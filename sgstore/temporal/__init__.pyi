@@ -17,6 +17,7 @@ from ._monitor import Monitor as Monitor
 from ._followed import RecentGraphs as RecentGraphs
 from ._monitor import opened as opened
 from ._monitor import paced as paced
+from ._plan import kept_throughout as kept_throughout
 from ._robustness import Robustness as Robustness
 from ._sequence_monitor import FrameTime as FrameTime
 from ._sequence_monitor import MonitorEvent as MonitorEvent
@@ -37,6 +38,7 @@ __all__ = [
     "Verdict",
     "Witness",
     "evaluate",
+    "kept_throughout",
     "cell_of",
     "columns_returned",
     "margin_cells",

@@ -1,0 +1,144 @@
+"""Verbs that choose, lock and compare say of a collection what they say of one store."""
+
+from __future__ import annotations
+
+import os
+import random
+import shlex
+from typing import TYPE_CHECKING
+
+import pytest
+from recordings import Recorder, car, person
+from thorough import LONG, some
+
+from sgstore.cli import run
+from sgstore.collection import Collection, pack
+from sgstore.ingest import ingest
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+TRACES = 12 if LONG else 5
+FRAMES = (22, 34) if LONG else (12, 20)
+BUNDLES = {1: TRACES, 3: -(-TRACES // 3), 5: -(-TRACES // 5)}
+"""Bundles → most traces of one."""
+CAR = "'MATCH (e:Ego)-[:near]->(c:Car)'"
+
+VERBS = [
+    *(
+        f"select {{}} {way} --abstraction E --no-payloads -o {{lock}}"
+        for way in (
+            "--minimal --unit clip --clip 1s",
+            f"{CAR} --minimal --combos 2 --unit clip --clip 1s --stride 500ms --objective seconds",
+            "--per-class 2 --unit clip --clip 500ms --split train=0.6,test=0.4",
+            "--rarest --budget 20frames --seed 3",
+            "--stratify 'ego.speed > 10' --per-class 2 --unit clip",
+            "--weakest 'robustness(ego.speed < 11)' --budget 9units",
+            "--weakest 'CHECK ALWAYS ego.speed < 11 ROBUSTNESS' --unit clip",
+            "--weakest 'CHECK EVENTUALLY ego.speed > 11 ROBUSTNESS' --unit trace",
+            "--sequences 1 --manoeuvre 'near=MATCH (e:Ego)-[:near]->(v:Car)' --minimal --unit clip",
+            "--budget 5s --seed 7",
+            "--budget 20kB --unit clip --seed 2",
+        )
+    ),
+    "select {} --minimal --unit trace -o {lock}",
+    f"select {{}} {CAR} --minimal --unit clip --clip 1s --curve",
+    "like {} d2#3",
+    "like {} d2#3 --all --limit 9 --abstraction ER --ignore person --json",
+    "like {} d1 --json",
+    "like {} d3@1.2s --pattern",
+    "like {} d9#2",
+    "diff {} {other} --json",
+    "diff {other} {} --abstraction ER --json",
+    "diff {} {other} --by-frame --json",
+    f"diff {{}} {{other}} --query {CAR} --json",
+    "diff {} {other} --query 'CHECK calm: ALWAYS ego.speed < 11' --require --json",
+    f"diff {{}}:{CAR[1:-1].join(chr(39) * 2)} {{other}} --json",
+    "diff {}:{kept} {} --json",
+    "lock verify {kept} {} --json",
+    "lock verify {moved} {} --json",
+    f"coverage novel {{}} --not-in {{}}:{CAR} --list clips --json",
+    "coverage sequences {} --k 2 --manoeuvre 'near=MATCH (e:Ego)-[:near]->(v:Car)' --json",
+]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    before = os.environ.get("SGSTORE_CACHE")
+    os.environ["SGSTORE_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+    yield
+    os.environ.pop("SGSTORE_CACHE")
+    if before is not None:
+        os.environ["SGSTORE_CACHE"] = before
+
+
+def drives(folder: Path, seed: int, count: int) -> Path:
+    """A store of drives among cars and people, each another one."""
+    rng = random.Random(seed)
+    paths = [folder / f"d{number}.mcap" for number in range(1, count + 1)]
+    for path in paths:
+        ahead, aside = rng.uniform(4, 14), rng.uniform(2, 6)
+        with Recorder(path) as recorder:
+            for i in range(rng.randint(*FRAMES)):
+                v = 8 + i * rng.uniform(0.05, 0.2)
+                moving = [car(7, i * v / 10, v=(v, 0)), car(8, ahead + i * 0.9, v=(9, 0))]
+                moving += [person(9, 12, aside)] if i % 7 < rng.randint(2, 6) else []
+                recorder.ground_truth(i * 0.1, moving, host=7)
+    ingest(folder / "one.sgstore", paths)
+    return folder / "one.sgstore"
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A store, another one, collections of the first, and locks of both."""
+    folder, away = tmp_path_factory.mktemp("drives"), tmp_path_factory.mktemp("others")
+    one, other = drives(folder, 1, TRACES), drives(away, 2, 2)
+    found = {"one": one, "other": other, "lock": folder / "made.lock"}
+    for number, most in BUNDLES.items():
+        place = folder / f"of{number}"
+        pack(one, place, bundle_traces=most)
+        assert len(Collection(place).bundles()) >= min(number, 3)
+        found[str(number)] = place
+    for name, store in (("kept", one), ("moved", other)):
+        found[name] = folder / f"{name}.lock"
+        assert (
+            run(["select", str(store), "--minimal", "--unit", "clip", "-o", str(found[name])]) == 0
+        )
+    return found
+
+
+def words_of(verb: str, places: dict[str, Path], place: Path) -> list[str]:
+    """The words of a command line, as a shell has them."""
+    named = {name: str(path) for name, path in places.items()}
+    return [word.replace("{}", str(place)).format(**named) for word in shlex.split(verb)]
+
+
+@pytest.fixture
+def said(
+    places: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> Callable[[str, str], tuple[int, str, str, bytes]]:
+    """A function that runs a verb on a place: what it ends with, prints, and writes into a lock."""
+
+    def said(verb: str, where: str) -> tuple[int, str, str, bytes]:
+        place, lock = places[where], places["lock"]
+        lock.unlink(missing_ok=True)
+        capsys.readouterr()
+        code = run(words_of(verb, places, place))
+        told = capsys.readouterr()
+        texts = (text.replace(str(place), "PLACE") for text in told)
+        return code, *texts, lock.read_bytes() if lock.exists() else b""
+
+    return said
+
+
+@pytest.mark.parametrize("verb", some(VERBS, 3))
+def test_what_is_said_of_a_collection_is_what_is_said_of_one_store(
+    verb: str, said: Callable[[str, str], tuple[int, str, str, bytes]]
+) -> None:
+    number = VERBS.index(verb)
+    expected = said(verb, "one")
+    asked = BUNDLES if LONG else [[*BUNDLES][number % 3]]
+    assert expected[1] or expected[2]
+    for bundles in asked:
+        assert said(verb, str(bundles)) == expected
