@@ -19,6 +19,7 @@ from sgstore.store import (
     UserTables,
     example_of,
     frames_like,
+    measured,
 )
 from sgstore.vocabulary import normalize_name
 
@@ -799,10 +800,9 @@ class Store:
         """A frame as a pattern in memory sees it, with what it asks that only the store knows."""
         from sgstore.lang import FrameView, events_in, looked_up
 
-        asked = looked_up(query)
         trace = self.file.trace(frame.trace_id)
         about = {f.name: getattr(frame, f.name) for f in fields(frame)} | {"id": frame.frame_id}
-        if asked:
+        if asked := looked_up(query):
             rows = self.file.rows(about_frame(asked), [frame.frame_id])
             about |= {one.attribute.name: v for one, v in zip(asked, rows.values[0], strict=True)}
         whole = {f.name: getattr(trace, f.name) for f in fields(trace)}
@@ -817,7 +817,8 @@ class Store:
             if node in graph.nodes:
                 graph.nodes[node].update(zip(constants.columns[1:], values, strict=True))
         events = events_in(query, frame.frame_id, lambda sql, at: self.file.rows(sql, at).values)
-        return FrameView(graph, about, whole, classes, roles, events)
+        later = partial(measured, self.file.rows, frame.trace_id)
+        return FrameView(graph, about, whole, classes, roles, events, later)
 
 
 def matches_of(

@@ -41,6 +41,7 @@ LAYERS: tuple[frozenset[str], ...] = (
         }
     ),
     frozenset({"mcap", "vocabulary"}),
+    frozenset({"criticality"}),
     frozenset({"abstractions", "config", "files", "graph", "lang", "notes", "roads", "world"}),
     frozenset({"contrib", "opendrive", "relations", "step", "trace_parts", "truth_lanes"}),
     frozenset({"lanelet2", "sumo_net"}),
@@ -52,7 +53,6 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"collection"}),
     frozenset({"demo", "locks", "notebook", "sandbox"}),
     frozenset({"coverage", "pytest_plugin"}),
-    frozenset({"criticality"}),
     frozenset({"assistant", "diff", "selection"}),
     frozenset({"serve"}),
     frozenset({"report"}),

@@ -697,7 +697,7 @@ def test_a_condition_on_a_measure_takes_no_memory_without_bound(town_store: Path
 
 
 def test_measures_over_a_drive_are_what_the_frames_add_up_to(open_town: Store) -> None:
-    tet, recorded = re.findall(r"```sql\n(SELECT trace, .*?)```", PAGE.read_text(), re.DOTALL)
+    tet, recorded, *_ = re.findall(r"```sql\n(SELECT trace, .*?)```", PAGE.read_text(), re.DOTALL)
     seen: dict[tuple[str, int], list[tuple[float, float | None, float]]] = {}
     sql = "SELECT trace, dst, t, ttc, gap FROM criticality JOIN frames USING (frame_id) WHERE src_is_ego"
     for trace, other, *row in open_town.sql(f"{sql} ORDER BY t").values:

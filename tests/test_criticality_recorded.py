@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import math
 import os
+import shutil
+import time
 from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,7 +38,7 @@ from sgstore.criticality import (
     ttc_recorded,
     ttce_recorded,
 )
-from sgstore.errors import ConfigError, QueryError
+from sgstore.errors import ConfigError, QueryError, SqlError, StoreError
 from sgstore.geometry import corners
 from sgstore.selection import PrioritySpec, SelectionUnit, prioritize
 from sgstore.temporal import Monitor
@@ -374,13 +376,120 @@ def test_cases_are_put_in_order_by_what_was_recorded_later(open_town: Store) -> 
     assert f"{order.worst[0].value[order.picked[0]]:.3g} m with" in order.reasons()[0]
 
 
-def test_a_pattern_says_where_measures_of_what_was_recorded_are(open_town: Store) -> None:
-    close = "(e:Ego), (v:Vehicle) WHERE pet(e, v) < 1"
-    rule = f"CHECK ALWAYS NOT EXISTS {{{close}}}"
+def test_patterns_sql_and_the_verb_have_the_measures_of_all_pairs(open_town: Store) -> None:
+    names = [*RECORDED]
+    told = ", ".join(f"{name}(e, v)" for name in names)
+    query = f"MATCH (e:Ego), (v:Entity) RETURN DISTINCT trace.name, e.id, v.id, {told}"
+    patterns = {tuple(row[:3]): tuple(row[3:]) for row in open_town.find(query)}
+    sql = f"SELECT trace, src, dst, {', '.join(names)} FROM encounters"
+    view = {row[:3]: row[3:] for row in open_town.sql(sql).values}
+    verb = {row[:3]: row[4:] for row in recorded(open_town).values}
 
-    for ask in (lambda: open_town.find(f"MATCH {close}"), lambda: Monitor(rule)):
-        with pytest.raises(QueryError, match=r"unknown function 'pet'(.|\n)*sgstore criticality"):
-            ask()
+    known = 0
+    assert view == verb
+    for trace in {trace for trace, *_ in verb}:
+        for src, dst, _, of in encounters(open_town, trace):
+            values = [RECORDED[name].value(of) for name in names]
+            wanted = tuple(None if math.isnan(one) else one for one in values)
+            assert view[trace, src, dst] == wanted
+            if (trace, src, dst) in patterns:  # in a frame with the ego
+                assert patterns[trace, src, dst] == wanted
+                known += sum(one is not None for one in wanted)
+    assert known > 100
+    # What stands fast is met by nobody, and so not known.
+    fast = [row for key, row in patterns.items() if key not in view]
+    assert all(set(row) == {None} for row in fast)
+
+
+def test_conditions_on_what_was_recorded_are_those_of_sql(open_town: Store) -> None:
+    rows = recorded(open_town, ["dce_recorded", "tet"]).values
+    close = {(row[0], row[2]) for row in rows if row[4] is not None and row[4] < 2}
+    frames = open_town.sql(
+        """SELECT count(DISTINCT frame_id) FROM pairs p JOIN frames f USING (frame_id)
+        JOIN encounters c ON c.trace = f.trace AND c.src = p.src AND c.dst = p.dst
+        WHERE c.dce_recorded < 2 AND p.distance < 30 AND p.src_is_ego"""
+    ).values[0][0]
+    where = "WHERE dce_recorded(e, v) < 2 AND dist(e, v) < 30"
+
+    found = open_town.find(f"MATCH (e:Ego), (v:Entity) {where}")
+    inside = open_town.find(f"MATCH (e:Ego) WHERE EXISTS {{(v:Entity) {where}}}")
+    ranked = open_town.find(
+        f"MATCH (e:Ego), (v:Entity) {where} RETURN v.id, MIN(dce_recorded(e, v)) OVER match AS d"
+    )
+    rule = "CHECK FORALL (v:Entity) ALWAYS (dist(ego, v) < 30 IMPLIES NOT dce_recorded(ego, v) < 2)"
+
+    assert found.count() == inside.count() == frames > 0
+    assert {row.v_id for row in ranked} <= {dst for _, dst in close}
+    assert all(row.d < 2 for row in ranked)
+    assert any(verdict.violated for verdict in open_town.check(rule))
+    sequence = "MATCH (e:Ego)-[:near]->(v:Vehicle) WHERE dce_recorded(e, v) < 2 THEN MATCH (e)-[:near]->(v)"
+    assert {row.v_id for row in open_town.find(f"{sequence} RETURN v.id")} <= {d for _, d in close}
+
+
+@pytest.fixture
+def copied(town_store: Path, tmp_path: Path) -> Store:
+    """A store of which nothing is worked out already."""
+    return sgstore.open(shutil.copy(town_store, tmp_path / "copy.sgstore"))
+
+
+def test_no_pair_is_worked_out_that_the_rest_of_a_question_excludes(
+    copied: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Encounter] = []
+    monkeypatch.setattr(sgstore.criticality, "et_recorded", lambda of: asked.append(of) or 1.5)
+    query = "MATCH (e:Ego), (v:Vehicle) WHERE {} dist(e, v) < 8 RETURN DISTINCT v.id"
+    near = copied.find(query.format("")).rows()
+
+    found = copied.find(query.format("et_recorded(e, v) < 2 AND")).rows()
+
+    assert {*found} == {*near}
+    assert 0 < len(asked) == len(near) < len(recorded(copied, ["dce_recorded"]).values)
+
+
+def test_a_long_trace_is_read_pair_by_pair(
+    copied: Store, open_town: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sgstore.store._encounters.MOST_STATES", 100)
+    monkeypatch.setattr("sgstore.criticality._encounter._CIRCLES", 3)
+
+    assert recorded(copied).values == recorded(open_town).values
+
+
+def test_measures_end_with_their_statement(copied: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    def slow(_: Encounter) -> float:
+        time.sleep(0.05)
+        return 1.0
+
+    monkeypatch.setattr(sgstore.criticality, "cpi", slow)
+    begin = time.monotonic()
+    sql = "SELECT sum(recorded('cpi', trace_id, dst, src)) FROM encounters"
+    with pytest.raises(SqlError, match="stopped after"):
+        copied.sql(sql, timeout_s=0.3)
+    assert time.monotonic() - begin < 2
+
+    with pytest.raises(StoreError, match=r"no recorded measure: 'ttc'; expected pet"):
+        copied.file.rows("SELECT recorded('ttc', trace_id, src, dst) FROM encounters")
+
+
+def test_a_monitor_refuses_what_is_recorded_later(open_town: Store) -> None:
+    close = "(e:Ego), (v:Vehicle) WHERE pet(e, v) < 1"
+
+    for text in (f"MATCH {close}", f"CHECK ALWAYS NOT EXISTS {{{close}}}"):
+        with pytest.raises(
+            QueryError, match=r"pet\(\) needs what is recorded later, which a monitor"
+        ):
+            Monitor(text)
+    with pytest.raises(QueryError, match=r"pet\(\) takes 2 arguments(.|\n)*post-encroachment time"):
+        open_town.find("MATCH (e:Ego) WHERE pet(e) < 1")
+
+
+def test_why_not_knows_what_was_recorded_later(open_town: Store) -> None:
+    frame = next(open_town.find("MATCH (e:Ego), (v:Vehicle) RETURN FRAMES").frames())
+
+    said = str(open_town.why_not(frame, "MATCH (e:Ego), (v:Vehicle) WHERE dce_recorded(e, v) < -1"))
+
+    assert "FAILS   dce_recorded(e, v) < (-1)" in said
+    assert "found   dce_recorded(e, v) = " in said
 
 
 PAGE = Path(__file__).parents[1] / "docs" / "criticality.md"

@@ -49,19 +49,18 @@ def criticality(
 ) -> None:
     """List measures of what was recorded: PET, TET, CPI, the closest encounter.
 
-    A row is the ego of a trace and one of those that it could meet. As a file it
-    is a table for --with: a view in SQL, and HAPPENS in patterns.
+    A row is the ego of a trace and one of those that it could meet: the view
+    encounters in SQL. In patterns they are functions, as in pet(e, v) < 1.5.
     """
-    from dataclasses import replace
-
+    from sgstore.coverage import ReportTable
     from sgstore.criticality import RECORDED, recorded
 
     found = recorded(bounds.opened(store), tuple(measures or RECORDED))
+    rows = found.values
     if most is not None:
         first = found.columns.index("kind") + 1
-        rows = [row for row in found.rows if row[first] is not None and row[first] <= most]
-        found = replace(found, rows=rows)
-    out.report(found)
+        rows = [row for row in rows if row[first] is not None and row[first] <= most]
+    out.report(ReportTable(found.columns, rows))
 
 
 @dataclass(frozen=True)

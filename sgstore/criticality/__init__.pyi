@@ -14,16 +14,21 @@ from ._exposure import tit as tit
 from ._headway import headway_recorded as headway_recorded
 from ._potential import cpi as cpi
 from ._potential import crash_probability as crash_probability
+from ._recorded import FIXED_KINDS as FIXED_KINDS
 from ._recorded import RECORDED as RECORDED
+from ._recorded import TRACKS as TRACKS
 from ._recorded import RecordedMeasure as RecordedMeasure
 from ._recorded import encounters as encounters
 from ._recorded import recorded as recorded
+from ._recorded import tracks_of as tracks_of
 
 __all__ = [
     "Encounter",
     "Encroachment",
+    "FIXED_KINDS",
     "RECORDED",
     "RecordedMeasure",
+    "TRACKS",
     "Track",
     "cpi",
     "crash_probability",
@@ -36,6 +41,7 @@ __all__ = [
     "recorded",
     "tet",
     "tit",
+    "tracks_of",
     "ttc_recorded",
     "ttce_recorded",
 ]

@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 
 _BLOCK: Final = 16
 """States that are bounded by one circle."""
+_CIRCLES: Final = 1 << 20
+"""Pairs of such circles whose distances are looked at together."""
 _TOGETHER: Final = 256
-"""Pairs of such circles that are looked into at once."""
+"""Pairs of circles that are looked into at once."""
 
 
 @dataclass(frozen=True)
@@ -94,18 +96,25 @@ class Encounter:
         if not self.known:
             return
         (x1, y1, r1), (x2, y2, r2) = self.a.circles, self.b.circles
-        near = np.hypot(x1[:, None] - x2, y1[:, None] - y2) <= (r1[:, None] + r2) * (1 + 1e-9)
-        blocks_a, blocks_b = np.nonzero(near)
+        step = max(_CIRCLES // max(len(x2), 1), 1)
+        for first in range(0, len(x1), step):
+            some = slice(first, first + step)
+            away = np.hypot(x1[some, None] - x2, y1[some, None] - y2)
+            blocks_a, blocks_b = np.nonzero(away <= (r1[some, None] + r2) * (1 + 1e-9))
+            for start in range(0, len(blocks_a), _TOGETHER):
+                part = slice(start, start + _TOGETHER)
+                yield self._touching(first + blocks_a[part], blocks_b[part])
+
+    def _touching(self, blocks_a: Ints, blocks_b: Ints) -> tuple[Ints, Ints]:
+        """Rows of a and of b, of some pairs of blocks, whose footprints overlap or touch."""
         inner = np.arange(_BLOCK)
-        for start in range(0, len(blocks_a), _TOGETHER):
-            part = slice(start, start + _TOGETHER)
-            rows_a = (blocks_a[part, None] * _BLOCK + inner)[:, :, None]
-            rows_b = (blocks_b[part, None] * _BLOCK + inner)[:, None, :]
-            rows_a, rows_b = (one.ravel() for one in np.broadcast_arrays(rows_a, rows_b))
-            there = (rows_a < len(self.a)) & (rows_b < len(self.b))
-            rows_a, rows_b = rows_a[there], rows_b[there]
-            on = _touch(self.a.states[rows_a], self.b.states[rows_b])
-            yield rows_a[on], rows_b[on]
+        rows_a = (blocks_a[:, None] * _BLOCK + inner)[:, :, None]
+        rows_b = (blocks_b[:, None] * _BLOCK + inner)[:, None, :]
+        rows_a, rows_b = (one.ravel() for one in np.broadcast_arrays(rows_a, rows_b))
+        there = (rows_a < len(self.a)) & (rows_b < len(self.b))
+        rows_a, rows_b = rows_a[there], rows_b[there]
+        on = _touch(self.a.states[rows_a], self.b.states[rows_b])
+        return rows_a[on], rows_b[on]
 
 
 def _touch(a: Floats, b: Floats) -> Bools:

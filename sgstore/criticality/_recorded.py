@@ -1,30 +1,21 @@
-"""The recorded measures of a store: the ego with each of those that it could meet, trace by trace."""
+"""The recorded measures by name, and those of a store: the ego with each of those that it could meet."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
-import numpy as np
-
-from sgstore.coverage import ReportTable
-from sgstore.criticality._closest import dce_recorded, ttce_recorded
-from sgstore.criticality._collision import ttc_recorded
-from sgstore.criticality._encounter import Encounter, Track
-from sgstore.criticality._encroachment import et_recorded, pet
-from sgstore.criticality._exposure import tet, tit
-from sgstore.criticality._headway import headway_recorded
-from sgstore.criticality._potential import cpi
+from sgstore.arrays import np
 from sgstore.errors import ConfigError
 from sgstore.quoting import literal
+from sgstore.records import dataclass
 from sgstore.vocabulary import MAP_KINDS, SIGNALS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
-    from sgstore.query import Store
-    from sgstore.world import Floats
+    from sgstore.criticality._encounter import Encounter, Track
 
 _FIXED: Final = (*MAP_KINDS, *SIGNALS, "building", "pole", "barrier", "vegetation")
 _STATES: Final = (
@@ -33,30 +24,35 @@ _STATES: Final = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class RecordedMeasure:
-    """A measure of an encounter.
+    """A measure of an encounter: the function of this room that is called so.
 
     Attributes
     ----------
+    name : str
     doc, unit : str
-    of : callable
-        Its value, or its values in the frames that have both.
     least : bool
         Whether the least of the values in the frames is that of the encounter, and not the first one.
     worse : str
         Which values are the more critical ones: ``low`` or ``high``; empty: neither.
     """
 
+    name: str
     doc: str
     unit: str
-    of: Callable[[Encounter], float | Floats]
     least: bool = False
     worse: str = "low"
 
+    @property
+    def meaning(self) -> str:
+        """The documentation in one line."""
+        return f"{self.doc}; {self.unit}; of what was recorded: the same in each frame of a trace"
+
     def value(self, encounter: Encounter) -> float:
         """The value of an encounter; NaN: not known, or there is none."""
-        found = np.atleast_1d(self.of(encounter))
+        of = getattr(import_module("sgstore.criticality"), self.name)
+        found = np.atleast_1d(of(encounter))
         if self.least:
             found = found[~np.isnan(found)]
             return float(found.min()) if len(found) else math.nan
@@ -64,43 +60,99 @@ class RecordedMeasure:
 
 
 RECORDED: Final = {
-    "pet": RecordedMeasure(
-        "post-encroachment time: from when one has left the area that both drive over to when the other one"
-        " comes into it",
-        "s",
-        pet,
-    ),
-    "et_recorded": RecordedMeasure(
-        "encroachment time: how long a is in that area", "s", et_recorded, worse="high"
-    ),
-    "ttc_recorded": RecordedMeasure(
-        "time until the footprints first touch, from the first frame that has both on",
-        "s",
-        ttc_recorded,
-    ),
-    "headway_recorded": RecordedMeasure(
-        "least time until a has come to where b is now", "s", headway_recorded, least=True
-    ),
-    "dce_recorded": RecordedMeasure("least gap", "m", dce_recorded),
-    "ttce_recorded": RecordedMeasure(
-        "time until the least gap, from the first frame that has both on",
-        "s",
-        ttce_recorded,
-        worse="",
-    ),
-    "tet": RecordedMeasure("time exposed to a ttc of at most 2 s", "s", tet, worse="high"),
-    "tit": RecordedMeasure("the same, weighted by how far below 2 s", "s²", tit, worse="high"),
-    "cpi": RecordedMeasure(
-        "crash potential index: mean probability that braking would not suffice",
-        "share",
-        cpi,
-        worse="high",
-    ),
+    one.name: one
+    for one in (
+        RecordedMeasure(
+            "pet",
+            "post-encroachment time: from when one has left the area that both drive over to when the other one"
+            " comes into it",
+            "s",
+        ),
+        RecordedMeasure(
+            "et_recorded", "encroachment time: how long a is in that area", "s", worse="high"
+        ),
+        RecordedMeasure(
+            "ttc_recorded",
+            "time until the footprints first touch, from the first frame that has both on",
+            "s",
+        ),
+        RecordedMeasure(
+            "headway_recorded", "least time until a has come to where b is now", "s", least=True
+        ),
+        RecordedMeasure("dce_recorded", "least gap", "m"),
+        RecordedMeasure(
+            "ttce_recorded",
+            "time until the least gap, from the first frame that has both on",
+            "s",
+            worse="",
+        ),
+        RecordedMeasure("tet", "time exposed to a ttc of at most 2 s", "s", worse="high"),
+        RecordedMeasure("tit", "the same, weighted by how far below 2 s", "s²", worse="high"),
+        RecordedMeasure(
+            "cpi",
+            "crash potential index: mean probability that braking would not suffice",
+            "share",
+            worse="high",
+        ),
+    )
 }
 """Measures by name."""
 
 
-def encounters(store: Store, trace: str) -> Iterator[tuple[int, int, str, Encounter]]:
+_FRAMES: Final = 2**24
+"""Ids that frames of one trace may have: a range, by which the database finds them."""
+FIXED_KINDS: Final = f"({', '.join(map(literal, _FIXED))})"
+"""Kinds of what nobody meets, because it stands fast, as SQL has them."""
+
+_columns = ", ".join(f"{column}::DOUBLE AS s{i}" for i, column in enumerate(_STATES))
+TRACKS: Final = f"""
+  SELECT n.node_id, n.kind::VARCHAR AS kind, n.is_ego, f.t, {_columns}
+  FROM nodes n JOIN frames f USING (frame_id)
+  WHERE n.frame_id BETWEEN $1::BIGINT * {_FRAMES} AND $1::BIGINT * {_FRAMES} + {_FRAMES - 1}
+    AND n.kind NOT IN {FIXED_KINDS}"""  # noqa: S608  names of ours
+"""The statement for the states of a trace of which :func:`tracks_of` makes tracks."""
+
+
+def tracks_of(found: Mapping[str, Any]) -> list[tuple[int, str, bool, Track]]:
+    """Tracks of entities, by node id: with the kind, and whether it is ever the ego.
+
+    Parameters
+    ----------
+    found : mapping of str to array
+        The columns of :data:`TRACKS`, in any order of rows.
+    """
+    from sgstore.criticality._encounter import Track
+
+    order = np.lexsort((np.asarray(found["t"]), np.asarray(found["node_id"])))
+    node = np.asarray(found["node_id"]).astype(np.int64)[order]
+    rows = np.empty((len(node), len(_STATES)))
+    for i in range(len(_STATES)):
+        rows[:, i] = np.ma.filled(np.ma.asarray(found[f"s{i}"]).astype(np.float64), np.nan)[order]
+    times = np.asarray(found["t"]).astype(np.float64)[order]
+    ego = np.ma.filled(np.ma.asarray(found["is_ego"]).astype(np.bool_), fill_value=False)[order]
+    kinds = np.asarray(found["kind"])
+    begins = np.flatnonzero(np.diff(node, prepend=node[:1] - 1)).tolist()
+    spans = zip(begins, [*begins[1:], len(node)], strict=True) if begins else ()
+    return [
+        (int(node[i]), str(kinds[order[i]]), bool(ego[i:j].any()), Track(times[i:j], rows[i:j]))
+        for i, j in spans
+    ]
+
+
+class _Asked(Protocol):
+    """The file of a store, as far as it is asked here."""
+
+    def arrays(self, sql: str, parameters: Sequence[object] | None = None) -> Mapping[str, Any]: ...
+    def rows(self, sql: str) -> Any: ...
+    def trace(self, ref: int | str) -> Any: ...
+
+
+class _Store(Protocol):
+    @property
+    def file(self) -> _Asked: ...
+
+
+def encounters(store: _Store, trace: str) -> Iterator[tuple[int, int, str, Encounter]]:
     """The ego of a trace with each of those that it could meet: node ids of both, the kind, the tracks.
 
     Parameters
@@ -109,36 +161,19 @@ def encounters(store: Store, trace: str) -> Iterator[tuple[int, int, str, Encoun
     trace : str
         Its name.
     """
-    kinds = ", ".join(map(literal, _FIXED))
-    states = ", ".join(f"{column}::DOUBLE AS s{i}" for i, column in enumerate(_STATES))
-    sql = f"""
-      SELECT n.node_id, n.kind::VARCHAR AS kind, n.is_ego, f.t, {states}
-      FROM nodes n JOIN frames f USING (frame_id)
-      WHERE f.trace = ? AND n.kind NOT IN ({kinds}) ORDER BY n.node_id, f.t
-    """  # noqa: S608  names of ours
-    found = store.file.arrays(sql, [trace])
-    node = np.asarray(found["node_id"]).astype(np.int64)
-    rows = np.stack(
-        [
-            np.ma.filled(np.ma.asarray(found[f"s{i}"]).astype(np.float64), np.nan)
-            for i in range(len(_STATES))
-        ],
-        axis=1,
-    )
-    times = np.asarray(found["t"]).astype(np.float64)
-    ego = np.ma.filled(np.ma.asarray(found["is_ego"]).astype(np.bool_), fill_value=False)
-    begins = np.flatnonzero(np.diff(node, prepend=node[:1] - 1)) if len(node) else np.zeros(0, int)
-    spans = list(zip(begins.tolist(), [*begins[1:].tolist(), len(node)], strict=True))
-    tracks = [(int(node[i]), str(found["kind"][i]), Track(times[i:j], rows[i:j])) for i, j in spans]
-    for (own, _, track), (i, j) in zip(tracks, spans, strict=True):
-        if ego[i:j].any():
-            for other, kind, met in tracks:
-                if other != own:
-                    yield own, other, kind, Encounter(track, met)
+    from sgstore.criticality._encounter import Encounter
+
+    tracks = tracks_of(store.file.arrays(TRACKS, [store.file.trace(trace).trace_id]))
+    for own, _, is_ego, track in tracks:
+        for other, kind, _, met in tracks if is_ego else ():
+            if other != own:
+                yield own, other, kind, Encounter(track, met)
 
 
-def recorded(store: Store, measures: Sequence[str] = tuple(RECORDED)) -> ReportTable:
+def recorded(store: _Store, measures: Sequence[str] = tuple(RECORDED)) -> Any:
     """Recorded measures of each ego with each of those that it could meet; a row for each pair and trace.
+
+    They are those of the view ``encounters``.
 
     Parameters
     ----------
@@ -148,7 +183,7 @@ def recorded(store: Store, measures: Sequence[str] = tuple(RECORDED)) -> ReportT
 
     Returns
     -------
-    ReportTable
+    Rows
         ``trace``, ``src``, ``dst``, ``kind``, and each measure. ``None``: not known, or there is none.
 
     Raises
@@ -159,10 +194,5 @@ def recorded(store: Store, measures: Sequence[str] = tuple(RECORDED)) -> ReportT
     wrong = next((name for name in measures if name not in RECORDED), None)
     if wrong is not None:
         raise ConfigError(f"no recorded measure: {wrong!r}; expected some of {', '.join(RECORDED)}")
-    rows: list[tuple[Any, ...]] = []
-    for trace in store.traces():
-        for own, other, kind, encounter in encounters(store, trace.name):
-            values = [RECORDED[name].value(encounter) for name in measures]
-            told = [None if math.isnan(value) else value for value in values]
-            rows.append((trace.name, own, other, kind, *told))
-    return ReportTable(("trace", "src", "dst", "kind", *measures), rows)
+    columns = ", ".join(("trace", "src", "dst", "kind", *measures))
+    return store.file.rows(f"SELECT {columns} FROM encounters ORDER BY trace_id, src, dst")  # noqa: S608  names of ours

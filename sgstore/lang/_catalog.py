@@ -16,6 +16,7 @@ from enum import StrEnum
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.criticality import RECORDED
 from sgstore.pair_numbers import PAIR_FUNCTIONS
 from sgstore.records import dataclass
 from sgstore.vocabulary import (
@@ -556,8 +557,8 @@ PAIR_NAMES: Final[Mapping[str, str]] = {
     for name, one in PAIR_FUNCTIONS.items()
     for word in (name, one.column, one.alias)
     if word
-}
-"""The functions of two entities by folded name, aliases included."""
+} | {normalize_name(name): name for name in RECORDED}
+"""The functions of two entities by folded name, aliases included, and measures of what was recorded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -693,6 +694,8 @@ class Catalog:
     part : bool
         Whether the store is a part of a collection. Then a dataset, an ego or a derived set that it has not is
         one that other parts have, and what is counted over all parts is given as a table.
+    online : bool
+        Whether frames come one by one, so that nothing later is known.
     """
 
     edges: Mapping[Triple, int] = field(default_factory=dict[Triple, int])
@@ -718,6 +721,7 @@ class Catalog:
         default_factory=dict[Any, frozenset[int]], compare=False, repr=False
     )
     part: bool = False
+    online: bool = False
 
     def under(self, abstraction: str) -> Catalog | None:
         """Return the catalog under an abstraction, in any spelling; ``None`` if there is none of that name."""

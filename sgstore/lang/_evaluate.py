@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
+from sgstore.criticality import RECORDED
 from sgstore.lang import ir as b
 from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit, Type
 from sgstore.lang._operators import OPERATORS, Column
@@ -58,6 +59,8 @@ class FrameView:
     events : mapping, optional
         What has happened in the frame, and to whom: by kind, or by the name of a user's own table. By default
         what the graph says.
+    recorded : callable, optional
+        Gives a measure of what was recorded later, of two nodes. Without it none is known.
     """
 
     graph: SceneGraph
@@ -66,6 +69,7 @@ class FrameView:
     classes: Callable[[str], str | None] | None = None
     roles: Callable[[], Mapping[int, str]] | None = None
     events: Mapping[str, Sequence[NodePair]] | None = None
+    recorded: Callable[[str, int, int], float | None] | None = None
 
     @cached_property
     def nodes(self) -> Mapping[int, Attributes]:
@@ -145,6 +149,8 @@ class FrameView:
         """A number of a pair of entities; ``None`` where something that it needs is missing."""
         if name in WAYS:
             return self._by_lanes(name, one, other)
+        if name in RECORDED:
+            return self.recorded(name, one, other) if self.recorded else None
         place = self.rows.get(other)
         if place is None or one not in self.rows:
             return None
@@ -489,7 +495,9 @@ def _of_crowd(part: b.Bound, key: str) -> Columns[Asked] | None:
                 return _of_others(part)
             name, truth = attribute.name, attribute.type is Type.boolean
             return lambda asked: asked[1].attribute(asked[0].view, name, truth=truth)
-        case b.PairNumber(function=function, a=one, b=other) if function not in WAYS:
+        case b.PairNumber(function=function, a=one, b=other) if (
+            function not in WAYS | RECORDED.keys()
+        ):
             if key not in {one, other}:
                 return _of_others(part)
             if one == other:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, NoReturn
 
+from sgstore.criticality import RECORDED
 from sgstore.errors import QueryError
 from sgstore.lang import ir as b
 from sgstore.lang import syntax as s
@@ -45,7 +46,7 @@ _COURSES: Final = (
 _TEMPORAL: Final = frozenset(map(normalize_name, _COURSES))
 FUNCTIONS: Final = frozenset(
     {
-        *(*PAIR_FUNCTIONS, *OF_ONE, *NUMERIC, *EXTREMES, *OF_TWO),
+        *(*PAIR_FUNCTIONS, *RECORDED, *OF_ONE, *NUMERIC, *EXTREMES, *OF_TWO),
         *(*_OTHERS, *AGGREGATES, *_COURSES),
     }
 )
@@ -144,7 +145,9 @@ def _expect(e: s.Call, low: int, high: int, names: SymbolTable) -> None:
 def _signature(name: str) -> str | None:
     """Return the signature and the meaning of a function of two entities or of a library predicate."""
     if name in PAIR_NAMES:
-        return f"{PAIR_NAMES[name]}(a, b): {PAIR_FUNCTIONS[PAIR_NAMES[name]].meaning}"
+        function = PAIR_NAMES[name]
+        about = PAIR_FUNCTIONS.get(function) or RECORDED[function]
+        return f"{function}(a, b): {about.meaning}"
     found = predicates().get(name)
     if found is None:
         return None
@@ -155,6 +158,12 @@ def _signature(name: str) -> str | None:
 def _pair(e: s.Call, names: SymbolTable) -> b.PairNumber:
     _expect(e, 2, 2, names)
     function = PAIR_NAMES[normalize_name(e.name)]
+    if function in RECORDED and names.session.online:
+        names.session.refuse(
+            f"{function}() needs what is recorded later, which a monitor cannot know",
+            e.span,
+            "ask a store: sgstore find, sgstore check; what looks ahead from one frame is ttc, pret, dce",
+        )
     if function == LANE_DIST:
         _refuse_sort(e, names)
     keys = [_entity(function, argument, names) for argument in e.arguments]

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from sgstore.criticality import RECORDED
 from sgstore.lang import ir as b
 from sgstore.lang._catalog import (
     NODE_ATTRIBUTES,
@@ -307,7 +308,7 @@ def _of_each(
     return {need for e in expressions for need in _needed(e, nodes, strict=strict)}
 
 
-def _needed(  # noqa: C901, PLR0911 - a case each
+def _needed(  # noqa: C901, PLR0911, PLR0912 - a case each
     expression: b.Bound, nodes: Mapping[str, b.Node], *, strict: bool
 ) -> set[Need]:
     """Return the needs of an expression; ``strict``: of all its parts, even if fewer were enough."""
@@ -333,6 +334,8 @@ def _needed(  # noqa: C901, PLR0911 - a case each
         case b.NodeAttribute(node=node, attribute=attribute):
             return of_node(node, attribute.name)
         case b.PairNumber(function=function, a=one, b=other):
+            if function in RECORDED:  # it is unknown where it needs more than the trace has
+                return set()
             told = function if function in COURSES else "ways"
             of_map = {Need("", None, None, lanes=told)} if function in WAYS else set[Need]()
             of_two = zip((one, other), columns_needed(function), strict=True)

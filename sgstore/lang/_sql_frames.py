@@ -56,7 +56,7 @@ from sgstore.lang._sql_masks import (
     told_kinds,
     with_blocks,
 )
-from sgstore.lang._sql_ways import WayEnd, way_text
+from sgstore.lang._sql_ways import LOOKED_UP, WayEnd, of_later, recorded_text, way_text
 from sgstore.lang.ir import (
     BlockValue,
     Bound,
@@ -90,7 +90,9 @@ Part = tuple[str, str, str]
 
 def _pairs(found: Iterable[Leaf]) -> list[PairNumber]:
     """The numbers of pairs among values that are computed in layers."""
-    return [leaf for leaf in found if isinstance(leaf, PairNumber) and leaf.function not in WAYS]
+    return [
+        leaf for leaf in found if isinstance(leaf, PairNumber) and leaf.function not in LOOKED_UP
+    ]
 
 
 @dataclass(slots=True)
@@ -174,6 +176,26 @@ class Layers:
 
     def text(self, values: BoundValues, keys: list[str], wanted: list[Leaf]) -> str:
         """The whole: frame, keys and the values that are wanted."""
+        later = list(dict.fromkeys(of_later(self.needed)))
+        if not later:
+            return self._without_later(values, keys, wanted)
+        last = [c for c in self.conditions if of_later(leaves(c))]
+        self.conditions = [c for c in self.conditions if c not in last]
+        kept = dict.fromkeys([*wanted, *(leaf for c in last for leaf in leaves(c))])
+        ends = dict.fromkeys(quoted(f"{key}.id") for one in later for key in (one.a, one.b))
+        known = [leaf for leaf in kept if leaf not in later]
+        text = self._without_later(values, list(dict.fromkeys([*keys, *ends])), known)
+        told = Select(["*"], [nested(text, ":tested")])
+        told.columns += [named(recorded_text(one), quoted(column_of(one))) for one in later]
+        names = ['"frame_id"', *keys, *(quoted(column_of(leaf)) for leaf in wanted)]
+        final = Select(list(dict.fromkeys(names)), [nested(told.text(), ":recorded")])
+        final.where = [
+            expression_text(c, lambda leaf: quoted(column_of(leaf)), values) for c in last
+        ]
+        return final.text()
+
+    def _without_later(self, values: BoundValues, keys: list[str], wanted: list[Leaf]) -> str:
+        """The same without conditions on what was recorded later."""
         pairs = _pairs(self.needed)
         last = max((self.stage(pair.function, pair.a, pair.b) for pair in pairs), default=0)
         innermost = self.join.select
@@ -614,7 +636,7 @@ def _second_phase(
     if sql.found is not None:
         told |= {leaf: f"{PATTERN}.{quoted(name)}" for leaf, name in sql.found.told.items()}
     for leaf in needed:
-        if not (isinstance(leaf, PairNumber) and leaf.function not in WAYS):
+        if not isinstance(leaf, PairNumber) or leaf.function in WAYS:
             join.texts[leaf] = told.get(leaf) or _value_text(sql, join, scope, given, leaf)
 
 
@@ -798,7 +820,7 @@ def _valued(leaf: Leaf) -> frozenset[str]:
         case NodeAttribute(node=node, attribute=attribute):
             return frozenset() if attribute.unit in _BARE else frozenset({node})
         case PairNumber(function=function, a=a, b=b):
-            return frozenset() if function in WAYS else frozenset({a, b})
+            return frozenset() if function in LOOKED_UP else frozenset({a, b})
         case _:
             return frozenset()
 

@@ -1,4 +1,4 @@
-"""SQL of what is told by lanes: distances to a node, and to the next part of the map of one sort; courses.
+"""SQL of numbers that are looked up: by lanes (distances, courses), and in what was recorded later.
 
 A node is on stretches of lanes: an entity in one place of each of its own lanes, a light or a sign where the
 lanes that it controls are waited on, a part of the map where ``map_place`` has it.
@@ -9,14 +9,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from sgstore.criticality import RECORDED
 from sgstore.lang._kinds import kind_conditions
+from sgstore.lang._plan import TRACE_OF_FRAME
 from sgstore.lang._sql_masks import in_mask
-from sgstore.pair_numbers import COURSES, LANE_DIST, NEXT_PARTS, PART_DIST
-from sgstore.quoting import literal
+from sgstore.lang.ir import PairNumber
+from sgstore.pair_numbers import COURSES, LANE_DIST, NEXT_PARTS, PART_DIST, WAYS
+from sgstore.quoting import literal, quoted
 from sgstore.vocabulary import SIGNALS, entity_kinds
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from sgstore.lang._catalog import Catalog
+    from sgstore.lang._formulas import Leaf
     from sgstore.lang.ir import Kinds
 
 _SIGNALS: Final = frozenset(SIGNALS)
@@ -178,3 +184,20 @@ def _kinds_of(end: WayEnd, alias: str, catalog: Catalog) -> list[str]:
     kinds = end.kinds.only(entity_kinds() - _SIGNALS)
     held = catalog.moving | catalog.fixed
     return kind_conditions(kinds, f'"{alias}"."kind"', f'"{alias}"."is_ego"', held)
+
+
+# What was recorded later ---------------------------------------------------------------------------
+
+LOOKED_UP: Final = WAYS | RECORDED.keys()
+"""Numbers of pairs that are no expressions of values of both."""
+
+
+def of_later(found: Iterable[Leaf]) -> list[PairNumber]:
+    """The measures of what was recorded among values: dear, so that they are asked when all else is tested."""
+    return [leaf for leaf in found if isinstance(leaf, PairNumber) and leaf.function in RECORDED]
+
+
+def recorded_text(value: PairNumber) -> str:
+    """A measure of what was recorded, of the nodes of a row; stores have the function (``_encounters``)."""
+    ends = ", ".join(quoted(f"{key}.id") for key in (value.a, value.b))
+    return f'recorded({literal(value.function)}, "frame_id" >> {TRACE_OF_FRAME}, {ends})'

@@ -89,6 +89,8 @@ class Session:
         Attributes of a client's own, by name.
     part : bool
         Whether the store is a part of a collection: see :attr:`sgstore.lang.Catalog.part`.
+    online : bool
+        Whether nothing later is known.
     dropped : set of str
         Names that a ``WITH`` does not pass on.
     maybe : set of str
@@ -114,6 +116,7 @@ class Session:
     own: Mapping[str, Type] = field(default_factory=dict[str, Type])
     own_edges: Mapping[str, Type] = field(default_factory=dict[str, Type])
     part: bool = False
+    online: bool = False
     dropped: set[str] = field(default_factory=set[str])
     maybe: set[str] = field(default_factory=set[str])
     the_ego: str | None = None
@@ -124,6 +127,7 @@ class Session:
         """Take over what a catalog says of the store that is asked."""
         self.classed, self.tables, self.traces = catalog.classed, catalog.tables, catalog.traces
         self.own, self.own_edges, self.part = catalog.own, catalog.own_edges, catalog.part
+        self.online = catalog.online
 
     def key(self, name: str | None) -> str:
         """A key that is not taken: the name itself if it can be; ``#1``, ``#2``, … for what has none."""

@@ -5,7 +5,8 @@ and ``_schema`` compares it with ``schema.sql`` before anything is read. ``_rows
 too, and makes tables and files of their rows; ``_steps`` lets a signal end them. ``_traces`` finds traces
 and frames by their names, ``_graphs`` reads graphs,
 ``_catalog`` tells the compiler of queries what there is, ``_joins`` brings users' own tables beside
-the store, and ``_contents`` makes digests of frames.
+the store, ``_encounters`` has measures of what was recorded later, and ``_contents`` makes digests
+of frames.
 
 Writing: ``_packing`` turns the graphs of a block into columns and masks. ``_write`` builds a trace aside,
 in arrays that wait in a file of ``_staging``, sorted and summed by ``_columns``; ``_payloads`` joins its

@@ -11,6 +11,7 @@ from ._bundles import parquet_rows as parquet_rows
 from ._bundles import write_bundle as write_bundle
 from ._catalog import relations_of_set as relations_of_set
 from ._catalog import subset_catalogs as subset_catalogs
+from ._encounters import measured as measured
 from ._landed import split_segment as split_segment
 from ._landed import whole_segment as whole_segment
 from ._merge import PartFile as PartFile
@@ -130,6 +131,7 @@ __all__ = [
     "lengths_of_messages",
     "marks",
     "maps_of_traces",
+    "measured",
     "merged_arrays",
     "merged_classes",
     "merged_file",

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import sgstore.store._rows as rows
 from sgstore.arrays import np
 from sgstore.errors import SgstoreError, StoreError, TraceError
+from sgstore.store._encounters import recorded_measures
 from sgstore.store._locking import (
     WAIT_S,
     Access,
@@ -193,21 +194,21 @@ class StoreFile:
         StoreError
             The database refuses it.
         """
-        with self._answered(lambda at, _: rows.run(at, sql, parameters), given) as found:
+        with self._answered(lambda at, _: rows.run(at, sql, parameters), sql, given) as found:
             return found
 
     def arrays(
         self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
     ) -> dict[str, NDArray[np.generic]]:
         """All columns of a statement of ours, as :meth:`rows` takes it; masked where something is NULL."""
-        with self._answered(lambda at, _: rows.arrays(at, sql, parameters), given) as found:
+        with self._answered(lambda at, _: rows.arrays(at, sql, parameters), sql, given) as found:
             return found
 
     def table(
         self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
     ) -> Any:
         """All rows of a statement of ours as Arrow; see :func:`sgstore.store._rows.table_of`."""
-        with self._answered(lambda at, _: rows.table_of(at, sql, parameters), given) as found:
+        with self._answered(lambda at, _: rows.table_of(at, sql, parameters), sql, given) as found:
             return found
 
     @contextmanager
@@ -220,7 +221,7 @@ class StoreFile:
         given: Iterable[Given] = (),
     ) -> Generator[Batches]:
         """Rows of a statement of ours, as :meth:`rows` takes it, ``size`` at a time and never all in memory."""
-        with self._answered(lambda at, _: Batches(at, sql, parameters, size), given) as found:
+        with self._answered(lambda at, _: Batches(at, sql, parameters, size), sql, given) as found:
             yield found
 
     @contextmanager
@@ -228,16 +229,16 @@ class StoreFile:
         self, step: Callable[[DuckDBPyConnection], T], given: Iterable[Given] = ()
     ) -> Generator[T]:
         """Make what a step of ours makes with the connection, after what is made before."""
-        with self._answered(lambda at, _: rows.interruptible(at, lambda: step(at)), given) as found:
-            yield found
+        with self._answered(lambda x, _: rows.interruptible(x, partial(step, x)), "", given) as y:
+            yield y
 
     @contextmanager
     def record_batches(
         self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
     ) -> Generator[ArrowStream | None]:
         """Rows of a statement of ours as a stream of Arrow; see :func:`sgstore.store._rows.record_batches`."""
-        with self._answered(lambda at, _: rows.record_batches(at, sql, parameters), given) as found:
-            yield found
+        with self._answered(lambda x, _: rows.record_batches(x, sql, parameters), sql, given) as y:
+            yield y
 
     def user_sql(
         self,
@@ -299,7 +300,6 @@ class StoreFile:
         )
         if max_rows is not None or not first.truncated:
             return first
-
         return rows.LaterRows(
             first,
             partial(self.user_sql, sql, timeout_s=timeout_s, given=given),
@@ -350,7 +350,7 @@ class StoreFile:
             of = partial(step, connection)
             return until.enter_context(rows.user_statement(connection, sql, timeout_s, of))
 
-        with self._answered(ask, public=True) as found:
+        with self._answered(ask, sql, public=True) as found:
             return found
 
     @contextmanager
@@ -369,7 +369,7 @@ class StoreFile:
             begin = partial(Batches, connection, sql, size=size)
             return until.enter_context(rows.user_statement(connection, sql, timeout_s, begin))
 
-        with self._answered(ask, public=True) as found:
+        with self._answered(ask, sql, public=True) as found:
             yield found
 
     def joined(self) -> dict[str, JoinedTable]:
@@ -865,20 +865,21 @@ class StoreFile:
     def _answered(
         self,
         ask: Callable[[DuckDBPyConnection, ExitStack], T],
+        sql: str,
         given: Iterable[Given] = (),
         *,
         public: bool = False,
     ) -> Generator[T]:
         """Answer of a question, while the store is open.
 
-        If the database fails by a fault of its own, the question is asked again. What it enters into the stack
-        is left with the store.
+        If the database fails by a fault of its own, the question is asked again. Its stack ends with it.
         """
         with ExitStack() as stack:
             while True:
                 try:
                     connection = stack.enter_context(self.access.reading(public=public))
                     with translated(self.path):
+                        stack.enter_context(recorded_measures(connection, self.path, sql))
                         give(connection, given)
                         found = ask(connection, stack)
                     break

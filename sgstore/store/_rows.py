@@ -21,9 +21,10 @@ from sgstore.arrays import np
 from sgstore.errors import ExportError, MissingExtraError, SqlError
 from sgstore.files import without_controls, working_folder, written_at, written_text
 from sgstore.quoting import literal, quoted
+from sgstore.store._encounters import show_recorded
 from sgstore.store._locking import EngineError, engine_fault, spill_fault
 from sgstore.store._schema import INSIDE
-from sgstore.store._steps import interruptible
+from sgstore.store._steps import interrupt, interruptible
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator, Sequence
@@ -459,7 +460,7 @@ def _interrupted_after(connection: DuckDBPyConnection, timeout_s: float | None) 
     def watch() -> None:
         pause = timeout_s
         while not done.wait(pause):
-            connection.interrupt()
+            interrupt(connection)
             pause = 0.01
 
     watcher = threading.Thread(target=watch, daemon=True)
@@ -887,6 +888,7 @@ def give(connection: DuckDBPyConnection, given: Iterable[Given]) -> None:
     """Make tables that nobody but this connection sees, until it is closed."""
     for table in given:
         if isinstance(table, tuple):
+            show_recorded(connection, table[0])
             interruptible(connection, partial(connection.execute, table[0], table[1] or None))
             continue
         columns = ", ".join(f"{quoted(name)} {kind}" for name, kind in table.types.items())

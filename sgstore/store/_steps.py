@@ -58,10 +58,20 @@ def interruptible(connection: DuckDBPyConnection, step: Callable[[], T]) -> T:
         while not task.is_over():
             with suppress(BaseException):  # whoever asks twice does not leave a statement behind
                 task.ended.wait(_AGAIN_S)
-                connection.interrupt()
+                interrupt(connection)
         task.forget()
         raise
     return task.result() if began else step()
+
+
+interrupted: Final[set[int]] = set()
+"""Connections whose statement is to end, by ``id``: DuckDB does not stop functions of ours, so they ask."""
+
+
+def interrupt(connection: DuckDBPyConnection) -> None:
+    """End the statement of a connection."""
+    interrupted.add(id(connection))
+    connection.interrupt()
 
 
 class _Task(Generic[T]):

@@ -257,7 +257,7 @@ class Monitor:
         self._on_event, self._on_step = on_event, on_step
         answers = frozenset(self.generator.answers)
         reach = RelationScope.of(config.as_dict())
-        catalog = Catalog(traces=(TraceFacts(0, trace, "", answers, reach),))
+        catalog = Catalog(traces=(TraceFacts(0, trace, "", answers, reach),), online=True)
         checks, queries = _bound(text, catalog, parameters or {})
         self._egos: list[str] = []
         self._questions: list[QueryCache] = []

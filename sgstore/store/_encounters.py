@@ -1,0 +1,218 @@
+"""Measures of what was recorded later: ``recorded('pet', trace_id, src, dst)`` in SQL, and a view of them.
+
+They need the tracks of two entities, so they are no expression of SQL. DuckDB calls our function for each row
+that the rest of a statement leaves; a pair is worked out once, and kept as long as the file stays as it is. The
+function belongs to an instance of the database, which may have several files; a macro of each connection says
+which one is meant. Both are there only for statements that name them.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import threading
+from collections import OrderedDict
+from contextlib import contextmanager, suppress
+from itertools import count
+from typing import TYPE_CHECKING, Any, Final
+
+import duckdb
+
+from sgstore.criticality import FIXED_KINDS, RECORDED, TRACKS, tracks_of
+from sgstore.errors import ConfigError
+from sgstore.store._lease import stamp_of
+from sgstore.store._schema import INSIDE
+from sgstore.store._steps import interrupted
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Iterable
+    from pathlib import Path
+
+    from duckdb import DuckDBPyConnection
+
+    from sgstore.criticality import Track
+    from sgstore.store._lease import Stamp
+
+MOST_STATES: Final = 1 << 20
+"""States of tracks that are kept; of a trace with more, those of a pair alone are read."""
+MOST_PAIRS: Final = 1 << 20
+"""Pairs whose measures are kept."""
+_FILES: Final = 4
+"""Files of which they are kept."""
+
+_WANTED: Final = re.compile(r"\b(recorded|encounters)\b", re.IGNORECASE)
+_FUNCTION: Final = "sgstore_recorded"
+_TYPES: Final = ["BIGINT", "VARCHAR", "BIGINT", "BIGINT", "BIGINT"]
+_VIEW: Final = f"""
+CREATE TEMP VIEW IF NOT EXISTS encounters AS
+SELECT e.trace_id, t.name AS trace, e.node_id AS src, o.node_id AS dst, o.kind,
+  {", ".join(f"recorded('{name}', e.trace_id, e.node_id, o.node_id) AS {name}" for name in RECORDED)}
+FROM (SELECT DISTINCT frame_id >> 24 AS trace_id, node_id FROM {INSIDE}.state WHERE is_ego) e
+JOIN (
+  SELECT trace_id, node_id, kind FROM {INSIDE}.entity
+  WHERE is_static OR (trace_id, node_id) IN (SELECT DISTINCT frame_id >> 24, node_id FROM {INSIDE}.state)
+) o ON o.trace_id = e.trace_id AND o.node_id <> e.node_id AND o.kind NOT IN {FIXED_KINDS}
+JOIN {INSIDE}.trace t ON t.trace_id = e.trace_id
+"""
+
+
+class _Known:
+    """What is kept of a file: tracks that were read last, and measures of pairs."""
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.tracks: OrderedDict[tuple[int, int], Track | None] = OrderedDict()
+        self.states = 0
+        self.whole: set[int] = set()
+        self.values: dict[tuple[str, int, int, int], float | None] = {}
+
+    def keep(self, trace: int, node: int, track: Track | None) -> None:
+        self.tracks[trace, node] = track
+        self.states += 0 if track is None else len(track)
+
+    def forget(self) -> None:
+        """Let go of all tracks, if there are many."""
+        if self.states > MOST_STATES:
+            self.tracks.clear()
+            self.whole.clear()
+            self.states = 0
+
+
+class _MeasuredQuestion:
+    """A connection whose statement asks for measures.
+
+    Parameters
+    ----------
+    connection : DuckDBPyConnection
+        The one that asks; tracks are read by another one of the same instance.
+    known : _Known
+    """
+
+    def __init__(self, connection: DuckDBPyConnection, known: _Known) -> None:
+        self.asking = connection
+        self._known = known
+        self._reader = connection.cursor()
+        at = connection.execute("SELECT current_database()").fetchall()[0][0]
+        self._reader.execute(f'USE "{at}".{INSIDE}')
+
+    def value(self, measure: str, trace: int, src: int, dst: int) -> float | None:
+        """A measure of a pair; ``None``: not known, or there is none."""
+        if measure not in RECORDED:
+            raise ConfigError(f"no recorded measure: {measure!r}; expected {', '.join(RECORDED)}")
+        key = measure, trace, src, dst
+        known = self._known
+        with known.lock:
+            if key not in known.values:
+                if id(self.asking) in interrupted:
+                    return None
+                if len(known.values) >= MOST_PAIRS:
+                    known.values.clear()
+                known.values[key] = self._worked_out(measure, trace, src, dst)
+            return known.values[key]
+
+    def _worked_out(self, measure: str, trace: int, src: int, dst: int) -> float | None:
+        if src == dst:
+            return None
+        a, b = (self._track(trace, node) for node in (src, dst))
+        if a is None or b is None:
+            return None
+        from sgstore.criticality import Encounter  # with numpy
+
+        value = RECORDED[measure].value(Encounter(a, b))
+        return None if math.isnan(value) else value
+
+    def _track(self, trace: int, node: int) -> Track | None:
+        known = self._known
+        key = trace, node
+        if key not in known.tracks and trace not in known.whole:
+            known.forget()
+            first, last = trace << 24, ((trace + 1) << 24) - 1
+            sql = "SELECT count(*) FROM state WHERE frame_id BETWEEN ? AND ?"
+            ((many,),) = self._reader.execute(sql, [first, last]).fetchall()
+            if many <= MOST_STATES:
+                known.whole.add(trace)
+                found = self._reader.execute(TRACKS, [trace])
+            else:
+                found = self._reader.execute(f"{TRACKS} AND n.node_id = $2", [trace, node])
+                known.keep(trace, node, None)
+            for other, _, _, track in tracks_of(found.fetchnumpy()):
+                known.keep(trace, other, track)
+        return known.tracks.get(key)
+
+    def close(self) -> None:
+        self._reader.close()
+
+
+_tokens = count()
+_questions: Final[dict[int, _MeasuredQuestion]] = {}
+_paths: Final[dict[int, Path]] = {}
+_known: Final[OrderedDict[tuple[Path, Stamp], _Known]] = OrderedDict()
+
+
+def _recorded(token: int, measure: Any, trace: Any, src: Any, dst: Any) -> float | None:
+    asked = _questions.get(token)
+    if asked is None or measure is None or trace is None or src is None or dst is None:
+        return None
+    return asked.value(measure, trace, src, dst)
+
+
+@contextmanager
+def recorded_measures(connection: DuckDBPyConnection, path: Path, sql: str) -> Generator[None]:
+    """Let a connection that reads a file have the measures, if its statement names them, or another one will.
+
+    Parameters
+    ----------
+    connection : DuckDBPyConnection
+    path : Path
+    sql : str
+        The statement. For others :func:`show_recorded` is asked.
+    """
+    _paths[id(connection)] = path
+    try:
+        show_recorded(connection, sql)
+        yield
+    finally:
+        del _paths[id(connection)]
+        interrupted.discard(id(connection))
+        for token, asked in list(_questions.items()):
+            if asked.asking is connection:
+                del _questions[token]
+                asked.close()
+
+
+def show_recorded(connection: DuckDBPyConnection, sql: str) -> None:
+    """Let a connection have the measures and the view, if its statement names them."""
+    path = _paths.get(id(connection))
+    if path is None or _WANTED.search(sql) is None:
+        return
+    if any(asked.asking is connection for asked in list(_questions.values())):
+        return
+    place = path, stamp_of(path)
+    known = _known.setdefault(place, _Known())
+    _known.move_to_end(place)
+    while len(_known) > _FILES:
+        _known.popitem(last=False)
+    token = next(_tokens)
+    _questions[token] = _MeasuredQuestion(connection, known)
+    with suppress(duckdb.CatalogException, duckdb.NotImplementedException):  # it is there
+        # What has side effects is not moved before other conditions.
+        connection.create_function(
+            _FUNCTION, _recorded, _TYPES, "DOUBLE", null_handling="special", side_effects=True
+        )
+    arguments = "measure, trace_id, src, dst"
+    connection.execute(
+        f"CREATE TEMP MACRO recorded({arguments}) AS {_FUNCTION}({token}, {arguments})"
+    )
+    connection.execute(_VIEW)
+
+
+def measured(
+    ask: Callable[[str, list[Any]], Iterable[tuple[Any, ...]]],
+    trace_id: int,
+    measure: str,
+    src: int,
+    dst: int,
+) -> float | None:
+    """A measure of a pair of nodes of a trace, given what answers statements; ``None``: not known."""
+    ((value,),) = ask("SELECT recorded(?, ?, ?, ?)", [measure, trace_id, src, dst])
+    return value
