@@ -166,6 +166,21 @@ def test_the_nearest_frame_does_not_depend_on_blocks(
         assert apart[ids.tolist().index(found[event.detail])] == apart.min()
 
 
+def test_the_first_events_of_a_block_come_with_many_of_the_one_before() -> None:
+    times = np.arange(400) * 100
+    events = [Event("x", int(time), int(time), 0) for time in times for _ in range(60)]
+    happenings, upto = Happenings(7), 201 * 60
+
+    told = [
+        happenings.of(Frames(np.arange(200), times[:200], tuple(events[:upto]))),
+        happenings.of(Frames(np.arange(200, 400), times[200:], tuple(events[upto:]))),
+        happenings.rest(),
+    ]
+
+    found = np.concatenate([columns["frame_id"] for columns in told])
+    assert np.unique(found, return_counts=True)[1].tolist() == [60] * 400
+
+
 def test_a_stamp_of_another_clock_goes_by_log_time() -> None:
     frames = Frames(np.arange(3), np.array([0, 100, 200]) * 1_000_000, ())
     event = Event("collision", 10**18, 110_000_000, 1)

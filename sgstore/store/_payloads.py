@@ -247,8 +247,8 @@ def _no_payload(connection: DuckDBPyConnection, frame: FrameRef, channel: str) -
 
 # Events of a trace → rows, each with the frame that is nearest in time --------------------------
 
-MOST_WAITING: Final = 10_000
-"""Events that wait for the frames to come."""
+MOST_WAITING: Final = 100_000
+"""Events that wait for the frames to come; if there are more, they go to the last frame so far."""
 
 
 class Happenings:
@@ -278,7 +278,7 @@ class Happenings:
         events = [*self._waiting, *frames.events]
         frame = nearest_frames(events, known[0], known[1])
         waits = frame == known.shape[1] - 1
-        if len(events) > MOST_WAITING:
+        if waits.sum() > MOST_WAITING:
             waits[:] = False
         self._waiting = [event for event, wait in zip(events, waits, strict=True) if wait]
         told = [event for event, wait in zip(events, waits, strict=True) if not wait]
