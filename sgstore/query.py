@@ -17,8 +17,6 @@ from sgstore.store import (
     FrameRef,
     StoreFile,
     UserTables,
-    example_of,
-    frames_like,
     measured,
 )
 from sgstore.vocabulary import normalize_name
@@ -467,6 +465,8 @@ class Store:
         AbstractionError
             There is no such abstraction, or nothing is called as what is to be ignored.
         """
+        from sgstore.store import example_of, frames_like
+
         example = example_of(self.file, _ref(frame), abstraction, ignore)
         return frames_like(self.file, example, limit, each_trace=each_trace)
 
