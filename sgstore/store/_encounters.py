@@ -17,6 +17,7 @@ from itertools import count
 from typing import TYPE_CHECKING, Any, Final
 
 import duckdb
+from duckdb.func import FunctionNullHandling
 
 from sgstore.criticality import FIXED_KINDS, RECORDED, TRACKS, tracks_of
 from sgstore.errors import ConfigError
@@ -42,7 +43,6 @@ _FILES: Final = 4
 
 _WANTED: Final = re.compile(r"\b(recorded|encounters)\b", re.IGNORECASE)
 _FUNCTION: Final = "sgstore_recorded"
-_TYPES: Final = ["BIGINT", "VARCHAR", "BIGINT", "BIGINT", "BIGINT"]
 _VIEW: Final = f"""
 CREATE TEMP VIEW IF NOT EXISTS encounters AS
 SELECT e.trace_id, t.name AS trace, e.node_id AS src, o.node_id AS dst, o.kind,
@@ -197,7 +197,12 @@ def show_recorded(connection: DuckDBPyConnection, sql: str) -> None:
     with suppress(duckdb.CatalogException, duckdb.NotImplementedException):  # it is there
         # What has side effects is not moved before other conditions.
         connection.create_function(
-            _FUNCTION, _recorded, _TYPES, "DOUBLE", null_handling="special", side_effects=True
+            _FUNCTION,
+            _recorded,
+            ["BIGINT", "VARCHAR", "BIGINT", "BIGINT", "BIGINT"],
+            "DOUBLE",
+            null_handling=FunctionNullHandling.SPECIAL,
+            side_effects=True,
         )
     arguments = "measure, trace_id, src, dst"
     connection.execute(
