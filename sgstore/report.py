@@ -165,9 +165,9 @@ def _kept(
     told = list(answer(store, {"ask": "check" if is_check else "matches", **question}, most))
     check, found = None, list[Found]()
     if is_check:
-        verdicts = [reply["verdict"] for reply in told if "verdict" in reply]
-        check = {"verdicts": verdicts, **told[-1]}
-        found = [(v["trace"], first, last, {}) for v in verdicts for first, last, *_ in v["spans"]]
+        (check,) = told
+        spans = [(one["trace"], *span) for one in check["verdicts"] for span in one["spans"]]
+        found = [(trace, first, last, {}) for trace, first, last, *_ in spans]
     else:
         found = list(_found(told))
     reads = Reads(store)

@@ -353,7 +353,7 @@ def test_a_trace_that_was_taken_out_meanwhile_has_no_map(
     def nobody(_: object) -> dict[str, Any]:
         return {}
 
-    monkeypatch.setattr(type(page.explorer.store.file), "places", nobody)
+    monkeypatch.setattr(type(page.explorer.stores["a"].file), "places", nobody)
     assert page.get("/api/map", trace="town").status_code == 404
 
 

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import asyncio
+import mimetypes
 import os
 import threading
 import time
 import uuid
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from dataclasses import astuple
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final, TypeVar
-from weakref import WeakSet
 
 from starlette.applications import Starlette
-from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
-from starlette.routing import Route
+from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
 
 from sgstore.errors import QueryError, SgstoreError, SqlError, StoreError
 from sgstore.notes import Note, NotesFile, write_table
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from starlette.types import Receive, Scope, Send
 
     Endpoint = Callable[[Request], Awaitable[Response]]
+    Replies = AsyncGenerator[dict[str, Any]]
 
 T = TypeVar("T")
 
@@ -51,13 +53,6 @@ LONGEST_S: Final = 86_400.0
 MOST_MATCHES: Final = 50_000
 """Matches and rows of a question; the page says if there are more."""
 
-_TYPES: Final = {
-    ".html": "text/html",
-    ".js": "text/javascript",
-    ".css": "text/css",
-    ".svg": "image/svg+xml",
-    ".txt": "text/plain",
-}
 WORKER: Final = "sgstore.serve._worker"
 FIRST: Final = {"ask": "rows", "text": "MATCH (e:Ego) RETURN e.id LIMIT 1", "parameters": {}}
 """What each sandbox is asked first: the language, the catalogue and the database are loaded for it."""
@@ -66,26 +61,20 @@ _NONCE: Final = "{{nonce}}"
 _SCRIPT: Final = "js/main.js"
 
 
+async def _lines(replies: Replies) -> AsyncGenerator[bytes]:
+    """Replies as lines of JSON, as they come."""
+    async for reply in replies:
+        yield as_json(reply) + b"\n"
+
+
+async def _last(replies: Replies) -> AsyncGenerator[bytes]:
+    """The last reply: the whole answer to a question that has one."""
+    *_, last = [reply async for reply in replies]
+    yield as_json(last)
+
+
 class _Answer(StreamingResponse):
-    """Answer that comes in parts; whatever ends it, the browser that has left, too, ends what makes it."""
-
-    def __init__(
-        self, parts: AsyncGenerator[bytes], ended: Callable[[], None], media_type: str
-    ) -> None:
-        super().__init__(parts, media_type=media_type)
-        self._parts, self._ended = parts, ended
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        try:
-            await super().__call__(scope, receive, send)
-        finally:
-            self._ended()
-            with suppress(RuntimeError):  # it runs: then it ends by itself
-                await self._parts.aclose()
-
-
-class _Question:
-    """A question to a sandbox that is under way: its replies, as they come.
+    """Answer that comes in parts; whatever ends it, the browser that has left, too, ends the question.
 
     Parameters
     ----------
@@ -94,16 +83,31 @@ class _Question:
     question : mapping
     key : str
         What it is cancelled by.
+    told : function
+        Makes the bytes that are sent of the replies.
+    media_type : str
     """
 
     def __init__(
-        self, pool: Callable[[], SandboxPool | Errand], question: Mapping[str, Any], key: str
+        self,
+        pool: Callable[[], SandboxPool | Errand],
+        question: Mapping[str, Any],
+        key: str,
+        told: Callable[[Replies], AsyncGenerator[bytes]] = _lines,
+        media_type: str = "application/x-ndjson",
     ) -> None:
+        super().__init__(told(self._replies()), media_type=media_type)
         self._pool, self._question, self._key = pool, question, key
         self._asked: SandboxPool | Errand | None = None
         self._gone = threading.Event()
         self._loop = asyncio.get_running_loop()
         self._found: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self.end()
 
     def ask(self) -> None:
         """Ask, in a thread of its own; an error is a reply."""
@@ -122,8 +126,7 @@ class _Question:
         finally:
             tell(None)
 
-    async def replies(self) -> AsyncGenerator[dict[str, Any]]:
-        """The replies, in order."""
+    async def _replies(self) -> Replies:
         while (reply := await self._found.get()) is not None:
             yield reply
 
@@ -148,10 +151,8 @@ class Explorer:
 
     Attributes
     ----------
-    busy : int
-        Questions and longer pieces of work that are under way.
-    errands : set
-        Processes of those pieces of work.
+    busy : set
+        Answers whose questions are under way.
 
     Raises
     ------
@@ -162,23 +163,18 @@ class Explorer:
     def __init__(
         self, path: Path, *, other: Path | None = None, write_to: Path | None = None
     ) -> None:
-        self.store = Store(path)
-        self.other = Store(other) if other is not None else None
+        self.stores = {"a": Store(path)}
+        if other is not None:
+            self.stores["b"] = Store(other)
         self.write_to = write_to
         self.notes = NotesFile(Path(path))
-        self.reads = {"a": Reads(self.store)}
-        if self.other is not None:
-            self.reads["b"] = Reads(self.other)
+        self.reads = {side: Reads(store) for side, store in self.stores.items()}
         self._stamp = self.notes.stamp()
         self._folder = TemporaryDirectory(prefix="sgstore-notes-")
-        self._pools = {"a": self._pool(path, tables=self._tables())}
-        if other is not None:
-            self._pools["b"] = self._pool(other)
+        self._pools = {side: self._pool(side) for side in self.stores}
         self._threads = ThreadPoolExecutor(MOST_QUESTIONS + 4, "sgstore question")
-        self._counting = threading.Lock()
         self._ended = threading.Event()
-        self.errands = WeakSet[Errand]()
-        self.busy = 0
+        self.busy = set[_Answer]()
 
     def warm(self) -> None:
         """Read maps in a thread of its own, before somebody asks for them."""
@@ -188,24 +184,22 @@ class Explorer:
     def close(self) -> None:
         """End the sandboxes, wait for what is read, and give the stores back."""
         self._ended.set()
-        for errand in tuple(self.errands):
-            errand.cancel()
+        for answer in tuple(self.busy):
+            answer.end()
         for pool in self._pools.values():
             pool.close()
         # The process must not end while a thread is within the database.
         self._threads.shutdown(cancel_futures=True)
         self._folder.cleanup()
-        self.store.close()
-        if self.other is not None:
-            self.other.close()
+        for store in self.stores.values():
+            store.close()
 
-    @staticmethod
-    def _pool(path: Path, tables: Mapping[str, Path] | None = None) -> SandboxPool:
+    def _pool(self, side: str) -> SandboxPool:
         return SandboxPool(
-            path,
+            self.stores[side].file.path,
             timeout_s=TIMEOUT_S,
             max_rows=MOST_MATCHES,
-            tables=tables,
+            tables=self._tables() if side == "a" else {},
             worker=WORKER,
             small=("parts", "why"),
             first=FIRST,
@@ -224,45 +218,27 @@ class Explorer:
         """The sandboxes of a store; those that are asked for tags know all that were written."""
         if side == "a" and "notes" in text.lower() and self._stamp != self.notes.stamp():
             self._stamp = self.notes.stamp()
-            old, self._pools["a"] = (
-                self._pools["a"],
-                self._pool(self.store.file.path, tables=self._tables()),
-            )
+            old, self._pools["a"] = self._pools["a"], self._pool("a")
             self._threads.submit(old.close)
         return self._pools[side]
 
     # What somebody typed -------------------------------------------------------------------------
 
-    def _ask(self, question: Mapping[str, Any], key: str = "", side: str = "a") -> _Question:
-        """A question that is asked from now on.
+    def _answer(self, pool: Callable[[], SandboxPool | Errand], *asked: Any) -> _Answer:
+        """The answer to a question that is asked from now on, in a thread.
 
         Raises
         ------
         RequestError
             There are too many questions under way.
         """
-        pool = partial(self.pool, side, str(question.get("text", "")))
-        asked = _Question(pool, question, key or uuid.uuid4().hex)
-        self._begin(asked.ask)
-        return asked
-
-    def _begin(self, work: Callable[[], None]) -> None:
-        """Have something done in a thread."""
-        with self._counting:
-            if self.busy >= MOST_QUESTIONS:
-                raise RequestError(
-                    f"{MOST_QUESTIONS} questions are under way; try again later", 503
-                )
-            self.busy += 1
-
-        def run() -> None:
-            try:
-                work()
-            finally:
-                with self._counting:
-                    self.busy -= 1
-
-        self._threads.submit(run)
+        if len(self.busy) >= MOST_QUESTIONS:
+            raise RequestError(f"{MOST_QUESTIONS} questions are under way; try again later", 503)
+        answer = _Answer(pool, *asked)
+        self.busy.add(answer)
+        asking = self._threads.submit(answer.ask)
+        asking.add_done_callback(lambda _: self.busy.discard(answer))
+        return answer
 
     async def find(self, request: Request) -> Response:
         """Matches of a pattern, or rows of SQL: lines of JSON, as they come."""
@@ -270,19 +246,18 @@ class Explorer:
         text = fields.text("text")
         kind = "sql" if _is_sql(text) else fields.one_of("ask", "matches", "rows")
         question = {"ask": kind, "text": text, "parameters": fields.parameters()}
-        key, side = fields.text("id", ""), fields.one_of("side", *self._pools)
+        key, side = fields.text("id", "") or uuid.uuid4().hex, fields.one_of("side", *self._pools)
         started = time.perf_counter()
-        asked = self._ask(question, key, side)
 
-        async def lines() -> AsyncGenerator[bytes]:
+        async def timed(replies: Replies) -> Replies:
             about = {"kind": kind}
-            async for reply in asked.replies():
-                yield as_json(about | reply) + b"\n"
+            async for reply in replies:
+                yield about | reply
                 about = {}
-            ms = (time.perf_counter() - started) * 1e3
-            yield as_json({"ms": round(ms, 1)}) + b"\n"
+            yield {"ms": round((time.perf_counter() - started) * 1e3, 1)}
 
-        return _Answer(lines(), asked.end, "application/x-ndjson")
+        pool = partial(self.pool, side, text)
+        return self._answer(pool, question, key, lambda replies: _lines(timed(replies)))
 
     async def cancel(self, request: Request) -> Response:
         """Stop a question."""
@@ -298,16 +273,8 @@ class Explorer:
         if "seq" in question:
             where = question["trace"], question["seq"]
             question["frame"] = await self.threaded(self.reads[side].frame_id, *where)
-        asked = self._ask(question, side=side)
-
-        async def answer() -> AsyncGenerator[bytes]:
-            found = [reply async for reply in asked.replies()]
-            if ask == "check":
-                verdicts = [one.pop("verdict") for one in found if "verdict" in one]
-                found[-1] |= {"verdicts": verdicts}
-            yield as_json(found[-1])
-
-        return _Answer(answer(), asked.end, "application/json")
+        pool = partial(self.pool, side, str(question.get("text", "")))
+        return self._answer(pool, question, uuid.uuid4().hex, _last, "application/json")
 
     # What the page reads by trace and frame --------------------------------------------------------
 
@@ -351,31 +318,13 @@ class Explorer:
         if "name" in question:
             question["to"] = str(self.target(question.pop("name")))
         else:
-            question["other"] = str(self.compared.file.path.absolute())
-        errand = Errand(self.store.file.path, timeout_s=LONGEST_S, memory=1 << 30, worker=WORKER)
-        self.errands.add(errand)
-        asked = _Question(lambda: errand, question, "")
-        self._begin(asked.ask)
-
-        async def lines() -> AsyncGenerator[bytes]:
-            async for reply in asked.replies():
-                yield as_json(reply) + b"\n"
-
-        return _Answer(lines(), asked.end, "application/x-ndjson")
-
-    @property
-    def compared(self) -> Store:
-        """The second store.
-
-        Raises
-        ------
-        RequestError
-            There is none.
-        """
-        if self.other is None:
-            told = "there is no second store; start 'sgstore serve STORE' with --compare OTHER"
-            raise RequestError(told, 404)
-        return self.other
+            if "b" not in self.stores:
+                told = "there is no second store; start 'sgstore serve STORE' with --compare OTHER"
+                raise RequestError(told, 404)
+            question["other"] = str(self.stores["b"].file.path.absolute())
+        path = self.stores["a"].file.path
+        errand = Errand(path, timeout_s=LONGEST_S, memory=1 << 30, worker=WORKER)
+        return self._answer(lambda: errand, question, "")
 
     def target(self, name: str) -> Path:
         """A place below the folder that may be written to.
@@ -398,15 +347,6 @@ async def page_of(request: Request, script: str = "main.js") -> Response:
     text = (PAGE / "index.html").read_text(encoding="utf-8").replace(_SCRIPT, f"js/{script}")
     nonce = request.scope["state"]["nonce"]
     return Response(text.replace(_NONCE, nonce), media_type="text/html")
-
-
-async def given_file(request: Request) -> Response:
-    """A module, a style or a licence of the page."""
-    path = FILES.get(request.path_params["name"])
-    if path is None:
-        return JSONResponse({"reason": "no such file"}, 404)
-    kind = _TYPES[path.suffix]
-    return FileResponse(path, media_type=kind, headers={"cache-control": "no-cache"})
 
 
 _QUESTIONS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -439,18 +379,6 @@ def _is_sql(text: str) -> bool:
     return first in {"SELECT", "WITH", "FROM", "DESCRIBE", "SUMMARIZE", "SHOW"}
 
 
-def _files() -> dict[str, Path]:
-    """Files of the page by what the page calls them; nothing else is given."""
-    return {
-        path.relative_to(PAGE).as_posix(): path
-        for path in sorted(PAGE.rglob("*"))
-        if path.suffix in _TYPES and path.is_file()
-    }
-
-
-FILES: Final = _files()
-
-
 def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: str) -> Guard:
     """The ASGI application of a store, behind a token.
 
@@ -465,7 +393,6 @@ def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: 
     """
     table: list[tuple[str, Endpoint]] = [
         ("GET /", page_of),
-        ("GET /static/{name:path}", given_file),
         ("GET /api/store", explorer.about),
         ("POST /api/find", explorer.find),
         ("DELETE /api/find/{key}", explorer.cancel),
@@ -487,30 +414,32 @@ def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: 
         yield
         await asyncio.get_running_loop().run_in_executor(None, explorer.close)
 
-    return Guard(Starlette(routes=routed(table), lifespan=lifespan), token, hosts, cookie)
+    return Guard(application_of(table, lifespan), token, hosts, cookie)
 
 
-def routed(table: Iterable[tuple[str, Endpoint]]) -> list[Route]:
-    """Routes of endpoints, each by its method and its path."""
+class _PageFiles(StaticFiles):
+    """Modules, styles and licences of the page; a browser asks whether it has the latest."""
+
+    def file_response(self, *about: Any) -> Response:
+        response = super().file_response(*about)
+        response.headers["cache-control"] = "no-cache"
+        return response
+
+
+def application_of(
+    table: Iterable[tuple[str, Endpoint]], lifespan: Callable[[Any], Any] | None = None
+) -> Starlette:
+    """An application of endpoints, each by its method and its path, and of the files of the page."""
+    mimetypes.add_type("text/javascript", ".js")  # some machines call it otherwise
     pairs = ((*where.split(), endpoint) for where, endpoint in table)
-    return [Route(path, _told(endpoint), methods=[method]) for method, path, endpoint in pairs]
+    routes = [Route(path, endpoint, methods=[method]) for method, path, endpoint in pairs]
+    files = Mount("/static", _PageFiles(directory=PAGE, follow_symlink=True))
+    handlers = {SgstoreError: _refusal}
+    return Starlette(routes=[*routes, files], exception_handlers=handlers, lifespan=lifespan)
 
 
-def _told(endpoint: Endpoint) -> Endpoint:
-    """An endpoint whose errors are answers."""
-
-    async def run(request: Request) -> Response:
-        try:
-            return await endpoint(request)
-        except SgstoreError as error:
-            return JSONResponse(error.as_dict(), _status(error))
-
-    return run
-
-
-def _status(error: SgstoreError) -> int:
-    """The status of an answer that tells of an error."""
-    if isinstance(error, RequestError):
-        return error.status
+async def _refusal(_: Request, error: Any) -> Response:
+    """An error of ours as an answer, with its status."""
     is_query = isinstance(error, QueryError | SqlError)
-    return 404 if isinstance(error, StoreError) and not is_query else 422
+    usual = 404 if isinstance(error, StoreError) and not is_query else 422
+    return JSONResponse(error.as_dict(), getattr(error, "status", usual))

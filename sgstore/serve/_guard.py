@@ -10,11 +10,10 @@ else's leads there.
 from __future__ import annotations
 
 import secrets
-from http.cookies import CookieError, SimpleCookie
 from typing import TYPE_CHECKING, Final
-from urllib.parse import parse_qs
 
-from starlette.datastructures import Headers, MutableHeaders
+from starlette.datastructures import MutableHeaders
+from starlette.requests import HTTPConnection
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 
 if TYPE_CHECKING:
@@ -75,7 +74,8 @@ class Guard:
 
     def _refusal(self, scope: Scope) -> Response | None:
         """Answer that refuses a request, or lets it in; ``None``: it may pass."""
-        headers = Headers(scope=scope)
+        asked = HTTPConnection(scope)
+        headers = asked.headers
         host = headers.get("host", "")
         name, port = scope.get("server") or ("", 0)
         if host not in {*self._hosts, host_of(name, port)}:
@@ -87,19 +87,12 @@ class Guard:
         if site not in {None, "same-origin"} and not plain:
             return PlainTextResponse("wrong site", 403)
         if plain and scope["query_string"]:
-            told = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
-            return self._let_in() if self._is_token(told) else _no_token()
-        return None if self._is_token(self._told(headers)) else _no_token()
+            token = asked.query_params.get("token", "")
+            return self._let_in() if self._is_token(token) else _no_token()
+        return None if self._is_token(asked.cookies.get(self._cookie, "")) else _no_token()
 
     def _is_token(self, told: str) -> bool:
         return secrets.compare_digest(told.encode(), self._token.encode())
-
-    def _told(self, headers: Headers) -> str:
-        try:
-            found = SimpleCookie(headers.get("cookie", "")).get(self._cookie)
-        except CookieError:
-            return ""
-        return found.value if found else ""
 
     def _let_in(self) -> Response:
         response = RedirectResponse("/", 303)

@@ -17,12 +17,11 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from starlette.applications import Starlette
 from starlette.responses import Response, StreamingResponse
 
 from sgstore.errors import QueryNameError, StoreError
 from sgstore.lang import why_not
-from sgstore.serve._app import answered, given_file, page_of, routed
+from sgstore.serve._app import answered, application_of, page_of
 from sgstore.serve._guard import Guard
 from sgstore.serve._reads import drawn_map, shown_picture, told_graph
 from sgstore.serve._requests import Fields
@@ -313,11 +312,10 @@ def live_application(run: LiveRun, token: str, hosts: tuple[str, ...], cookie: s
 
     table: list[tuple[str, Endpoint]] = [
         ("GET /", partial(page_of, script="live.js")),
-        ("GET /static/{name:path}", given_file),
         ("GET /api/live", live),
         *((where, partial(ask, name=name, fields=told)) for where, (name, *told) in ASKED.items()),
     ]
-    return Guard(Starlette(routes=routed(table)), token, hosts, cookie)
+    return Guard(application_of(table), token, hosts, cookie)
 
 
 def _columns(graph: SceneGraph, origin: tuple[float, float]) -> dict[str, Any]:

@@ -105,7 +105,7 @@ def _told_why(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]
 def _told_check(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
     """Verdicts of checks, each trace with its violations."""
     run = store.check(question["text"], **question["parameters"])
-    many = 0
+    many, verdicts = 0, list[Reply]()
     for verdict in run:
         spans = [
             [one.start_seq, one.end_seq, one.start, one.end, dict(one.values)]
@@ -115,8 +115,8 @@ def _told_check(store: Store, question: dict[str, Any], most: int) -> Iterator[R
         about = {"check": verdict.check, "trace": verdict.trace, "verdict": verdict.verdict}
         about |= {"reason": verdict.reason, "violations": len(verdict.violations), "spans": spans}
         about["robustness"] = " · ".join(filter(None, margin_cells(verdict)))
-        yield {"more": True, "verdict": about}
-    yield {"count": many, "truncated": many >= most, "notes": run.notes}
+        verdicts.append(about)
+    yield {"verdicts": verdicts, "count": many, "truncated": many >= most, "notes": run.notes}
 
 
 def _measured(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
