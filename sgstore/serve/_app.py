@@ -27,7 +27,7 @@ from sgstore.query import Store
 from sgstore.sandbox import Errand, SandboxPool
 from sgstore.serve._guard import Guard
 from sgstore.serve._reads import READS, Reads
-from sgstore.serve._requests import Fields, RequestError
+from sgstore.serve._requests import RequestError, fields_of, one_of, taken
 from sgstore.serve._wire import PAGE, as_json
 
 if TYPE_CHECKING:
@@ -222,6 +222,10 @@ class Explorer:
             self._threads.submit(old.close)
         return self._pools[side]
 
+    def _side(self, fields: Mapping[str, Any]) -> str:
+        """Which of the stores is asked."""
+        return one_of(*self.stores)(fields.get("side", "a"), "side")
+
     # What somebody typed -------------------------------------------------------------------------
 
     def _answer(self, pool: Callable[[], SandboxPool | Errand], *asked: Any) -> _Answer:
@@ -242,21 +246,21 @@ class Explorer:
 
     async def find(self, request: Request) -> Response:
         """Matches of a pattern, or rows of SQL: lines of JSON, as they come."""
-        fields = await Fields.of(request)
-        text = fields.text("text")
-        kind = "sql" if _is_sql(text) else fields.one_of("ask", "matches", "rows")
-        question = {"ask": kind, "text": text, "parameters": fields.parameters()}
-        key, side = fields.text("id", "") or uuid.uuid4().hex, fields.one_of("side", *self._pools)
+        fields = await fields_of(request)
+        question = taken(fields, "ask", "text", "parameters")
+        if _is_sql(question["text"]):
+            question["ask"] = "sql"
+        key, side = taken(fields, "id")["id"] or uuid.uuid4().hex, self._side(fields)
         started = time.perf_counter()
 
         async def timed(replies: Replies) -> Replies:
-            about = {"kind": kind}
+            about = {"kind": question["ask"]}
             async for reply in replies:
                 yield about | reply
                 about = {}
             yield {"ms": round((time.perf_counter() - started) * 1e3, 1)}
 
-        pool = partial(self.pool, side, text)
+        pool = partial(self.pool, side, question["text"])
         return self._answer(pool, question, key, lambda replies: _lines(timed(replies)))
 
     async def cancel(self, request: Request) -> Response:
@@ -267,9 +271,9 @@ class Explorer:
 
     async def one(self, request: Request, ask: str) -> Response:
         """The whole answer to a question: lanes of truth, why not, verdicts. An error is an answer, too."""
-        fields = await Fields.of(request)
-        side = fields.one_of("side", *self._pools)
-        question = {"ask": ask, **fields.take(*_QUESTIONS[ask])}
+        fields = await fields_of(request)
+        side = self._side(fields)
+        question = {"ask": ask, **taken(fields, *_QUESTIONS[ask])}
         if "seq" in question:
             where = question["trace"], question["seq"]
             question["frame"] = await self.threaded(self.reads[side].frame_id, *where)
@@ -285,9 +289,9 @@ class Explorer:
 
     async def read(self, request: Request, name: str) -> Response:
         """Something that is read of a store: columns as bytes, a picture, or plain values."""
-        fields = await Fields.of(request)
-        reads = self.reads[fields.one_of("side", *self.reads)]
-        ask = partial(getattr(reads, name), **fields.take(*READS[name]))
+        fields = await fields_of(request)
+        reads = self.reads[self._side(fields)]
+        ask = partial(getattr(reads, name), **taken(fields, *READS[name]))
         return answered(await self.threaded(ask))
 
     async def about(self, _: Request) -> Response:
@@ -300,21 +304,20 @@ class Explorer:
 
     async def tags(self, request: Request) -> Response:
         """All tags; with POST one is written, or taken away."""
-        fields = await Fields.of(request)
+        fields = await fields_of(request)
         if request.method == "POST":
-            trace, seq = fields.text("trace"), fields.whole("seq")
-            await self.threaded(self.reads["a"].frame_id, trace, seq)
-            note = Note(trace, seq, fields.text("tag"), fields.text("note", ""))
-            gone = fields.one_of("do", "add", "remove") == "remove"
-            await self.threaded(partial(self.notes.add, note, gone=gone))
+            told = taken(fields, "trace", "seq", "tag", "note", "do")
+            gone = told.pop("do") == "remove"
+            await self.threaded(self.reads["a"].frame_id, told["trace"], told["seq"])
+            await self.threaded(partial(self.notes.add, Note(**told), gone=gone))
         found = await self.threaded(self.notes.read)
-        told = {"notes": [astuple(note) for note in found], "file": self.notes.path.name}
-        return JSONResponse(told)
+        notes = [astuple(note) for note in found]
+        return JSONResponse({"notes": notes, "file": self.notes.path.name})
 
     async def work(self, request: Request, name: str) -> Response:
         """A longer piece of work, as lines of JSON: what is done of it, then its result or an error."""
-        fields = await Fields.of(request)
-        question = {"ask": name, **fields.take(*_WORK[name])}
+        fields = await fields_of(request)
+        question = {"ask": name, **taken(fields, *_WORK[name])}
         if "name" in question:
             question["to"] = str(self.target(question.pop("name")))
         else:

@@ -24,7 +24,7 @@ from sgstore.lang import why_not
 from sgstore.serve._app import answered, application_of, page_of
 from sgstore.serve._guard import Guard
 from sgstore.serve._reads import drawn_map, shown_picture, told_graph
-from sgstore.serve._requests import Fields
+from sgstore.serve._requests import fields_of, taken
 from sgstore.serve._wire import as_json, clean, packed
 from sgstore.serve._worker import told_lanes
 from sgstore.temporal import RecentGraphs
@@ -59,7 +59,7 @@ _STATES: Final = {
     **dict.fromkeys(("kind", "ego", "light"), np.uint8),
 }
 _NO_LIGHT: Final = len(LIGHT_STATES)
-
+_OF_EVENTS: Final = "kind", "name", "nodes", "names", "values"
 
 ASKED: Final = {
     "GET /api/store": ("about",),
@@ -108,20 +108,11 @@ class LiveRun:
 
     def event(self, event: MonitorEvent) -> None:
         """Take an event: it goes with its frame."""
+        told = {name: getattr(event, name) for name in _OF_EVENTS}
+        told |= {"first": event.start.seq, "start": event.start.t}
+        told |= {"last": event.end.seq, "end": event.end.t}
         with self._lock:
-            self._events.append(
-                {
-                    "kind": event.kind,
-                    "name": event.name,
-                    "first": event.start.seq,
-                    "last": event.end.seq,
-                    "start": event.start.t,
-                    "end": event.end.t,
-                    "nodes": dict(event.nodes),
-                    "names": dict(event.names),
-                    "values": clean(event.values),
-                }
-            )
+            self._events.append(clean(told))
 
     def step(self, here: FrameTime, graphs: Sequence[SceneGraph]) -> None:
         """Take a frame with its graphs; of several egos the first one's is shown."""
@@ -173,14 +164,15 @@ class LiveRun:
     def _new_still(self, graph: SceneGraph) -> list[list[Any]]:
         """What stands and was not there before: node, kind, x, y, heading, length, width."""
         x, y = self._origin or (0.0, 0.0)
-        new = [n for n, a in graph.nodes.items() if n >= 0 and a["is_static"]]
-        for node in (new := [node for node in new if node not in self._still]):
+        new = [
+            n for n, a in graph.nodes.items() if n >= 0 and a["is_static"] and n not in self._still
+        ]
+        for node in new:
             about = graph.nodes[node]
             place = about.get("x", math.nan) - x, about.get("y", math.nan) - y
             turned = math.radians(about.get("heading", 0.0))
             size = about.get("length"), about.get("width")
-            told = [node, KIND_CODE[about["kind"]], *place, turned, *size]
-            self._still[node] = clean(told)
+            self._still[node] = clean([node, KIND_CODE[about["kind"]], *place, turned, *size])
         return [self._still[node] for node in new]
 
     # What the page asks --------------------------------------------------------------------------------
@@ -304,7 +296,7 @@ def live_application(run: LiveRun, token: str, hosts: tuple[str, ...], cookie: s
     """The ASGI application of a monitor, behind a token; as :func:`sgstore.serve.application`."""
 
     async def ask(request: Request, name: str, fields: Sequence[str]) -> Response:
-        told = (await Fields.of(request)).take(*fields)
+        told = taken(await fields_of(request), *fields)
         return answered(await asyncio.to_thread(partial(getattr(run, name), **told)))
 
     async def live(_: Request) -> Response:

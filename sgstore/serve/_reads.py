@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from sgstore.readers import Media
     from sgstore.roads import RoadMap
     from sgstore.store import StoredTrace
+
+T = TypeVar("T")
 
 MOST_THUMBS: Final = 400
 """Frames whose states are sent for small pictures at once."""
@@ -130,10 +132,7 @@ class Reads:
 
     def map(self, trace: str) -> bytes:
         """Outlines of the road map of a trace; without points where it has none."""
-        places = self._store.file.places()
-        if trace not in places:
-            raise StoreError(f"no trace {trace!r} in the store")
-        key = places[trace][2]
+        key = _among(self._store.file.places(), trace)[2]
         with self._reading:  # one map at a time: two who ask for one do not read it twice
             if key not in self._maps:
                 found = self._store.file.road_map_text(trace)
@@ -182,8 +181,8 @@ class Reads:
         ]
 
 
-def _among(traces: Mapping[str, StoredTrace], name: str) -> StoredTrace:
-    """A trace by its whole name."""
+def _among(traces: Mapping[str, T], name: str) -> T:
+    """What is told of a trace, by its whole name."""
     if name not in traces:
         raise StoreError(f"no trace {name!r} in the store")
     return traces[name]

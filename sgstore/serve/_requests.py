@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import SgstoreError
@@ -46,133 +47,95 @@ class RequestError(SgstoreError):
         super().__init__(reason)
 
 
-class Fields:
-    """Named values of a request; each way of asking for one says what is expected.
+async def fields_of(request: Request) -> dict[str, Any]:
+    """The fields of a body of JSON; of a GET those of the address.
 
-    Parameters
-    ----------
-    values : mapping of str to value
+    Raises
+    ------
+    RequestError
+        The body is too long, or no object of JSON.
     """
+    if request.method in {"GET", "DELETE"}:
+        return dict(request.query_params)
+    if request.headers.get("content-type", "").split(";")[0] != "application/json":
+        raise RequestError("expected a body of application/json", 415)
+    body = b""
+    async for part in request.stream():
+        body += part
+        if len(body) > MOST_BODY:
+            raise RequestError(f"the body is longer than {MOST_BODY} bytes", 413)
+    try:
+        found = json.loads(body, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise RequestError(f"the body is no JSON: {error}") from None
+    if not isinstance(found, dict):
+        raise RequestError("expected an object of JSON")
+    return found
 
-    def __init__(self, values: dict[str, Any]) -> None:
-        self._values = values
 
-    @classmethod
-    async def of(cls, request: Request) -> Fields:
-        """The fields of a body of JSON; of a GET those of the address.
+def taken(fields: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    """Values by name, each as :data:`FIELDS` says; what is not told is as in :data:`USUAL`."""
+    return {name: FIELDS[name](fields.get(name, USUAL.get(name)), name) for name in names}
 
-        Raises
-        ------
-        RequestError
-            The body is too long, or no object of JSON.
-        """
-        if request.method in {"GET", "DELETE"}:
-            return cls(dict(request.query_params))
-        if request.headers.get("content-type", "").split(";")[0] != "application/json":
-            raise RequestError("expected a body of application/json", 415)
-        body = b""
-        async for part in request.stream():
-            body += part
-            if len(body) > MOST_BODY:
-                raise RequestError(f"the body is longer than {MOST_BODY} bytes", 413)
-        try:
-            found = json.loads(body, parse_constant=_refuse_constant)
-        except (ValueError, RecursionError) as error:
-            raise RequestError(f"the body is no JSON: {error}") from None
-        if not isinstance(found, dict):
-            raise RequestError("expected an object of JSON")
-        return cls(found)
 
-    def __contains__(self, name: str) -> bool:
-        return self._values.get(name) is not None
+def one_of(*words: str) -> Callable[[object, str], str]:
+    """A field that is one of some words."""
 
-    def text(self, name: str, default: str | None = None) -> str:
-        """A text; without a default it must be there."""
-        value = self._values.get(name, default)
-        if not isinstance(value, str) or len(value) > MOST_TEXT:
-            raise RequestError(f"{name}: expected a text of at most {MOST_TEXT} characters")
-        try:
-            value.encode()
-        except UnicodeEncodeError:
-            raise RequestError(f"{name}: it has half a character") from None
-        return value
-
-    def whole(self, name: str, default: int | None = None, *, least: int = 0) -> int:
-        """A whole number, ``least`` or more."""
-        return _whole(self._values.get(name, default), name, least)
-
-    def one_of(self, name: str, *words: str) -> str:
-        """One of some words; the first is the default."""
-        value = self._values.get(name, words[0])
+    def read(value: object, name: str) -> str:
         if value not in words:
             raise RequestError(f"{name}: expected one of {', '.join(words)}")
         return str(value)
 
-    def parameters(self) -> dict[str, Any]:
-        """Values of ``$name``: numbers, texts, truth values, lists of these."""
-        found = self._values.get("parameters") or {}
-        if not isinstance(found, dict) or len(found) > 100:
-            raise RequestError("parameters: expected an object")
-        for name, value in found.items():
-            items = value if isinstance(value, list) else [value]
-            if len(items) > MOST_ITEMS or not name.isidentifier() or not all(map(_plain, items)):
-                raise RequestError(f"parameters: {name!r} is no value that a query can have")
-        return found
-
-    def take(self, *names: str) -> dict[str, Any]:
-        """Values by name, each as :data:`FIELDS` says."""
-        return {name: FIELDS[name](self, name) for name in names}
-
-    def binding(self) -> dict[str, int] | None:
-        """Node ids by variable; ``None`` where none are told."""
-        found = self._values.get("binding")
-        if found is None:
-            return None
-        if not isinstance(found, dict) or len(found) > 1000:
-            raise RequestError("binding: expected an object of node ids")
-        return {str(k): _whole(v, f"binding of {k!r}", LEAST_NODE) for k, v in found.items()}
-
-    def node(self, name: str) -> int:
-        """Id of a node; those of the map are negative."""
-        return self.whole(name, least=LEAST_NODE)
-
-    def frames(self) -> list[tuple[str, int]]:
-        """Frames as trace and number."""
-        return [(name, seq) for name, seq in self._lists("frames", 2)]
-
-    def clips(self) -> list[tuple[str, int, int]]:
-        """Clips as trace, first and last number."""
-        found = [(name, first, last) for name, first, last in self._lists("clips", 3)]
-        if any(first > last for _, first, last in found):
-            raise RequestError("clips: one ends before it begins")
-        return found
-
-    def _lists(self, name: str, width: int) -> list[list[Any]]:
-        rows = self._values.get(name)
-        if not isinstance(rows, list) or len(rows) > MOST_ITEMS:
-            raise RequestError(f"{name}: expected a list of at most {MOST_ITEMS}")
-        for row in rows:
-            if not isinstance(row, list) or len(row) != width or not isinstance(row[0], str):
-                raise RequestError(f"{name}: expected lists of a trace and {width - 1} numbers")
-            for value in row[1:]:
-                _whole(value, name, 0)
-        return rows
+    return read
 
 
-FIELDS: Final[Mapping[str, Callable[[Fields, str], Any]]] = {
-    **dict.fromkeys(("text", "trace", "channel", "attribute", "name"), Fields.text),
-    **dict.fromkeys(("seq", "first", "last"), Fields.whole),
-    "node": Fields.node,
-    "other": lambda of, name: of.node(name) if name in of else None,
-    "what": lambda of, name: of.one_of(name, "classes", "growth", "combos"),
-    "abstraction": lambda of, name: of.text(name, "RSV"),
-    "format": lambda of, name: of.text(name, "mcap"),
-    "parameters": lambda of, _: of.parameters(),
-    "binding": lambda of, _: of.binding(),
-    "clips": lambda of, _: of.clips(),
-    "frames": lambda of, _: of.frames(),
-}
-"""What each field of a request is, whatever is asked."""
+def _text(value: object, name: str) -> str:
+    if not isinstance(value, str) or len(value) > MOST_TEXT:
+        raise RequestError(f"{name}: expected a text of at most {MOST_TEXT} characters")
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        raise RequestError(f"{name}: it has half a character") from None
+    return value
+
+
+def _parameters(value: Any, _: str) -> dict[str, Any]:
+    """Values of ``$name``: numbers, texts, truth values, lists of these."""
+    found = value or {}
+    if not isinstance(found, dict) or len(found) > 100:
+        raise RequestError("parameters: expected an object")
+    for name, one in found.items():
+        items = one if isinstance(one, list) else [one]
+        if len(items) > MOST_ITEMS or not name.isidentifier() or not all(map(_plain, items)):
+            raise RequestError(f"parameters: {name!r} is no value that a query can have")
+    return found
+
+
+def _binding(value: Any, _: str) -> dict[str, int] | None:
+    """Node ids by variable; ``None`` where none are told."""
+    if value is None:
+        return None
+    if not isinstance(value, dict) or len(value) > 1000:
+        raise RequestError("binding: expected an object of node ids")
+    return {str(k): _whole(v, f"binding of {k!r}", LEAST_NODE) for k, v in value.items()}
+
+
+def _spans(rows: object, name: str, width: int) -> list[tuple[Any, ...]]:
+    """Lists of a trace and numbers of frames."""
+    if not isinstance(rows, list) or len(rows) > MOST_ITEMS:
+        raise RequestError(f"{name}: expected a list of at most {MOST_ITEMS}")
+    for row in rows:
+        if not isinstance(row, list) or len(row) != width or not isinstance(row[0], str):
+            raise RequestError(f"{name}: expected lists of a trace and {width - 1} numbers")
+    return [(row[0], *(_whole(value, name) for value in row[1:])) for row in rows]
+
+
+def _clips(value: object, name: str) -> list[tuple[Any, ...]]:
+    """Clips as trace, first and last number."""
+    found = _spans(value, name, 3)
+    if any(first > last for _, first, last in found):
+        raise RequestError("clips: one ends before it begins")
+    return found
 
 
 def _plain(value: object) -> bool:
@@ -181,7 +144,7 @@ def _plain(value: object) -> bool:
     return value is None or isinstance(value, bool | int | str)
 
 
-def _whole(value: object, name: str, least: int) -> int:
+def _whole(value: object, name: str, least: int = 0) -> int:
     if isinstance(value, str) and value.lstrip("-").isdecimal() and len(value) < 20:
         value = int(value)
     fits = isinstance(value, int) and not isinstance(value, bool)
@@ -192,3 +155,28 @@ def _whole(value: object, name: str, least: int) -> int:
 
 def _refuse_constant(word: str) -> float:
     raise ValueError(f"{word} is no number of JSON")
+
+
+_node: Final = partial(_whole, least=LEAST_NODE)
+
+USUAL: Final = {
+    **{"ask": "matches", "what": "classes", "do": "add", "abstraction": "RSV", "format": "mcap"},
+    **dict.fromkeys(("id", "note"), ""),
+}
+"""What fields are that are not told."""
+
+FIELDS: Final[Mapping[str, Callable[[Any, str], Any]]] = {
+    **dict.fromkeys(("text", "trace", "channel", "attribute", "name", "tag", "note", "id"), _text),
+    **dict.fromkeys(("abstraction", "format"), _text),
+    **dict.fromkeys(("seq", "first", "last"), _whole),
+    "node": _node,  # those of the map are negative
+    "other": lambda value, name: None if value is None else _node(value, name),
+    "ask": one_of("matches", "rows"),
+    "what": one_of("classes", "growth", "combos"),
+    "do": one_of("add", "remove"),
+    "parameters": _parameters,
+    "binding": _binding,
+    "clips": _clips,
+    "frames": partial(_spans, width=2),
+}
+"""What each field of a request is, whatever is asked."""

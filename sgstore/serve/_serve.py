@@ -6,7 +6,7 @@ import secrets
 import socket
 import threading
 import webbrowser
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -69,18 +69,14 @@ def serve(
     ConfigError
         The address cannot be listened on.
     """
-    with ExitStack() as unless_begun:
-        explorer = Explorer(store, other=other, write_to=write_to)
-        unless_begun.callback(explorer.close)
+    with closing(Explorer(store, other=other, write_to=write_to)) as explorer:
+        explorer.warm()
         make = partial(application, explorer)
-        with _page_of(make, host, port) as (server, listening, address):
-            explorer.warm()
-            on_start(address)
-            if browse:
-                webbrowser.open(address)
-            unless_begun.pop_all()
-            with suppress(KeyboardInterrupt):
-                server.run(sockets=[listening])
+        with (
+            _begun(make, host, port, browse, on_start) as (server, listening),
+            suppress(KeyboardInterrupt),
+        ):
+            server.run(sockets=[listening])
 
 
 @contextmanager
@@ -100,12 +96,10 @@ def serve_live(
     ConfigError
         The address cannot be listened on.
     """
-    with _page_of(partial(live_application, run), HOST, port) as (server, listening, address):
+    make = partial(live_application, run)
+    with _begun(make, HOST, port, browse, on_start) as (server, listening):
         thread = threading.Thread(target=server.run, args=([listening],), daemon=True)
         thread.start()
-        on_start(address)
-        if browse:
-            webbrowser.open(address)
         try:
             yield
         finally:
@@ -114,10 +108,14 @@ def serve_live(
 
 
 @contextmanager
-def _page_of(
-    make: Callable[[str, tuple[str, ...], str], Guard], host: str, port: int
-) -> Generator[tuple[uvicorn.Server, socket.socket, str]]:
-    """A server of an application, the socket that it is to listen on, and the address with its token."""
+def _begun(
+    make: Callable[[str, tuple[str, ...], str], Guard],
+    host: str,
+    port: int,
+    browse: bool,  # noqa: FBT001 - as serve has it
+    on_start: Callable[[str], None],
+) -> Generator[tuple[uvicorn.Server, socket.socket]]:
+    """A server of an application, and the socket that it is to listen on; its address is told."""
     with _listening(host, port) as listening:
         number = listening.getsockname()[1]
         token = secrets.token_urlsafe(24)
@@ -131,7 +129,11 @@ def _page_of(
             lifespan="on",  # at its end the explorer is closed
             timeout_graceful_shutdown=1,  # a question under way does not keep the server
         )
-        yield uvicorn.Server(config), listening, f"http://{hosts[0]}/?token={token}"
+        address = f"http://{hosts[0]}/?token={token}"
+        on_start(address)
+        if browse:
+            webbrowser.open(address)
+        yield uvicorn.Server(config), listening
 
 
 def _listening(host: str, port: int) -> socket.socket:

@@ -9,13 +9,14 @@ from __future__ import annotations
 import json
 import math
 import struct
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable
 
     from numpy.typing import NDArray
 
@@ -52,26 +53,18 @@ def as_json(value: object) -> bytes:
     try:
         text = json.dumps(value, allow_nan=False, separators=(",", ":"), ensure_ascii=False)
     except ValueError:
-        text = json.dumps(_worded(value), separators=(",", ":"), ensure_ascii=False)
+        text = json.dumps(clean(value, str), separators=(",", ":"), ensure_ascii=False)
     return text.encode(errors="replace")
 
 
-def _worded(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _worded(item) for key, item in value.items()}
+def clean(value: Any, word: Callable[[float], str | None] = lambda _: None) -> Any:
+    """A value as JSON holds it: numbers that are none are ``None``, or another word for them."""
+    if isinstance(value, Mapping):
+        return {str(key): clean(item, word) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_worded(item) for item in value]
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def clean(value: Any) -> Any:
-    """A value as JSON holds it: numbers that are none are ``None``."""
-    if isinstance(value, dict):
-        return {str(key): clean(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [clean(item) for item in value]
+        return [clean(item, word) for item in value]
     if isinstance(value, np.generic):
-        return clean(value.item())
+        return clean(value.item(), word)
     if isinstance(value, float) and not math.isfinite(value):
-        return None
+        return word(value)
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
