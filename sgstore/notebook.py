@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import ConfigError, SgstoreError
 from sgstore.query import Store
+from sgstore.quoting import is_statement
 
 if TYPE_CHECKING:
     from collections.abc import MutableMapping
@@ -24,9 +25,6 @@ USAGE: Final = (
     "%%sgql [STORE] [--as NAME]; the store is a variable or a path, by default the last one"
 )
 
-_SQL: Final = re.compile(
-    r"\s*(SELECT|WITH|FROM|VALUES|TABLE|DESCRIBE|SHOW|SUMMARIZE|EXPLAIN)\b", re.IGNORECASE
-)
 _NO_NAMES: Final = re.compile(
     r"'(?:[^'\\]|\\.)*'|\"(?:[^\"\\]|\\.)*\"|--[^\n]*|/\*.*?\*/", re.DOTALL
 )
@@ -111,7 +109,7 @@ class SgqlCell:
         return held[0]
 
     def _asked(self, store: Store, text: str) -> Matches | CheckRun | Rows:
-        if _SQL.match(text):
+        if is_statement(text):
             return store.sql(text)
         values = self._values(text)
         return store.check(text, **values) if _has_checks(text) else store.find(text, **values)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
 
 from sgstore.arrays import np
 from sgstore.lang import parts_of
@@ -68,6 +69,18 @@ class TruthLanes:
         for others in spans[1:]:
             found = tuple(_intersection(found, others))
         return found
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values: ``trace``, ``binding``, ``lanes``; ``together``: runs by step, as :meth:`together`."""
+        lanes = [
+            {name: getattr(lane.part, name) for name in ("text", "step", "nodes", "conditions")}
+            | {"edges": [*map(asdict, lane.part.edges)]}
+            | {"spans": lane.spans, "unknown": lane.unknown}
+            for lane in self.lanes
+        ]
+        together = {step: self.together(step) for step in self.steps}
+        binding = dict(self.binding)
+        return {"trace": self.trace, "binding": binding, "lanes": lanes, "together": together}
 
 
 def _intersection(

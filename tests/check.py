@@ -43,6 +43,7 @@ TESTS = {
     " zones like tolerance",
     "map_files": "cli_map lanelet2 sumo",
     "importing": "importing openlabel",
+    "json_text": "serve export_mcap",
     "markup": "opendrive_document lanelet2",
     "matches": "query query_recordings api rows",
     "mcap": "mcap_* spool ahead",

@@ -33,6 +33,7 @@ LAYERS: tuple[frozenset[str], ...] = (
             "display",
             "errors",
             "geometry",
+            "json_text",
             "markup",
             "pair_numbers",
             "plugins",

@@ -214,21 +214,19 @@ def test_matches_come_as_lines(page: Page, store: Store) -> None:
     rows = [row for line in lines for row in line.get("matches", [])]
     spans = list(store.find(NEAR).intervals())
 
-    assert (head["kind"], head["reasons"]) == ("matches", {})
+    assert (head["columns"], head["reasons"]) == (list(store.find(NEAR).columns), {})
     assert [(r[0], r[1], r[2]) for r in rows] == [(s.trace, s.start_seq, s.end_seq) for s in spans]
-    assert lines[-2]["count"] == len(spans)
-    assert lines[-1]["ms"] > 0
+    assert lines[-1]["count"] == len(spans)
 
 
 def test_sql_is_answered_in_the_same_place(page: Page) -> None:
-    answer, ms = page.find("-- how many\nSELECT count(*) AS n FROM frames")
+    (answer,) = page.find("-- how many\nSELECT count(*) AS n FROM frames")
 
-    assert (answer["kind"], answer["columns"], answer["rows"]) == ("sql", ["n"], [[750]])
-    assert "ms" in ms
+    assert (answer["columns"], answer["rows"]) == (["n"], [[750]])
 
 
 def test_numbers_that_json_has_no_word_for_are_texts(page: Page) -> None:
-    answer, _ = page.find("SELECT 'inf'::DOUBLE AS a, '-inf'::DOUBLE AS b, 'nan'::DOUBLE AS c")
+    (answer,) = page.find("SELECT 'inf'::DOUBLE AS a, '-inf'::DOUBLE AS b, 'nan'::DOUBLE AS c")
     check = page.post("/api/check", text="CHECK p: ALWAYS FALSE IMPLIES TRUE ROBUSTNESS")
 
     assert answer["rows"] == [["inf", "-inf", "nan"]]
@@ -418,7 +416,7 @@ def test_tags_are_kept_beside_the_store_and_can_be_asked_for(page: Page, town_st
     ]
     assert gone["notes"] == told.json()["notes"]
     assert file.read_text().splitlines()[0] == "trace,seq,tag,note,who,at"
-    (answer, _) = page.find("SELECT seq FROM notes WHERE tag = 'check this'")
+    (answer,) = page.find("SELECT seq FROM notes WHERE tag = 'check this'")
     assert answer["rows"] == [[12]]
     found = page.find("MATCH (e:Ego) WHERE notes.tag = 'check this'")
     assert found[2]["matches"][0][1:3] == [12, 12]
@@ -474,7 +472,7 @@ def test_two_stores_are_compared(page: Page) -> None:
     assert told["scenes"]["rows"] == []
     assert told["frames"]["rows"][0][0] == "same"
     head, *_ = page.find(NEAR, side="b")
-    assert head["kind"] == "matches"
+    assert "columns" in head
 
 
 # What is refused ---------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.display import cell
@@ -59,12 +58,3 @@ def remarks(reply: Mapping[str, Any]) -> list[str]:
         of.setdefault(reason, []).append(name)
     left_out = [f"(cannot answer: {', '.join(names)}: {reason})" for reason, names in of.items()]
     return [*left_out, *(f"(note: {note})" for note in reply.get("notes", ()))]
-
-
-def finite(value: Any) -> Any:
-    """A value without the numbers that JSON has not: infinity and NaN become ``None``."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {name: finite(item) for name, item in value.items()}  # pyright: ignore[reportUnknownVariableType]
-    return [finite(item) for item in value] if isinstance(value, list | tuple) else value  # pyright: ignore[reportUnknownVariableType]

@@ -22,9 +22,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 from pydantic import Field
 
-from sgstore.assistant._text import finite, remarks, rows_text
+from sgstore.assistant._text import remarks, rows_text
 from sgstore.assistant._vocabulary import Topic, topic_text
 from sgstore.errors import ExportError, StoreError
+from sgstore.json_text import finite
 from sgstore.query import Store
 from sgstore.sandbox import TIMEOUT_S, Sandbox
 

@@ -26,6 +26,7 @@ from google.protobuf import (
     timestamp_pb2,
 )
 
+from sgstore.json_text import finite
 from sgstore.readers import add_fields, png
 from sgstore.vocabulary import DIRECTIONS, PROXIMITY
 
@@ -174,19 +175,6 @@ def values(told: dict[str, Any], time_ns: int) -> bytes:
     """Values by name, as JSON with their time."""
     about = {"timestamp": {"sec": time_ns // 10**9, "nsec": time_ns % 10**9}} | told
     return json.dumps(finite(about), allow_nan=False).encode()
-
-
-def finite(value: Any) -> Any:
-    """Return a value for JSON, with null for numbers that are not finite."""
-    match value:
-        case float() if not math.isfinite(value):
-            return None
-        case dict():
-            return {key: finite(item) for key, item in value.items()}
-        case list():
-            return [finite(item) for item in value]
-        case _:
-            return value
 
 
 def stamp(message: Any, time_ns: int) -> None:

@@ -12,7 +12,6 @@ The metadata of these channels says ``sgstore: derived``: they are made of the r
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any, Final
 
 from mcap.records import Channel, Schema
@@ -22,6 +21,7 @@ from sgstore.errors import ExportError
 from sgstore.exporters._labels import FEW, ClipFrames
 from sgstore.exporters._nx import graphs_of
 from sgstore.exporters._transforms import FrameTransforms
+from sgstore.json_text import json_text
 from sgstore.readers import DERIVED
 
 if TYPE_CHECKING:
@@ -217,8 +217,4 @@ def _graph(graph: SceneGraph) -> dict[str, Any]:
 
 def _as_json(value: Any) -> bytes:
     """As JSON; numbers that are none are null."""
-    try:
-        text = json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
-    except ValueError:
-        text = json.dumps(foxglove_scene.finite(value), ensure_ascii=False, separators=(",", ":"))
-    return text.encode("utf-8", "backslashreplace")
+    return json_text(value).encode("utf-8", "backslashreplace")

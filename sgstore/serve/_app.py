@@ -6,7 +6,6 @@ import asyncio
 import mimetypes
 import os
 import threading
-import time
 import uuid
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
@@ -24,6 +23,7 @@ from starlette.staticfiles import StaticFiles
 from sgstore.errors import QueryError, SgstoreError, SqlError, StoreError
 from sgstore.notes import Note, NotesFile, write_table
 from sgstore.query import Store
+from sgstore.quoting import is_statement
 from sgstore.sandbox import Errand, SandboxPool
 from sgstore.serve._guard import Guard
 from sgstore.serve._reads import READS, Reads
@@ -224,7 +224,7 @@ class Explorer:
 
     def _side(self, fields: Mapping[str, Any]) -> str:
         """Which of the stores is asked."""
-        return one_of(*self.stores)(fields.get("side", "a"), "side")
+        return one_of(*self.stores)(fields.get("side"), "side")
 
     # What somebody typed -------------------------------------------------------------------------
 
@@ -248,20 +248,10 @@ class Explorer:
         """Matches of a pattern, or rows of SQL: lines of JSON, as they come."""
         fields = await fields_of(request)
         question = taken(fields, "ask", "text", "parameters")
-        if _is_sql(question["text"]):
+        if is_statement(question["text"]):
             question["ask"] = "sql"
         key, side = taken(fields, "id")["id"] or uuid.uuid4().hex, self._side(fields)
-        started = time.perf_counter()
-
-        async def timed(replies: Replies) -> Replies:
-            about = {"kind": question["ask"]}
-            async for reply in replies:
-                yield about | reply
-                about = {}
-            yield {"ms": round((time.perf_counter() - started) * 1e3, 1)}
-
-        pool = partial(self.pool, side, question["text"])
-        return self._answer(pool, question, key, lambda replies: _lines(timed(replies)))
+        return self._answer(partial(self.pool, side, question["text"]), question, key)
 
     async def cancel(self, request: Request) -> Response:
         """Stop a question."""
@@ -284,8 +274,7 @@ class Explorer:
 
     async def threaded(self, ask: Callable[..., T], *arguments: Any) -> T:
         """Answer of a function that takes its time."""
-        loop = asyncio.get_running_loop()
-        return await loop.run_in_executor(self._threads, partial(ask, *arguments))
+        return await asyncio.get_running_loop().run_in_executor(self._threads, ask, *arguments)
 
     async def read(self, request: Request, name: str) -> Response:
         """Something that is read of a store: columns as bytes, a picture, or plain values."""
@@ -365,6 +354,9 @@ _WORK: Final[Mapping[str, tuple[str, ...]]] = {
 """The fields of a question, and of a longer piece of work, by its name."""
 
 
+_METHODS: Final = {name: "POST" if "frames" in told else "GET" for name, told in READS.items()}
+
+
 def answered(found: Any) -> Response:
     """Answer of columns as bytes, of a picture with its type, or of plain values."""
     if isinstance(found, bytes):
@@ -373,13 +365,6 @@ def answered(found: Any) -> Response:
         headers = {"cache-control": "private, max-age=3600"}
         return Response(found[0], media_type=found[1], headers=headers)
     return JSONResponse(found)
-
-
-def _is_sql(text: str) -> bool:
-    """Tell whether a text is a statement of SQL, by its first word."""
-    words = [line for line in text.splitlines() if not line.strip().startswith("--")]
-    first = (" ".join(words).split(maxsplit=1) or [""])[0].upper()
-    return first in {"SELECT", "WITH", "FROM", "DESCRIBE", "SUMMARIZE", "SHOW"}
 
 
 def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: str) -> Guard:
@@ -401,13 +386,7 @@ def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: 
         ("DELETE /api/find/{key}", explorer.cancel),
         ("GET /api/notes", explorer.tags),
         ("POST /api/notes", explorer.tags),
-        *(
-            (
-                f"{'POST' if 'frames' in told else 'GET'} /api/{name}",
-                partial(explorer.read, name=name),
-            )
-            for name, told in READS.items()
-        ),
+        *((f"{_METHODS[name]} /api/{name}", partial(explorer.read, name=name)) for name in READS),
         *((f"POST /api/{name}", partial(explorer.one, ask=name)) for name in _QUESTIONS),
         *((f"POST /api/{name}", partial(explorer.work, name=name)) for name in _WORK),
     ]
@@ -423,8 +402,8 @@ def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: 
 class _PageFiles(StaticFiles):
     """Modules, styles and licences of the page; a browser asks whether it has the latest."""
 
-    def file_response(self, *about: Any) -> Response:
-        response = super().file_response(*about)
+    def file_response(self, *args: Any, **kwargs: Any) -> Response:
+        response = super().file_response(*args, **kwargs)
         response.headers["cache-control"] = "no-cache"
         return response
 

@@ -20,13 +20,13 @@ import numpy as np
 from starlette.responses import Response, StreamingResponse
 
 from sgstore.errors import QueryNameError, StoreError
+from sgstore.json_text import finite
 from sgstore.lang import why_not
 from sgstore.serve._app import answered, application_of, page_of
 from sgstore.serve._guard import Guard
 from sgstore.serve._reads import drawn_map, shown_picture, told_graph
 from sgstore.serve._requests import fields_of, taken
-from sgstore.serve._wire import as_json, clean, packed
-from sgstore.serve._worker import told_lanes
+from sgstore.serve._wire import as_json, packed
 from sgstore.temporal import RecentGraphs
 from sgstore.vocabulary import KIND_CODE, KINDS, LIGHT_STATE_CODE, LIGHT_STATES
 
@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     from sgstore.roads import RoadMap
     from sgstore.serve._app import Endpoint
     from sgstore.temporal import FrameTime, Monitor, MonitorEvent, Verdict
+
+    Things = Mapping[int, Mapping[str, Any]]
 
 MOST_FRAMES: Final = 3000
 """Frames that are kept for whoever opens the page later, and at most so many bytes of them."""
@@ -112,7 +114,7 @@ class LiveRun:
         told |= {"first": event.start.seq, "start": event.start.t}
         told |= {"last": event.end.seq, "end": event.end.t}
         with self._lock:
-            self._events.append(clean(told))
+            self._events.append(finite(told))
 
     def step(self, here: FrameTime, graphs: Sequence[SceneGraph]) -> None:
         """Take a frame with its graphs; of several egos the first one's is shown."""
@@ -120,18 +122,13 @@ class LiveRun:
         with self._lock:
             if self._origin is None:
                 self._origin = _origin_of(graph)
-            header = {
-                "seq": here.seq,
-                "t": here.t,
-                "origin": self._origin,
-                "ego": -1 if graph.ego is None else graph.ego,
-                "names": self._new_names(graph),
-                "still": self._new_still(graph),
-                "status": monitor.status if monitor is not None else {},
-                "events": self._events,
-            }
+            things = {node: about for node, about in graph.nodes.items() if node >= 0}
+            header = {"seq": here.seq, "t": here.t, "origin": self._origin, "events": self._events}
+            header |= {"ego": -1 if graph.ego is None else graph.ego}
+            header |= {"names": self._new_names(things), "still": self._new_still(things)}
+            header |= {"status": {} if monitor is None else monitor.status}
             self._events = []
-            data = packed(header, _columns(graph, self._origin))
+            data = packed(header, _columns(things, graph.ego, self._origin))
             self._put("frame", base64.b64encode(data))
             self._recent.add(here, graph, self.name if monitor is None else monitor.trace)
 
@@ -150,48 +147,40 @@ class LiveRun:
             self._bytes -= len(self._sent.popleft())
             self._gone += 1
 
-    def _new_names(self, graph: SceneGraph) -> dict[int, list[str]]:
-        found = {
-            node: [about["kind"], about.get("ident", ""), ""]
-            for node, about in graph.nodes.items()
-            if node >= 0 and node not in self._names
-        }
+    def _new_names(self, things: Things) -> dict[int, list[str]]:
+        new = {node: about for node, about in things.items() if node not in self._names}
+        found = {node: [a["kind"], a.get("ident", ""), ""] for node, a in new.items()}
         self._names |= found
         while len(self._names) > MOST_NAMES:
             self._names.popitem(last=False)
         return found
 
-    def _new_still(self, graph: SceneGraph) -> list[list[Any]]:
+    def _new_still(self, things: Things) -> list[list[Any]]:
         """What stands and was not there before: node, kind, x, y, heading, length, width."""
         x, y = self._origin or (0.0, 0.0)
-        new = [
-            n for n, a in graph.nodes.items() if n >= 0 and a["is_static"] and n not in self._still
-        ]
+        new = [n for n, about in things.items() if about["is_static"] and n not in self._still]
         for node in new:
-            about = graph.nodes[node]
+            about = things[node]
             place = about.get("x", math.nan) - x, about.get("y", math.nan) - y
             turned = math.radians(about.get("heading", 0.0))
             size = about.get("length"), about.get("width")
-            self._still[node] = clean([node, KIND_CODE[about["kind"]], *place, turned, *size])
+            self._still[node] = finite([node, KIND_CODE[about["kind"]], *place, turned, *size])
         return [self._still[node] for node in new]
 
     # What the page asks --------------------------------------------------------------------------------
 
     def about(self) -> dict[str, Any]:
         """What the page is told first, as of a store with one trace."""
+        key, cameras = "live" * self._has_map, [] if self._cameras is None else self._cameras.topics
         trace = {"name": self.name, "frames": 0, "seconds": 0.0, "period": 0.0, "map": ""}
-        trace |= {"map_key": "live" * self._has_map, "origin": self._origin or (0.0, 0.0)}
-        cameras = [] if self._cameras is None else [*self._cameras.topics]
-        trace |= {"cameras": cameras}
-        monitor = self._monitor
-        names = monitor.names if monitor is not None else ()
-        checks = [*monitor.status] if monitor is not None else []
+        trace |= {"map_key": key, "origin": self._origin or (0.0, 0.0), "cameras": [*cameras]}
+        names, checks = (), []
+        if self._monitor is not None:
+            names, checks = self._monitor.names, [*self._monitor.status]
+        patterns = [name for name in names if name not in checks]
         codes = {"kind": list(KINDS), "light": [*LIGHT_STATES, "unknown"]}
-        return {"store": self.name, "traces": [trace], "codes": codes, "other": None} | {
-            "writing": False,
-            "checks": checks,
-            "patterns": [name for name in names if name not in checks],
-        }
+        told = {"store": self.name, "traces": [trace], "codes": codes, "other": None}
+        return {**told, "writing": False, "checks": checks, "patterns": patterns}
 
     def map(self) -> bytes:
         """Outlines of the road map; without points where there is none."""
@@ -209,7 +198,7 @@ class LiveRun:
         with self._lock:
             match = self._recent.match(text, query, binding or {})
             known = [max(self._gone, match.begun), match.seen]
-            return {**told_lanes(match.lanes(self.name, self._gone)), "known": known}
+            return {**match.lanes(self.name, self._gone).as_dict(), "known": known}
 
     def series(self, attribute: str, node: int, other: int | None = None) -> bytes:
         """An attribute over the frames whose graphs are kept, as the explorer gives it; it is followed on.
@@ -310,21 +299,18 @@ def live_application(run: LiveRun, token: str, hosts: tuple[str, ...], cookie: s
     return Guard(application_of(table), token, hosts, cookie)
 
 
-def _columns(graph: SceneGraph, origin: tuple[float, float]) -> dict[str, Any]:
+def _columns(things: Things, ego: int | None, origin: tuple[float, float]) -> dict[str, Any]:
     """States of what moves, as the page draws them."""
-    moving = [(n, a) for n, a in graph.nodes.items() if n >= 0 and not a["is_static"]]
-    columns: dict[str, list[Any]] = {
-        name: [about.get(name, math.nan) for _, about in moving] for name in _STATES
-    }
+    moving = {node: about for node, about in things.items() if not about["is_static"]}
+    columns = {name: [a.get(name, math.nan) for a in moving.values()] for name in _STATES}
     for name, place in zip("xy", origin, strict=True):
         columns[name] = [value - place for value in columns[name]]
     columns["heading"] = [math.radians(degrees) for degrees in columns["heading"]]
-    columns["node"] = [node for node, _ in moving]
-    columns["ego"] = [int(node == graph.ego) for node, _ in moving]
-    columns["kind"] = [KIND_CODE[about["kind"]] for _, about in moving]
-    columns["light"] = [
-        LIGHT_STATE_CODE.get(about.get("light_state", ""), _NO_LIGHT) for _, about in moving
-    ]
+    columns["node"] = [*moving]
+    columns["ego"] = [node == ego for node in moving]
+    columns["kind"] = [KIND_CODE[about["kind"]] for about in moving.values()]
+    lights = [about.get("light_state", "") for about in moving.values()]
+    columns["light"] = [LIGHT_STATE_CODE.get(light, _NO_LIGHT) for light in lights]
     return {name: np.array(columns[name], type_) for name, type_ in _STATES.items()}
 
 

@@ -14,10 +14,10 @@ from sgstore.coverage import ChosenFrames, classed, classes, combos, covered, gr
 from sgstore.diff import by_frame, scenes
 from sgstore.errors import StoreError
 from sgstore.exporters import Export, write_export
+from sgstore.json_text import finite
 from sgstore.locks import lock_of
 from sgstore.query import Store
 from sgstore.sandbox import tell
-from sgstore.serve._wire import clean
 from sgstore.store import frame_ids, lengths_of_messages
 from sgstore.world import Clip
 
@@ -131,5 +131,5 @@ def _apart(clips: Clips) -> list[tuple[str, int, int]]:
 
 def _table(of: ReportTable) -> dict[str, Any]:
     """A table as the page shows it; it says how many rows there are."""
-    rows = clean(of.rows[:MOST_ROWS])
+    rows = finite(of.rows[:MOST_ROWS])
     return {"columns": of.columns, "rows": rows, "of": len(of.rows), "said": of.said}

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import numpy as np
 
 from sgstore.errors import ExportError, SgstoreError, StoreError
+from sgstore.json_text import finite
 from sgstore.lang import patterns, words
 from sgstore.opendrive import read_map
 from sgstore.roads import drawn_outlines
 from sgstore.serve._requests import RequestError
-from sgstore.serve._wire import clean, packed
+from sgstore.serve._wire import packed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -36,13 +37,13 @@ MOST_THUMBS: Final = 400
 READS: Final[Mapping[str, tuple[str, ...]]] = {
     "words": (),
     "library": (),
-    "thumbs": ("frames",),
     "states": ("trace", "first", "last"),
     "static": ("trace",),
     "map": ("trace",),
     "frame": ("trace", "seq"),
     "picture": ("trace", "seq", "channel"),
     "series": ("trace", "attribute", "node", "other"),
+    "thumbs": ("frames",),
 }
 """Methods of :class:`Reads` that a page asks, each with the fields that it takes."""
 
@@ -214,4 +215,4 @@ def told_graph(graph: SceneGraph) -> dict[str, Any]:
         {"src": src, "relation": relation, "dst": dst, **about}
         for src, relation, dst, about in graph.edges
     ]
-    return clean({"nodes": nodes, "edges": edges})
+    return finite({"nodes": nodes, "edges": edges})

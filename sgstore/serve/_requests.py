@@ -79,12 +79,12 @@ def taken(fields: Mapping[str, Any], *names: str) -> dict[str, Any]:
 
 
 def one_of(*words: str) -> Callable[[object, str], str]:
-    """A field that is one of some words."""
+    """A field that is one of some words; the first, where it is not told."""
 
     def read(value: object, name: str) -> str:
-        if value not in words:
+        if value not in (None, *words):
             raise RequestError(f"{name}: expected one of {', '.join(words)}")
-        return str(value)
+        return str(value or words[0])
 
     return read
 
@@ -159,10 +159,7 @@ def _refuse_constant(word: str) -> float:
 
 _node: Final = partial(_whole, least=LEAST_NODE)
 
-USUAL: Final = {
-    **{"ask": "matches", "what": "classes", "do": "add", "abstraction": "RSV", "format": "mcap"},
-    **dict.fromkeys(("id", "note"), ""),
-}
+USUAL: Final = {"abstraction": "RSV", "format": "mcap", "id": "", "note": ""}
 """What fields are that are not told."""
 
 FIELDS: Final[Mapping[str, Callable[[Any, str], Any]]] = {

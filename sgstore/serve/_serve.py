@@ -22,7 +22,7 @@ except ImportError as error:
     raise MissingExtraError("the explorer", "ui") from error
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator
+    from collections.abc import Callable, Generator, Iterable
     from pathlib import Path
 
     from sgstore.serve._guard import Guard
@@ -73,7 +73,10 @@ def serve(
         explorer.warm()
         make = partial(application, explorer)
         with (
-            _begun(make, host, port, browse, on_start) as (server, listening),
+            _begun(make, host, port, (on_start, webbrowser.open)[: 1 + browse]) as (
+                server,
+                listening,
+            ),
             suppress(KeyboardInterrupt),
         ):
             server.run(sockets=[listening])
@@ -97,7 +100,7 @@ def serve_live(
         The address cannot be listened on.
     """
     make = partial(live_application, run)
-    with _begun(make, HOST, port, browse, on_start) as (server, listening):
+    with _begun(make, HOST, port, (on_start, webbrowser.open)[: 1 + browse]) as (server, listening):
         thread = threading.Thread(target=server.run, args=([listening],), daemon=True)
         thread.start()
         try:
@@ -112,8 +115,7 @@ def _begun(
     make: Callable[[str, tuple[str, ...], str], Guard],
     host: str,
     port: int,
-    browse: bool,  # noqa: FBT001 - as serve has it
-    on_start: Callable[[str], None],
+    told: Iterable[Callable[[str], object]],
 ) -> Generator[tuple[uvicorn.Server, socket.socket]]:
     """A server of an application, and the socket that it is to listen on; its address is told."""
     with _listening(host, port) as listening:
@@ -130,9 +132,8 @@ def _begun(
             timeout_graceful_shutdown=1,  # a question under way does not keep the server
         )
         address = f"http://{hosts[0]}/?token={token}"
-        on_start(address)
-        if browse:
-            webbrowser.open(address)
+        for tell in told:
+            tell(address)
         yield uvicorn.Server(config), listening
 
 

@@ -7,19 +7,18 @@ padded to 8 bytes. The header names the columns with their types and lengths und
 from __future__ import annotations
 
 import json
-import math
 import struct
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.json_text import json_text
+
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Mapping
 
     from numpy.typing import NDArray
-
 
 PAGE: Final = Path(__file__).parent / "page"
 """Files of the page."""
@@ -50,21 +49,4 @@ def _padding(data: bytes) -> bytes:
 
 def as_json(value: object) -> bytes:
     """A value as browsers read it: a number that JSON has no word for is a text, as ``inf``."""
-    try:
-        text = json.dumps(value, allow_nan=False, separators=(",", ":"), ensure_ascii=False)
-    except ValueError:
-        text = json.dumps(clean(value, str), separators=(",", ":"), ensure_ascii=False)
-    return text.encode(errors="replace")
-
-
-def clean(value: Any, word: Callable[[float], str | None] = lambda _: None) -> Any:
-    """A value as JSON holds it: numbers that are none are ``None``, or another word for them."""
-    if isinstance(value, Mapping):
-        return {str(key): clean(item, word) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [clean(item, word) for item in value]
-    if isinstance(value, np.generic):
-        return clean(value.item(), word)
-    if isinstance(value, float) and not math.isfinite(value):
-        return word(value)
-    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+    return json_text(value, str).encode(errors="replace")

@@ -8,18 +8,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from sgstore.errors import QueryError
 from sgstore.lang import WhyNotSteps
 from sgstore.query import Store
 from sgstore.sandbox import plain, rows_found, serve
 from sgstore.temporal import margin_cells
-
-if TYPE_CHECKING:
-    from sgstore.truth_lanes import TruthLanes
 
 Reply = dict[str, Any]
 Asked = Callable[[Store, dict[str, Any], int], Iterator[Reply]]
@@ -65,21 +61,8 @@ def _told_rows(store: Store, question: dict[str, Any], most: int) -> Iterator[Re
 def _told_parts(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
     """Lanes of truth."""
     binding = question["binding"]
-    yield told_lanes(
-        store.parts(question["text"], question["frame"], binding, **question["parameters"])
-    )
-
-
-def told_lanes(lanes: TruthLanes) -> Reply:
-    """Lanes of truth as the page takes them."""
-    told: list[Reply] = []
-    for lane in lanes.lanes:
-        part = lane.part
-        about = {n: getattr(part, n) for n in ("text", "step", "nodes", "conditions")}
-        about |= {"edges": [*map(asdict, part.edges)], "spans": lane.spans}
-        told.append({**about, "unknown": lane.unknown})
-    together = {step: lanes.together(step) for step in lanes.steps}
-    return {"trace": lanes.trace, "binding": lanes.binding, "lanes": told, "together": together}
+    text, values = question["text"], question["parameters"]
+    yield store.parts(text, question["frame"], binding, **values).as_dict()
 
 
 def _told_why(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:

@@ -167,11 +167,12 @@ export async function find(how = {}) {
     for await (const line of api.lines("api/find", { text: query, parameters: parametersOf(query), id }, { signal: mine.signal })) {
       if (line.names) told.names = line.names;
       if (line.matches) for (const row of line.matches) told.matches.push(matchOf(row, told));
-      for (const name of ["reasons", "columns", "rows", "notes", "count", "truncated", "ms", "error"]) {
+      for (const name of ["reasons", "columns", "rows", "notes", "count", "truncated", "error"]) {
         if (line[name] !== undefined) told[name] = line[name];
       }
       if (performance.now() - last > 120) { last = performance.now(); answer.value = { ...told }; }
     }
+    told.ms = performance.now() - began;
     told.state = told.error ? "error" : "done";
   } catch (error) {
     if (mine.signal.aborted) return;
