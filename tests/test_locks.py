@@ -236,12 +236,12 @@ def test_a_trace_that_is_missing_is_named_and_its_clips_are_not_handed_out(
 def test_a_digest_tells_every_number_and_every_edge_apart(store: Store) -> None:
     ids = frames_of_lock(lock_of(store, Strategy.every, payloads=False), store)
 
-    alone = list(graph_digests(store.file, [ids[i : i + 1] for i in range(len(ids))]))
-    pairs = list(graph_digests(store.file, [ids[i : i + 2] for i in range(0, len(ids) - 1, 2)]))
+    alone = graph_digests(store.file, [ids[i : i + 1] for i in range(len(ids))])
+    pairs = graph_digests(store.file, [ids[i : i + 2] for i in range(0, len(ids) - 1, 2)])
 
     assert len(set(alone)) == len(ids)  # things move: no two graphs are the same to the last bit
     assert not set(alone) & set(pairs)
-    assert list(graph_digests(store.file, [ids[::2]])) != list(graph_digests(store.file, [ids]))
+    assert graph_digests(store.file, [ids[::2]]) != graph_digests(store.file, [ids])
 
 
 # Sets -------------------------------------------------------------------------------------------------------

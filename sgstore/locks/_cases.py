@@ -83,7 +83,7 @@ def lock_of(
         )
         parts, of = [part for part, _ in pairs], [trace for _, trace in pairs]
         groups = [frame_id for frame_id, _, _ in parts]
-        graphs = list(graph_digests(store.file, groups))
+        graphs = graph_digests(store.file, groups)
         read = payload_digests(store, groups) if payloads else iter([None] * len(parts))
         cases: list[LockedCase] = []
         for part, trace, graph, payload in zip(parts, of, graphs, read, strict=True):

@@ -15,18 +15,21 @@ import numpy as np
 from sgstore.store._packing import seq_of, trace_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from sgstore.store._file import StoreFile
-    from sgstore.world import Ints
+    from sgstore.world import Bools, Ints
 
     Words = NDArray[np.uint64]
 
 
 WINDOW: Final = 4_000
-"""Frames that are read at once."""
+"""Frames whose messages are read at once."""
+
+GRAPHS: Final = 500
+"""Frames whose graphs are read at once; a thousand edges of a frame, and 45 values of each node, are usual."""
 
 DIGEST_BYTES: Final = 16
 
@@ -99,32 +102,37 @@ def marks(file: StoreFile) -> dict[int, Mark]:
     return {row[0]: Mark(*row[1:]) for row in file.rows(_MARKS).values}
 
 
-def graph_digests(file: StoreFile, frames: Sequence[Ints]) -> Iterator[str]:
+def graph_digests(file: StoreFile, frames: Sequence[Ints]) -> list[str]:
     """A digest of the graphs of each of some groups of frames.
 
     Parameters
     ----------
     file : StoreFile
     frames : sequence of int64
-        Groups of ids, ascending in each.
+        Groups of ids, ascending in each. Groups may come in any order: the store is read in its own, once.
     """
+    digests = [""] * len(frames)
+    order = sorted(range(len(frames)), key=lambda number: int(frames[number][0]))
     with file.snapshot():
-        for low, high in _windows([len(group) for group in frames]):
-            groups = frames[low:high]
+        tables = [(v, c, _labels(file, v, c)) for v, c in (_TABLES | _LATER).items()]
+        for low, high in _windows([len(frames[number]) for number in order]):
+            groups = [frames[number] for number in order[low:high]]
             hashes = [hashlib.blake2b(digest_size=DIGEST_BYTES) for _ in groups]
             wanted = np.unique(np.concatenate(groups))
-            for view, columns in (_TABLES | _LATER).items():
-                rows = _rows(file, view, columns, wanted)
-                for number, group in enumerate(groups):
-                    _add(hashes[number], rows, group, always=view in _TABLES)
-            yield from (one.hexdigest() for one in hashes)
+            for view, columns, labels in tables:
+                rows = _rows(file, view, columns, labels, wanted)
+                for one, group in zip(hashes, groups, strict=True):
+                    _add(one, rows, group, always=view in _TABLES)
+            for number, one in zip(order[low:high], hashes, strict=True):
+                digests[number] = one.hexdigest()
+    return digests
 
 
 def _windows(sizes: Sequence[int]) -> Iterator[tuple[int, int]]:
-    """Ranges of groups of about :data:`WINDOW` frames together, one group at least."""
+    """Ranges of groups of about :data:`GRAPHS` frames together, one group at least."""
     low = together = 0
     for high, size in enumerate(sizes):
-        if together + size > WINDOW and high > low:
+        if together + size > GRAPHS and high > low:
             yield low, high
             low, together = high, 0
         together += size
@@ -132,47 +140,75 @@ def _windows(sizes: Sequence[int]) -> Iterator[tuple[int, int]]:
         yield low, len(sizes)
 
 
-def _rows(file: StoreFile, view: str, columns: Sequence[str], wanted: Ints) -> tuple[Ints, Words]:
+def _labels(file: StoreFile, view: str, columns: Sequence[str]) -> dict[str, Words]:
+    """The words of the texts of columns that are enumerations, by their codes."""
+    found: dict[str, Words] = {}
+    for name, kind, *_ in file.rows(f"DESCRIBE SELECT * FROM {view}").values:
+        if name in columns and kind.startswith("ENUM"):
+            [[texts]] = file.rows(f"SELECT enum_range(NULL::{kind})").values
+            found[name] = np.array([_word(text) for text in texts], np.uint64)
+    return found
+
+
+def _rows(
+    file: StoreFile,
+    view: str,
+    columns: Sequence[str],
+    labels: Mapping[str, Words],
+    wanted: Ints,
+) -> tuple[Ints, Words]:
     """The rows of a view: the frame of each, and words; in an order that depends on them alone."""
-    listed = ", ".join(f'v."{column}"' for column in columns)
-    sql = f"SELECT v.frame_id, {listed} FROM {view} v JOIN {_WANTED} ON w.frame_id = v.frame_id"
+    listed = ", ".join(
+        f'enum_code(v."{name}") AS "{name}"' if name in labels else f'v."{name}"'
+        for name in columns
+    )
+    span = f"v.frame_id BETWEEN {wanted[0]} AND {wanted[-1]}"  # what a scan of a table can skip by
+    sql = f"SELECT v.frame_id, {listed} FROM {view} v JOIN {_WANTED} ON w.frame_id = v.frame_id WHERE {span}"
     found = file.arrays(sql, {"frames": wanted.tolist()})
     frame_id = found.pop("frame_id").astype(np.int64)
-    words = np.empty((len(frame_id), 1 + len(columns)), np.uint64)
+    told = [_words(values, labels.get(name)) for name, values in found.items()]
+    order = np.lexsort((*told[2::-1], frame_id))  # what tells rows apart stands in front
+    if _like_before(order, frame_id, *told[:3]).any():
+        order = np.lexsort((*told[::-1], frame_id))
+        order = order[~_like_before(order, frame_id, *told)]
+    frame_id = frame_id[order]
+    words = np.empty((len(order), 1 + len(told)), np.uint64)
     words[:, 0] = seq_of(frame_id).astype(np.uint64)
-    for place, column in enumerate(found.values(), start=1):
-        words[:, place] = _words(column)
-    order = np.lexsort((*words.T[3:0:-1], frame_id))  # what tells rows apart stands in front
-    words, frame_id = words[order], frame_id[order]
-    same = (np.diff(words[:, :4], axis=0) == 0).all(axis=1) & (np.diff(frame_id) == 0)
-    if same.any():
-        order = np.lexsort((*words.T[:0:-1], frame_id))
-        words, frame_id = words[order], frame_id[order]
-    fresh = np.ones(len(words), np.bool_)
-    fresh[1:] = (words[1:] != words[:-1]).any(axis=1) | (frame_id[1:] != frame_id[:-1])
-    return frame_id[fresh], words[fresh]
+    for place, column in enumerate(told, start=1):
+        words[:, place] = column[order]
+    return frame_id, words
+
+
+def _like_before(order: NDArray[np.intp], *columns: NDArray[Any]) -> Bools:
+    """(N,): which rows, in an order, are like the one before them."""
+    like = np.ones(len(order), np.bool_)
+    like[:1] = False
+    for column in columns:
+        ordered = column[order]
+        like[1:] &= ordered[1:] == ordered[:-1]
+    return like
 
 
 _MISSING_DIGEST: Final = np.uint64(0x6E756C6C6E756C6C)
 
 
-def _words(values: NDArray[Any]) -> Words:
-    """Values as 64 bits each."""
+def _words(values: NDArray[Any], labels: Words | None) -> Words:
+    """Values as 64 bits each; codes by the words of what they stand for."""
     plain = np.ma.getdata(values)
     missing = np.ma.getmaskarray(values)
-    if plain.dtype.kind == "f":
+    if labels is not None:
+        words = labels[np.where(missing, 0, plain)]
+    elif plain.dtype.kind == "f":
         numbers = plain.astype(np.float64) + 0.0  # one zero
         missing = missing | np.isnan(numbers)
         words = numbers.view(np.uint64)
     elif plain.dtype.kind in "biu":
         words = plain.astype(np.int64).view(np.uint64)
     else:
-        texts = [
-            "" if gone else str(text) for text, gone in zip(plain.tolist(), missing, strict=True)
-        ]
+        texts = np.where(missing, "", plain).tolist()
         known = {text: _word(text) for text in set(texts)}
-        words = np.fromiter((known[text] for text in texts), np.uint64, len(texts))
-    return np.where(missing, _MISSING_DIGEST, words)
+        words = np.fromiter(map(known.__getitem__, texts), np.uint64, len(texts))
+    return np.where(missing, _MISSING_DIGEST, words) if missing.any() else words
 
 
 def _word(text: str) -> int:
