@@ -16,7 +16,7 @@ import sgstore.pair_numbers._rss as rss
 from sgstore.pair_numbers._ways import WAYS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from sgstore.pair_numbers._declared import PairFunction
 
@@ -106,6 +106,19 @@ _BEFORE_KINDS: Final = 10
 """Numbers before the kinds in the views, which keep the order of their columns; new ones come behind."""
 
 
+def _is_of(name: str, one: str) -> bool:
+    """Tell whether something is a function (a sine, a root) of columns of a alone, or of b alone."""
+    return "(" in EXPRESSIONS.get(name, "") and all(
+        part[:2] == f"{one}_" and part not in EXPRESSIONS for part in parts_of(name)
+    )
+
+
+def _side(one: str, names: Sequence[str]) -> str:
+    """The states as those of a or b, with functions of it alone: worked out once, not for each of its pairs."""
+    made = [f"{pair_sql(name, lambda n: f'{n[2:]}::DOUBLE')} AS {name}" for name in names]
+    return f"(SELECT {', '.join(['*', *made])} FROM inside.state) {one}"  # noqa: S608
+
+
 def pairs_view(view: str = "pairs") -> tuple[str, str]:
     """Return the statement of a view of pairs, without its head, and the documentation of what is first in it.
 
@@ -121,16 +134,20 @@ def pairs_view(view: str = "pairs") -> tuple[str, str]:
     ]
     wanted = frozenset[str]().union(*(needed_for(name) for _, name in listed))
     inputs = sorted(name for name in wanted if not stage_of(name))
+    sides = {one: sorted(name for name in wanted if _is_of(name, one)) for one in "ab"}
     columns = ["b.frame_id", "a.node_id AS src", "b.node_id AS dst"]
     columns += ["a.kind AS src_kind", "b.kind AS dst_kind"]
     columns += ["a.is_ego AS src_is_ego", "b.is_ego AS dst_is_ego"]
     columns += [f"{name[0]}.{name[2:]}::DOUBLE AS {name}" for name in inputs]
-    join = (
-        "inside.state a JOIN inside.state b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id"
+    columns += [f"{one}.{name}" for one, names in sides.items() for name in names]
+    joined = (
+        f"{_side('a', sides['a'])} JOIN {_side('b', sides['b'])}"
+        " ON b.frame_id = a.frame_id AND b.node_id <> a.node_id"
     )
-    text = f"SELECT {', '.join(columns)} FROM {join}"  # noqa: S608
-    for stage in range(1, 1 + max(map(stage_of, wanted))):
-        layer = [f"{pair_sql(n, str)} AS {n}" for n in sorted(wanted) if stage_of(n) == stage]
+    text = f"SELECT {', '.join(columns)} FROM {joined}"  # noqa: S608
+    left = sorted(wanted.difference(*sides.values()))
+    for stage in range(1, 1 + max(map(stage_of, left))):
+        layer = [f"{pair_sql(n, str)} AS {n}" for n in left if stage_of(n) == stage]
         text = f"SELECT *, {', '.join(layer)} FROM ({text})"  # noqa: S608
     numbers = [name if column == name else f"{name} AS {column}" for column, name in listed]
     shown = [*_KEPT[:3], *numbers[:_BEFORE_KINDS], *_KEPT[3:], *numbers[_BEFORE_KINDS:]]
