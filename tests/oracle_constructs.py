@@ -243,7 +243,7 @@ def of_store(
             world, store = worlds(number, Path(folder), **size)
             rng = random.Random(f"{rows[0]} {number}")
             with store.file.snapshot():
-                for _ in range(WORLD if cases == 1 else 10):
+                for _ in range(WORLD if cases == 1 else 50):
                     REMEMBERED.clear()
                     try:
                         found = asked(world, store, rng)

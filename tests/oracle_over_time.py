@@ -259,7 +259,10 @@ class Told:
         return size(low) - slack <= age and (high is None or age <= size(high) + slack)
 
     def either(self, e: Any, i: int, binding: Binding) -> Any:
-        """A condition that looks at other frames, or a value, at a frame."""
+        """A condition that looks at other frames, or a value, at a frame; what AND joins is each of its own."""
+        if isinstance(e, s.Logic) and e.word == "AND" and is_temporal(e):
+            known = [self.either(operand, i, binding) for operand in e.operands]
+            return False if False in known else None if None in known else True
         logic = isinstance(e, s.Temporal | s.Logic) and is_temporal(e)
         return self.true(e, i, binding) if logic else self.value(e, i, binding)
 

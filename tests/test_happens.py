@@ -125,6 +125,32 @@ def test_a_value_may_be_what_happens(store: Store) -> None:
     assert sorted(tuple(row) for row in rows)[2:] == [("untold", 29, None), ("untold", 30, None)]
 
 
+EITHER = "ONCE HAPPENS lane_invasion(e) OR NOT HAPPENS collision(e)"
+BOTH = "HISTORICALLY NOT HAPPENS lane_invasion(e) AND NOT HAPPENS collision(e)"
+
+
+@pytest.mark.parametrize(("condition", "times"), [(EITHER, 60), (BOTH, 0)])
+def test_a_condition_over_time_is_as_true_in_a_value_as_where_it_selects(
+    store: Store, tmp_path: Path, condition: str, times: int
+) -> None:
+    pattern = "USING UNKNOWN false MATCH (e:Ego)"
+    chosen = f"CASE WHEN {condition} THEN 1 ELSE 0 END"
+    kept = dict(store.find(f"{pattern} WHERE {condition} RETURN trace.name, COUNT(*)"))
+    counted = dict(store.find(f"{pattern} RETURN trace.name, SUM({chosen})"))
+    lasting = f"{pattern} RETURN trace.name, MAX({chosen}) OVER match AS most"
+    over = dict(store.find(lasting))
+    found: list[Any] = []
+    path = drive(tmp_path / "untold.mcap", events=False)
+    with opened(str(path), Config()) as source:
+        queries = f"{lasting.replace('trace.name, ', '')}; {pattern} WHERE {condition}"
+        monitor = Monitor(queries, source.road_map, trace="untold", on_event=found.append)
+        monitor.run(source.frames)
+
+    assert (kept.get("untold", 0), counted["untold"], over["untold"]) == (times, times, times > 0)
+    assert [event.values["most"] for event in found if event.values] == [times > 0]
+    assert any(not event.values for event in found) == (times > 0)
+
+
 def test_a_recording_that_would_not_tell_is_left_out(store: Store) -> None:
     matches = store.find("MATCH (e:Ego) WHERE NOT HAPPENS collision(e)")
 

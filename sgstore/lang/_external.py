@@ -44,8 +44,8 @@ from sgstore.lang.ir import (
     Scope,
     SignalCall,
     StepTime,
-    Tense,
     TraceAttribute,
+    is_formula,
     with_operands,
 )
 from sgstore.quoting import quoted
@@ -306,14 +306,12 @@ def with_places(query: Query) -> tuple[Query, dict[Bound, FrameAttribute]]:
     places: dict[Bound, FrameAttribute] = {}
 
     def placed(value: Bound) -> Bound:
-        match value:
-            case Tense() | SignalCall() | StepTime() | OverMatch():
-                if value not in places:
-                    name = f":value {len(places)}"
-                    attribute = Attribute(name, value.type, {}, "", DisplayUnit.whole)
-                    places[value] = FrameAttribute(attribute, value.type)
-                return places[value]
-            case _:
-                return with_operands(value, placed)
+        if not (isinstance(value, SignalCall | StepTime | OverMatch) or is_formula(value)):
+            return with_operands(value, placed)
+        if value not in places:
+            name = f":value {len(places)}"
+            attribute = Attribute(name, value.type, {}, "", DisplayUnit.whole)
+            places[value] = FrameAttribute(attribute, value.type)
+        return places[value]
 
     return replace(query, result=query.result.changed(placed)), places

@@ -711,6 +711,20 @@ def is_temporal(expression: Bound) -> bool:
     )
 
 
+def is_formula(expression: Bound) -> bool:
+    """Tell whether a part of a value is a condition over time: true or false, since there nothing is unknown.
+
+    What ``AND`` joins are conditions of their own, as in ``WHERE``: one of this frame alone may be unknown.
+    """
+    if not isinstance(expression, Operation):
+        return isinstance(expression, Tense)
+    joined = expression.word in {"OR", "NOT", "XOR", "IMPLIES"} and is_temporal(expression)
+    of_matches = StepTime | OverMatch | Aggregate | GroupKey
+    return joined and not any(
+        isinstance(part, of_matches) or is_passed_on(part) for part in walk(expression)
+    )
+
+
 def is_angle(value: Bound) -> bool:
     """Tell whether a value comes round after 360 degrees."""
     match value:

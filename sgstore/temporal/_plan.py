@@ -325,7 +325,7 @@ class Plan:
                 present = self._atom(TRUE, frozenset({node}))
                 assert isinstance(present, f.Proposition)  # noqa: S101 - it speaks of a node
                 test.presence[node] = present.name
-            case b.Tense():
+            case _ if b.is_formula(expression):
                 test.formulas[expression] = self.formula(expression)
             case b.SignalCall(operand=operand):
                 test.signals[operand] = self._signal(operand)

@@ -27,7 +27,6 @@ from sgstore.temporal._offline import (
     chosen_traces,
     frame_times,
 )
-from sgstore.temporal._plan import CONNECTIVES
 from sgstore.temporal._signals import Clock, SignalValues
 from sgstore.temporal._windows import over_columns
 from sgstore.world import longest_step_ns, tolerance_ns
@@ -299,8 +298,6 @@ class RunFinder:
         step = self._query.steps[0]
         if self._query.spans or step.absent or self._query.gaps != "break" or self._ask.everywhere:
             return False
-        if any(isinstance(one, b.Operation) and one.word in CONNECTIVES for one in step.when):
-            return False  # where what is unknown is false
         asked = [*step.when, *(value for place in places for value in _values(place))]
         return all(map(self._is_of_rows, asked))
 
@@ -309,6 +306,8 @@ class RunFinder:
             case b.SignalCall(word=word, operand=operand) if word in b.WINDOWS:
                 plain = not b.is_temporal(operand) and self._is_of_rows(operand)
                 return plain and b.nodes_of(operand) == self._window_nodes
+            case _ if b.is_formula(value):
+                return False  # where what is unknown is false
             case b.Operation(operands=operands) if b.is_temporal(value):
                 return all(map(self._is_of_rows, operands))
             case b.StepTime():

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.lang import Column, ExternalRelation, Window, relation, value_text
-from sgstore.lang.ir import Bound, OverMatch, Query, SignalCall, StepTime, Tense
+from sgstore.lang.ir import Bound, OverMatch, Query, SignalCall, StepTime, is_formula
 from sgstore.matches import TooMuchError
 from sgstore.records import dataclass
 from sgstore.store import BUCKET_BITS
@@ -478,9 +478,7 @@ class Finder:
 
     def _planned(self, place: Bound) -> Formula | Test:
         """The formula, or the test, whose value is asked for at a place."""
-        if isinstance(place, Tense) or (
-            isinstance(place, SignalCall) and place.word == "exists_now"
-        ):
+        if is_formula(place) or (isinstance(place, SignalCall) and place.word == "exists_now"):
             return self._plan.formula(place)
         return self._plan.test(place)
 

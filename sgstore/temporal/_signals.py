@@ -405,7 +405,7 @@ def _over_time(part: b.Bound, test: Test) -> Columns[SignalValues] | None:
     match part:
         case b.SignalCall():
             return lambda at: at.course(part, test)
-        case b.Tense():
+        case _ if part in test.formulas:
             return lambda at: Column(at.condition(part, test))
         case b.Operation(word=word, operands=operands) if word in _TOLERANT and lasts(part):
             compare = _TOLERANT[word]

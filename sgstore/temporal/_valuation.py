@@ -404,7 +404,7 @@ def _courses(expression: b.Bound) -> Iterator[b.SignalCall]:
     """The values over time that an expression is made of; those in their conditions are of other tests."""
     if isinstance(expression, b.SignalCall):
         yield expression
-    elif not isinstance(expression, b.Tense):
+    elif not b.is_formula(expression):
         for operand in b.operands_of(expression):
             yield from _courses(operand)
 
