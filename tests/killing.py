@@ -199,14 +199,17 @@ class Server:
         return self._said.read_text(encoding="utf-8", errors="replace")
 
     def processes(self) -> list[int]:
-        """It and its workers, as long as they live."""
-        found: list[int] = []
-        for stat in Path("/proc").glob("[0-9]*/stat"):
+        """It and its workers, as long as they live.
+
+        One whose first thread has ended holds its locks until the last one has: all threads are looked at.
+        """
+        found: set[int] = set()
+        for stat in Path("/proc").glob("[0-9]*/task/[0-9]*/stat"):
             with suppress(OSError):
                 fields = stat.read_text().rpartition(")")[2].split()
                 if int(fields[3]) == self.pid and fields[0] not in "ZX":
-                    found.append(int(stat.parent.name))
-        return found
+                    found.add(int(stat.parts[2]))
+        return sorted(found)
 
     def kill(self, how: str) -> None:
         """End it."""
