@@ -194,7 +194,11 @@ ALTERED = {
         " place BIGINT, images BIGINT GENERATED ALWAYS AS (place + 1))",
     ),
     "a kind more": ("ALTER TABLE inside.map_edge ALTER src_kind TYPE ENUM ('car', 'hovercraft')",),
-    "a type": ("DROP TYPE light_state", "CREATE TYPE light_state AS ENUM ('red', 'blue')"),
+    "a type": (
+        "ALTER TABLE inside.state ALTER light_state TYPE VARCHAR",  # a type in use is kept
+        "DROP TYPE light_state",
+        "CREATE TYPE light_state AS ENUM ('red', 'blue')",
+    ),
     "a macro like a function": ("CREATE MACRO degrees(x) AS 42",),
     "a macro like an operator": ("CREATE MACRO \"||\"(a, b) AS 'mine'",),
     "a macro like a table function": ("CREATE MACRO range(n) AS TABLE SELECT 1 AS range",),

@@ -439,7 +439,7 @@ def _refused(sql: str, timeout_s: float | None) -> Generator[None]:
         if (fault := engine_fault(error)) is not None:
             raise EngineError(fault) from error
         message = spill_fault(str(error)) or str(error).strip()
-        if "pytz" in message:
+        if "pytz" in message:  # before DuckDB 2.0.1
             message = "times with a time zone cannot be shown; cast them: now()::TIMESTAMP"
         raise SqlError(message) from error
 
