@@ -20,6 +20,7 @@ from thorough import LONG
 import sgstore.temporal._sequences as joins
 from sgstore.demo import RECORDING
 from sgstore.errors import QueryError
+from sgstore.graph import SceneGraph
 from sgstore.step import Frame
 from sgstore.temporal import Monitor
 
@@ -391,3 +392,13 @@ def test_types_of_the_simulator_are_known_while_it_drives() -> None:
         told += [(event.name, event.names["v"]) for event in monitor.step(frame)]
 
     assert told == [("pattern 1", "car 1"), ("pattern 2", "prop 2")]
+
+
+@pytest.mark.parametrize(
+    "text", ["MATCH (a:OffRoad)", "MATCH (a)", "USING UNKNOWN false MATCH (:Car)-[:isIn]->(a)"]
+)
+def test_a_frame_without_an_ego_has_off_road_too(text: str) -> None:
+    nodes = {-1: {"kind": "off_road"}, 3: {"kind": "car"}}
+    scene = SceneGraph(1, "town", 0, 0, None, nodes, [(3, "isIn", -1, {})])
+    found = {event.nodes["a"] for event in Monitor(text).look([scene])}
+    assert found == ({-1, 3} if text == "MATCH (a)" else {-1})

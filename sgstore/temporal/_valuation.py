@@ -229,7 +229,8 @@ class NodeNames:
         if kinds not in self._found:
             view, ego = self._view, self._view.graph.ego
             found = {n for kind in kinds.other for n in view.by_kind.get(kind, ())}
-            found.discard(-1 if ego is None else ego)
+            if ego is not None:
+                found.discard(ego)
             if ego is not None and ego in view.nodes and view.is_one(ego, kinds):
                 found.add(ego)
             self._found[kinds] = frozenset(found)
