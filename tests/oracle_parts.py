@@ -25,6 +25,7 @@ from oracle import (
     free_names,
     named_nodes,
     relations_of,
+    remembered,
     shown,
     try_each,
 )
@@ -116,10 +117,7 @@ class Row(Search):
         if edge.low is None or edge.high is None:
             return {()}
         ends = (right, left) if edge.direction == "left" else (left, right)
-        single = replace(
-            edge, low=None, high=None, direction="any" if edge.direction == "any" else "right"
-        )
-        links = self.joined(single)
+        links = self.joined(step_of(edge))
         found: set[tuple[Any, ...]] = set()
 
         def walk(seen: tuple[Any, ...], length: int) -> None:
@@ -135,6 +133,13 @@ class Row(Search):
         for length in range(edge.low, edge.high + 1):
             walk((ends[0],), length)
         return {way[::-1] for way in found} if edge.direction == "left" else found
+
+
+@remembered
+def step_of(edge: s.EdgePattern) -> s.EdgePattern:
+    """One edge of a way, along it; always the same object, because pairs of nodes are kept by it."""
+    along = "any" if edge.direction == "any" else "right"
+    return replace(edge, low=None, high=None, direction=along)
 
 
 def rows_of(match: s.MatchClause, world: World, text: str) -> list[Row]:

@@ -35,6 +35,10 @@ def world() -> World:
     return random_world(3, traces=3, frames=6)
 
 
+WIDE = "{(c:Ego) WHERE v.x > 101 OR EXISTS {(d) WHERE c.width IS KNOWN OR w.x > 1}}"
+"""Of a block that is in another one, asked beside what was passed on, or a path."""
+
+
 @pytest.mark.parametrize(
     "text",
     [
@@ -47,6 +51,8 @@ def world() -> World:
         "WITH * WHERE v.x > 101 RETURN COUNT(v)",
         "OPTIONAL MATCH (v)-[d]->(w) WITH v, w RETURN v, w, COUNT(*)",
         "OPTIONAL MATCH p = (v)-[:near*1..2]->(w) WHERE length(p) > 1 RETURN v, p, length(p)",
+        f"WITH v, 2 AS n MATCH (w) WHERE COUNT {WIDE} < n RETURN v, w",
+        f"MATCH p = (v)-[:near*1..2]-(w) WHERE EXISTS {WIDE} OR length(p) = 1 RETURN v, w",
     ],
 )
 def test_parts_are_what_their_definition_says(text: str, world: World) -> None:

@@ -32,6 +32,7 @@ from sgstore.lang.ir import (
     PathWay,
     Query,
     Result,
+    ReturnColumn,
     Scope,
     WithStage,
     is_counted,
@@ -109,7 +110,8 @@ def _pattern(
         scope = replace(way.scope, where=where)
         # Conditions of blocks in a later pattern are looked for in the query; it is not the outermost scope.
         asked = scope if rows is None else replace(scope)
-        sql.query, sql.found = replace(query, scope=asked, result=Result(), stages=()), None
+        told = Result(columns=tuple(ReturnColumn(column_of(leaf), leaf) for leaf in wanted))
+        sql.query, sql.found = replace(query, scope=asked, result=told, stages=()), None
         if rows is not None and outer and given is None:
             given = _given(sql, rows, outer)
         stops = frozenset(key for keys in way.nodes for key in keys)
