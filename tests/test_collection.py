@@ -21,7 +21,8 @@ from sgstore.cli import run as run_verb
 from sgstore.collection import Collection, PartialAnswerError, gc, pack, unpack, verify
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection import _engines as engines
-from sgstore.errors import QueryError, SqlError, StoreError
+from sgstore.collection import _worker as worker
+from sgstore.errors import QueryError, QueryNameError, SqlError, StoreError, TextSpan
 from sgstore.lang import _catalog, compile_query, ir, syntax
 from sgstore.lang import _parts as parts
 from sgstore.lang._aggregates import AGGREGATES
@@ -422,7 +423,7 @@ def test_a_statement_of_a_users_sees_no_other_bundle(whole: Collection, place: P
         f'"file {other}.sgstore".inside.trace',
         f"read_blob('{place / 'bundles' / other}.sgstore')",
     ):
-        with pytest.raises(PartialAnswerError):
+        with pytest.raises(SqlError, match=r"does not exist|disabled"):
             list(whole.sql(f"SELECT count(*) FROM {table}", each=True))
 
 
@@ -662,3 +663,29 @@ def test_verbs_ask_collections_as_they_ask_stores(
     assert run_verb(["find", str(place), "MATCH (a:Car)", "--count"]) == 0
     assert int(capsys.readouterr().out) == Store(path).find("MATCH (a:Car)").count()
     assert run_verb(["collection", "gc", str(place), "--dry-run", "--json"]) == 0
+
+
+def test_what_is_wrong_with_a_question_is_no_fault_of_a_bundle(
+    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for engine in ("local", "local:2"):
+        for partial in (False, True):
+            whole = Collection(place, engine=engine, partial=partial)
+            with pytest.raises(SqlError, match='column "nope" was not found'):
+                list(whole.sql("SELECT nope", each=True))
+            assert not whole.missing
+    assert run_verb(["sql", str(place), "SELECT nope", "--each", "--partial"]) == 2
+    said = capsys.readouterr().err
+    assert 'column "nope" was not found' in said
+    assert "bundle" not in said
+
+    span, text = TextSpan(6, 9), "MATCH (a)"
+    refused = QueryNameError("no such thing", text=text, span=span, hint="did you mean b?")
+
+    def refuses(task: dict[str, Any]) -> dict[str, Any]:
+        raise refused
+
+    monkeypatch.setattr(worker, "answer", refuses)
+    with pytest.raises(QueryNameError) as found:
+        Collection(place, partial=True).find("MATCH (a:Car)").rows()
+    assert (str(found.value), found.value.as_dict()) == (str(refused), refused.as_dict())

@@ -5,14 +5,19 @@ from __future__ import annotations
 import os
 import random
 import shlex
-from typing import TYPE_CHECKING
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from recordings import Recorder, car, person
 from thorough import LONG, some
 
 from sgstore.cli import run
+from sgstore.cli._options import LOSS
 from sgstore.collection import Collection, pack
+from sgstore.collection import _worker as worker
+from sgstore.errors import StoreError
 from sgstore.ingest import ingest
 
 if TYPE_CHECKING:
@@ -142,3 +147,109 @@ def test_what_is_said_of_a_collection_is_what_is_said_of_one_store(
     assert expected[1] or expected[2]
     for bundles in asked:
         assert said(verb, str(bundles)) == expected
+
+
+# Bundles that do not answer ---------------------------------------------------------------------
+
+ASKED_OFTEN = [
+    "select {} --minimal --unit clip --clip 1s --no-payloads -o {lock}",
+    "select {} --weakest 'robustness(ego.speed < 11)' --budget 9units --no-payloads -o {lock}",
+    f"select {{}} {CAR} --minimal --combos 2 --unit clip --clip 1s --no-payloads -o {{lock}}",
+]
+"""Verbs that ask a bundle several questions."""
+PARTIAL = {
+    **dict.fromkeys(ASKED_OFTEN, "less"),
+    "coverage classes {} --abstraction E --json": "less",
+    "coverage novel {} --not-in {other} --json": "less",
+    "like {} d2#3 --json": "less",
+    "diff {} {other} --json": "less",
+    f"diff {{}} {{other}} --query {CAR} --json": "less",
+    "lock verify {kept} {} --json": "one",  # what cannot be looked at is not said to be wrong
+}
+"""Verbs, and the store of which is true what they say of a collection where a bundle does not answer."""
+
+
+@pytest.fixture(scope="module")
+def lacking(
+    places: dict[str, Path], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[str, dict[str, Path]]:
+    """A bundle of the collection of three that d2 is not in; and the places with a store without its traces."""
+    whole = Collection(places["3"])
+    home = {trace["name"]: trace["bundle"] for trace in whole.snapshot.traces}
+    bundle = next(one for one in whole.bundles() if one != home["d2"])
+    folder = tmp_path_factory.mktemp("less")
+    kept = [name for name, of in home.items() if of != bundle]
+    ingest(folder / "less.sgstore", [places["one"].parent / f"{name}.mcap" for name in kept])
+    return bundle, {**places, "less": folder / "less.sgstore"}
+
+
+@pytest.mark.parametrize("verb", some([*PARTIAL], 2))
+@pytest.mark.parametrize("comes_back", [False, True])
+def test_partial_answers_are_those_of_the_bundles_that_answered_first(
+    verb: str,
+    comes_back: bool,
+    lacking: tuple[str, dict[str, Path]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    gone, places = lacking
+    failed = list[str]()
+
+    def fails(task: dict[str, Any]) -> dict[str, Any]:
+        if task["bundle"] == gone and not (comes_back and failed):
+            failed.append(gone)
+            raise StoreError("the machine is away")
+        return answer(task)
+
+    answer = worker.answer
+    monkeypatch.setattr(worker, "answer", fails)
+    told: list[tuple[str, bytes]] = []
+    for where in (PARTIAL[verb], "3"):
+        places["lock"].unlink(missing_ok=True)
+        more = ["--partial"] if where == "3" else []
+        code = run([*words_of(verb, places, places[where]), *more])
+        out = capsys.readouterr()
+        lock = places["lock"].read_bytes() if places["lock"].exists() else b""
+        told.append((out.out.replace(str(places[where]), "PLACE"), lock))
+    assert code == LOSS
+    assert f"bundle {gone[:12]}… did not answer: the machine is away" in out.err
+    assert len(failed) == 1  # it is not asked again
+    assert told[0] == told[1]
+
+
+@pytest.mark.parametrize("verb", some(ASKED_OFTEN, 2))
+def test_a_bundle_that_is_lost_between_two_questions_ends_a_verb(
+    verb: str,
+    lacking: tuple[str, dict[str, Path]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    gone, places = lacking
+    asked = list[str]()
+
+    def fails(task: dict[str, Any]) -> dict[str, Any]:
+        asked.extend([gone] if task["bundle"] == gone else [])
+        if len(asked) > 1:
+            raise StoreError("the machine is away")
+        return answer(task)
+
+    answer = worker.answer
+    monkeypatch.setattr(worker, "answer", fails)
+    code = run([*words_of(verb, places, places["3"]), "--partial"])
+    out = capsys.readouterr()
+    assert code == 1
+    assert f"{gone[:12]}…: the machine is away" in out.err
+    assert not out.out
+
+
+@pytest.mark.skipif(not LONG or find_spec("ray") is None, reason="minutes; needs the extra ray")
+def test_ray_says_what_one_store_says(
+    said: Callable[[str, str], tuple[int, str, str, bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ray = import_module("ray")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        for verb in VERBS:
+            assert said(f"{verb} --engine ray", "3") == said(verb, "one"), verb
+    finally:
+        ray.shutdown()

@@ -14,12 +14,24 @@ import sys
 import threading
 from collections import deque
 from contextlib import suppress
+from dataclasses import astuple
 from functools import partial
 from importlib import import_module
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, Protocol, TextIO
 
-from sgstore.errors import MissingExtraError, SgstoreError, StoreError
+from sgstore.errors import (
+    AbstractionError,
+    ConfigError,
+    MissingExtraError,
+    QueryError,
+    QueryNameError,
+    QuerySyntaxError,
+    SgstoreError,
+    SqlError,
+    StoreError,
+    TextSpan,
+)
 from sgstore.processes import command
 
 if TYPE_CHECKING:
@@ -47,7 +59,10 @@ class Engine(Protocol):
     shares_files: bool
 
     def map(self, function: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[Outcome]:
-        """Yield the outcome of each task, as they come; ``{"bundle": …, "error": …}`` of one that failed."""
+        """Yield the outcome of each task, as they come; ``{"bundle": …, "error": …}`` of one that failed.
+
+        What :func:`refusal` adds to it, :func:`fault_of_question` reads.
+        """
         ...
 
 
@@ -77,9 +92,39 @@ def engine_named(name: str) -> Engine:
     )
 
 
+_OF_QUESTIONS: Final = (
+    QuerySyntaxError,
+    QueryNameError,
+    QueryError,
+    SqlError,
+    AbstractionError,
+    ConfigError,
+)
+"""Errors that are due to a question and not to a bundle; what another is derived from comes after it."""
+
+
 def refusal(task: Task, error: SgstoreError) -> Outcome:
     """The outcome of a task that was refused: to do it again would not help."""
-    return {"bundle": task["bundle"], "error": str(error)}
+    outcome = {"bundle": task["bundle"], "error": str(error)}
+    kind = next((one for one in _OF_QUESTIONS if isinstance(error, one)), None)
+    if kind is None:
+        return outcome
+    about: dict[str, Any] = {}
+    if isinstance(error, QueryError):
+        about = {"text": error.text, "span": error.span and astuple(error.span), "hint": error.hint}
+    reason = getattr(error, "reason", str(error))
+    return outcome | {"wrong": {"kind": kind.__name__, "reason": reason, "about": about}}
+
+
+def fault_of_question(outcome: Outcome) -> SgstoreError | None:
+    """The error that is due to the question itself; ``None``: its bundle cannot answer, or did."""
+    if (wrong := outcome.get("wrong")) is None:
+        return None
+    about = wrong["about"]
+    if about.get("span"):
+        about = about | {"span": TextSpan(*about["span"])}
+    kind = next(one for one in _OF_QUESTIONS if one.__name__ == wrong["kind"])
+    return kind(wrong["reason"], **about)
 
 
 class _Here:

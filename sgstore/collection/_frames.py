@@ -168,8 +168,17 @@ class CollectionFrames:
     ) -> Generator[list[PartFile]]:
         """The answers to a question of all bundles, or of those of which each is asked something."""
         with working_folder("parts") as folder:
-            answers = self._whole.ask(question, [*each] or self._bundles, each)
-            yield [part.moved(folder) for answer in answers for part in _parts_of(answer)]
+            found: list[PartFile] = []
+            for bundles in ([*each] or self._bundles, [worker.EMPTY]):  # all may be missing
+                if not found:
+                    asked = {one: each.get(one, _any_of(each)) for one in bundles}
+                    answers = self._whole.ask(question, bundles, asked)
+                    found = [part.moved(folder) for a in answers for part in _parts_of(a)]
+            yield found
+
+
+def _any_of(each: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+    return next(iter(each.values()), {})
 
 
 def _parts_of(answer: Mapping[str, Any]) -> list[PartFile]:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection import _worker as worker
-from sgstore.collection._engines import engine_named
+from sgstore.collection._engines import engine_named, fault_of_question
 from sgstore.collection._frames import CollectionFrames
 from sgstore.collection._pack import refuse_others
 from sgstore.collection._place import place_at
@@ -111,7 +111,9 @@ class Collection:
     tables : mapping of str to path or data frame, optional
         Tables of one's own that are joined to the frames, as :class:`sgstore.Store` takes them.
     partial : bool
-        Whether an answer may lack bundles that cannot be asked; ``missing`` says which.
+        Whether an answer may lack bundles that cannot be asked; ``missing`` says which. They are not asked
+        again, so that several questions are answered by the same bundles: one that has answered, and then
+        cannot be asked, is an error once, and missing from then on.
 
     Raises
     ------
@@ -141,6 +143,7 @@ class Collection:
         refuse_others(self.place, self.snapshot)
         self.missing: dict[str, str] = {}
         self.opened: list[str] = []
+        self._answered = set[str]()
         self._engine_name, self._partial = engine, partial
         self._tables = UserTables(tables) if tables else None
 
@@ -344,38 +347,57 @@ class Collection:
     ) -> Iterator[dict[str, Any]]:
         """Yield what each of some bundles answers, as they come; ``each``: what only one of them is asked.
 
+        Those that are missing are not asked again.
+
         Raises
         ------
         PartialAnswerError
-            Some did not answer, and an answer must be whole.
+            Some did not answer, and an answer must be whole; or they have answered other questions before.
+        QueryError, SqlError, AbstractionError, ConfigError
+            The question is at fault, as a bundle has found.
         """
-        self.opened = list(bundles)
+        self.opened = [one for one in bundles if one not in self.missing]
         failed: dict[str, str] = {}
         with working_folder("answers") as folder:
             base = self._task(question, folder)
-            tasks = [base | {"bundle": bundle} | each.get(bundle, {}) for bundle in bundles]
+            tasks = [base | {"bundle": bundle} | each.get(bundle, {}) for bundle in self.opened]
             done = set[str]()
             for result in self.engine.map(worker.answer, tasks):
                 if result["bundle"] in done:
                     continue
                 done.add(result["bundle"])
                 if "error" in result:
+                    if (fault := fault_of_question(result)) is not None:
+                        raise fault
                     failed[result["bundle"]] = result["error"]
                     if not self._partial:
                         break
                     continue
+                self._answered.add(result["bundle"])
                 yield worker.brought(result, folder)
             self._judge(failed, len(tasks))
 
     def _judge(self, failed: Mapping[str, str], asked: int) -> None:
-        if failed and not self._partial:
-            told = [f"{name[:12]}…: {why}" for name, why in failed.items()]
-            more = [f"… and {len(told) - _SHOWN} more"] if len(told) > _SHOWN else []
-            listed = "\n  ".join([*told[:_SHOWN], *more])
-            raise PartialAnswerError(
-                f"{self.place.url}: not all of {asked} bundles could be asked:\n  {listed}", failed
-            )
-        self.missing |= failed
+        """Refuse an answer without some bundles, or note them if an answer may lack bundles.
+
+        What was asked before may hold what those said that have answered then: so they are not left out now.
+        """
+        lost = failed.keys() & self._answered
+        if self._partial:
+            self.missing |= failed
+        if not lost and (self._partial or not failed):
+            return
+        told = [f"{name[:12]}…: {why}" for name, why in failed.items()]
+        more = [f"… and {len(told) - _SHOWN} more"] if len(told) > _SHOWN else []
+        more += (
+            ["what was asked before was answered by all: ask all of it again"]
+            if lost and self._partial
+            else []
+        )
+        listed = "\n  ".join([*told[:_SHOWN], *more])
+        raise PartialAnswerError(
+            f"{self.place.url}: not all of {asked} bundles could be asked:\n  {listed}", failed
+        )
 
     def _task(self, question: dict[str, Any], folder: Path) -> dict[str, Any]:
         snapshot, tables = self.snapshot, dict[str, str]()
