@@ -91,7 +91,7 @@ test: $(VENV)/.dev
 # pages of the docs and the patterns that come along, and parts of the long programs below. A file that is not listed is of the core.
 EDGES := commonroad coverage coverage_docs crime criticality_recorded derive derive_using like locks selection selection_docs selection_overlapping prioritize \
   draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap export_scenarios export_rerun export_viewers exports exports_docs timeline \
-  assistant notebook carla_live collection collection_landing collection_verbs collection_ray collection_remote collection_spark importing junit lang_sgl pytest_plugin record sample \
+  assistant notebook carla_live collection collection_landing collection_select collection_verbs collection_ray collection_remote collection_spark importing junit lang_sgl pytest_plugin record sample \
   cli_people docs_house docs_queries lang_docs packaging views_page library cookbook textmate tck \
   lanelet2 autoware sumo lane_courses roundabouts zones fuzz mutants serve live report parts sandbox_pool sequences shrink
 tests-of = $(foreach name,$(1),tests/test_$(name).py)
@@ -174,7 +174,7 @@ maps: $(VENV)/.base
 	build/maps/bin/python tests/oracle_sumo.py
 
 # Files of tests that try more where SGSTORE_LONG is set (tests/thorough.py).
-LONG := collection collection_landing collection_verbs collection_ray collection_remote commonroad collection_spark temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \
+LONG := collection collection_landing collection_select collection_verbs collection_ray collection_remote commonroad collection_spark temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file abstractions \
   lang_after lang_attributes lang_counting lang_match lang_oracle lang_parts lang_subgraphs doors frozen importing ingest_data ingest_hardship library zones \
   export_scenarios monitor union store_verify notebook assistant online parts serve sgg_traces step_expressions store_transactions tolerance over_time lane_places lane_courses roundabouts criticality_recorded crime
 oracle: $(VENV)/.dev

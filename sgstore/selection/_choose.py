@@ -24,6 +24,8 @@ from sgstore.coverage import (
 )
 from sgstore.errors import ConfigError
 from sgstore.locks import lock_of
+from sgstore.query import Store
+from sgstore.selection._bundles import UnitsWished, cheapest_units
 from sgstore.selection._cover import affordable, cheapest, has_solver, minimal, within
 from sgstore.selection._units import (
     Budget,
@@ -216,6 +218,21 @@ class SelectionSpec:
                 f"--alpha {self.alpha:g}; expected 0 (the same for all) to 1 (as they are)"
             )
 
+    @property
+    def one_of_alike(self) -> bool:
+        """Tell whether of units that hold the same classes one is enough to choose from, the cheapest."""
+        shared = self.unit is SelectionUnit.clip and (self.stride_s or math.inf) < self.clip_s
+        least = self.strategy is Strategy.minimal or (
+            self.strategy is Strategy.per_class and self.each == 1
+        )
+        return least and not (self.combos or self.sequences or self.budget or shared)
+
+    @property
+    def wished(self) -> UnitsWished:
+        """The units, as a bundle is asked for them."""
+        least = self.abstraction, self.objective, self.seed
+        return UnitsWished(self.unit.value, self.clip_s, self.stride_s, *least)
+
     def as_dict(self, query: str) -> dict[str, Any]:
         """All of it as plain values, as a lock says it."""
         cover = self.strategy in {Strategy.minimal, Strategy.per_class, Strategy.rarest}
@@ -286,8 +303,13 @@ def select(chosen: ChosenFrames, spec: SelectionSpec) -> Selection:
     QueryError, ExportError
         The expression of the strata is none.
     """
-    units = units_of(chosen, spec.unit, spec.clip_s, spec.stride_s)
-    if not len(units):
+    if spec.one_of_alike and not isinstance(chosen.store, Store):
+        units, held = cheapest_units(chosen, chosen.store, spec.wished)
+        if units.total:
+            return _covering(spec, units, units.ranks(spec.seed), held)
+    else:
+        units = units_of(chosen, spec.unit, spec.clip_s, spec.stride_s)
+    if not units.total:
         said = [f"{chosen.text}: no frame to select from"]
         return Selection(
             spec, units, np.zeros(0, np.int64), result={"units": 0, "of": 0}, said=said
@@ -349,7 +371,7 @@ def _covering(spec: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> 
     result |= {"units": len(cover.chosen), "cost": cover.cost, "bound": bound, "exact": cover.exact}
     result["greedy"] = cover.greedy
     said = [
-        f"{len(cover.chosen)} of {len(units)} {units.unit}s keep all {held.total} {held.kind}"
+        f"{len(cover.chosen)} of {units.total} {units.unit}s keep all {held.total} {held.kind}"
         + (f", each in {each} {units.unit}s or in all that have it" if each > 1 else ""),
         f"{spec.objective}: {_number(cover.cost)}; lower bound {_number(bound)}, so "
         + (
@@ -394,7 +416,7 @@ def _covering(spec: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> 
 
 def _said_of(held: Holdings, units: Units, spec: SelectionSpec) -> dict[str, Any]:
     return {
-        "of": len(units),
+        "of": units.total,
         "elements": held.total,
         "kind": held.kind,
         "least": spec.objective,
@@ -654,8 +676,7 @@ def split_table(
     """
     units = selection.units
     of = classed(units.chosen, selection.spec.abstraction)
-    code = np.full(len(units.frame_id), UNKNOWN)
-    code[np.searchsorted(units.frame_id, of.frame_id)] = of.code
+    code = units.codes(of)
     mine = {
         name: np.array([unit for unit, part in parts.items() if part == name], np.int64)
         for name in shares
@@ -777,6 +798,8 @@ def curve(selection: Selection, points: int = POINTS) -> Curve:
     ConfigError
         It was not chosen by what it keeps.
     """
+    if selection.units.others:  # random orders are of all units
+        selection = _of_all_units(selection)
     held, units = selection.holdings, selection.units
     if not len(units):
         return Curve(
@@ -814,6 +837,14 @@ def curve(selection: Selection, points: int = POINTS) -> Curve:
     ]
     table = ReportTable(("units", "kept", "share", "at_random"), rows, said)
     return Curve(table, needed, float(need.mean()), float(need.std()), len(need), seconds)
+
+
+def _of_all_units(selection: Selection) -> Selection:
+    """The same selection among all units, of which bundles left some out."""
+    spec, some = selection.spec, selection.units
+    units = units_of(some.chosen, spec.unit, spec.clip_s, spec.stride_s)
+    picked = np.searchsorted(units.first, some.first[selection.picked])
+    return replace(selection, units=units, picked=picked, holdings=_held(spec, units))
 
 
 def _points(most: int, points: int) -> Ints:

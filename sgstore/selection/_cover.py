@@ -49,6 +49,8 @@ def reduced(family: SetFamily) -> tuple[Ints, list[tuple[SetFamily, Ints]]]:
     forced = np.zeros(len(family), np.bool_)
     wanted = need > 0
     work, size = _COMPARISONS, -1
+    if need.max(initial=0) <= 1:  # at first: bundles of a collection have left out as much
+        alive &= cheapest_alike(family)
     while size != (size := int(alive.sum()) + int(wanted.sum())):
         _force(family, need, alive, forced)
         wanted &= need > 0
@@ -59,6 +61,13 @@ def reduced(family: SetFamily) -> tuple[Ints, list[tuple[SetFamily, Ints]]]:
             work -= _drop_smaller_sets(family, alive, wanted, work)
         alive &= np.bincount(family.set_of[wanted[family.members]], minlength=len(family)) > 0
     return np.flatnonzero(forced), _parts(family, need, alive, wanted)
+
+
+def cheapest_alike(family: SetFamily) -> Bools:
+    """(S,): of sets that hold the same only the cheapest: enough where each element is needed once."""
+    alive = np.ones(len(family), np.bool_)
+    _drop_same_sets(family, alive, np.ones(len(family.need), np.bool_))
+    return alive & (np.diff(family.starts) > 0)
 
 
 def _force(family: SetFamily, need: Ints, alive: Bools, forced: Bools) -> None:

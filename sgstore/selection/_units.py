@@ -120,6 +120,8 @@ class Units:
     log_time_ns : (N,) int64
     begin, end : (U,) int64
         The rows of each unit, the last one not included; both ascend, and each row is in a unit.
+    others : int
+        How many units there are beside these: such as hold what one of these holds, and cost no less.
     """
 
     chosen: ChosenFrames
@@ -129,9 +131,15 @@ class Units:
     log_time_ns: Ints
     begin: Ints
     end: Ints
+    others: int = 0
 
     def __len__(self) -> int:
         return len(self.begin)
+
+    @property
+    def total(self) -> int:
+        """Number of units with those that are left out."""
+        return len(self) + self.others
 
     @property
     def overlap(self) -> bool:
@@ -152,6 +160,12 @@ class Units:
     def last(self) -> Ints:
         """(U,): ids of their last frames."""
         return self.frame_id[self.end - 1]
+
+    def codes(self, of: Classed) -> Ints:
+        """(N,): the class of each frame; unknown of those that were not asked for."""
+        place = np.searchsorted(of.frame_id, self.frame_id)
+        there = np.append(of.frame_id, -1)[place] == self.frame_id
+        return np.where(there, np.append(of.code, UNKNOWN)[place], UNKNOWN)
 
     def rows_of(self, picked: Ints) -> Ints:
         """Rows of the frames of some units, ascending, each once."""
@@ -325,7 +339,7 @@ class Holdings:
     Attributes
     ----------
     classed : Classed or None
-        The frames with their classes; ``None``: the elements are sequences.
+        The frames with their classes; ``None``: the elements are sequences, or bundles told what units hold.
     pairs : (2, M) int64
         Units, and the elements that each holds; each pair once, in order.
     weight : (E,) int64
@@ -368,7 +382,7 @@ class Holdings:
                 "clips that overlap are chosen for sequences by their number alone: leave out --stride, or"
                 " --objective and a budget of time, frames or bytes"
             )
-        pairs = _classes_of(units, self.classed)
+        pairs = classes_of(units, self.classed)
         return replace(self, pairs=pairs if self.has is None else _of_units(pairs, self.has))
 
 
@@ -392,14 +406,19 @@ def holdings(units: Units, abstraction: str, combos: int = 0, *, of_ego: bool = 
         There are more combinations, or combinations in units, than can be gone through.
     """
     of = classed(units.chosen, abstraction)
-    pairs = _classes_of(units, of)
+    pairs = classes_of(units, of)
     if not combos:
         sizes = of.sizes()[of.present()]
-        return Holdings(of, pairs, np.ones_like(sizes), sizes, f"classes in {abstraction}")
+        return Holdings(of, pairs, np.ones_like(sizes), sizes, kind_of(abstraction))
     found = combined(features(of, abstraction, of_ego=of_ego), combos)
     inside, weight, frames = _distinct_combinations(found)
     kind = f"combinations of {combos} features{' of the ego' if of_ego else ''} in {abstraction}"
     return Holdings(of, _of_units(pairs, inside), weight, frames, kind, inside)
+
+
+def kind_of(abstraction: str) -> str:
+    """What elements are that are classes."""
+    return f"classes in {abstraction}"
 
 
 def sequence_holdings(units: Units, k: int, names: Sequence[str], within_s: float) -> Holdings:
@@ -439,13 +458,12 @@ def sequence_holdings(units: Units, k: int, names: Sequence[str], within_s: floa
     return Holdings(None, pairs, np.ones_like(often), often, kind)
 
 
-def _classes_of(units: Units, of: Classed) -> Ints:
+def classes_of(units: Units, of: Classed) -> Ints:
     """(2, M): units, and the classes that occur, counted from 0, that each holds."""
     present = of.present()
     number = np.full(len(of.names) + 1, UNKNOWN)
     number[present] = np.arange(len(present))
-    code = np.full(len(units.frame_id), UNKNOWN)
-    code[np.searchsorted(units.frame_id, of.frame_id)] = number[of.code]
+    code = number[units.codes(of)]
     held = 0
     parts: list[Ints] = []
     for unit, row in units.members():
