@@ -26,6 +26,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING
 
+import duckdb
 import numpy as np
 
 from bench.ingest import recording
@@ -66,12 +67,20 @@ AIMS = {4: 1.25, 10: 1.6}
 """Bundles → at most so many times the processor time of one store."""
 RECORDINGS = 16
 """Recordings that are read in two shares."""
-EMPTY_MS, TASK_MS, BYTES, SHARES = 25.0, 5.0, 1.10, 1.10
+EMPTY_MS, ATTACH_MS, TASK_MS, BYTES, SHARES = 25.0, 10.0, 5.0, 1.10, 1.10
+
+
+def rows_of(asked: Store | Collection, text: str) -> object:
+    return asked.find(text).rows()
+
+
+def verdicts_of(asked: Store | Collection, text: str) -> object:
+    return list(asked.check(text))
 
 
 def questions(asked: Store | Collection) -> list[Callable[[], object]]:
-    finds = [partial(lambda text: asked.find(text).rows(), text) for text in PATTERNS + SEQUENCES]
-    return [*finds, *(partial(lambda text: list(asked.check(text)), text) for text in CHECKS)]
+    finds = [partial(rows_of, asked, text) for text in PATTERNS + SEQUENCES]
+    return [*finds, *(partial(verdicts_of, asked, text) for text in CHECKS)]
 
 
 def seconds(ask: Callable[[], object]) -> float:
@@ -115,12 +124,26 @@ def measures(folder: Path, traces: int, frames: int | None) -> Iterator[Measure]
         ratio = size / path.stat().st_size
         aim_told = f"aim ≤ {BYTES}" if bundles == 4 else ""
         yield Measure(f"bytes of {bundles} bundles", ratio, "times", aim_told)
-        nothing = partial(lambda of: list(of.find(NOTHING)), whole)
+        nothing = partial(rows_of, whole, NOTHING)
         empty = median(seconds(nothing) for _ in range(5)) / bundles
         yield Measure("a bundle that finds nothing", empty * 1e3, "ms", f"aim ≤ {EMPTY_MS:g}")
+        took = median(map(attached, sorted((place / "bundles").iterdir())))
+        yield Measure("attach a bundle, ask it once", took * 1e3, "ms", f"aim ≤ {ATTACH_MS:g}")
     yield from model(spent_on, written, len(one))
     yield from of_ray(folder / "of-10")
     yield from of_shares(folder, 300 if frames else 1_500)
+
+
+def attached(bundle: Path) -> float:
+    """Seconds of processor until a connection that is open has an answer of a bundle, which it leaves again."""
+    with duckdb.connect() as connection:
+        connection.execute("SELECT 1").fetchall()
+        start = time.process_time()
+        connection.execute(f"ATTACH '{bundle}' AS bundle (READ_ONLY)")
+        near = "SELECT count(*) FROM bundle.inside.edge WHERE relation = 'near'"
+        connection.execute(near).fetchall()
+        connection.execute("DETACH bundle")
+        return time.process_time() - start
 
 
 def model(spent_on: Mapping[int, float], frames: int, asked: int) -> Iterator[Measure]:
