@@ -249,11 +249,13 @@ class Search:
                 return self.call(e, binding)
             case s.HappensExpression(kind=kind, arguments=arguments):
                 nodes = [self.value(argument, binding) for argument in arguments]
+                # Of a table of one's own, it is told who is the first of two.
+                turns = (1, -1) if kind in EITHER_WAY else (1,)
                 told = [
                     (a, b)
                     for what, *pair in self.frame.events
                     if what == kind
-                    for a, b in (pair, pair[::-1])
+                    for a, b in (pair[::turn] for turn in turns)
                 ]
                 happened = any([*pair[: len(nodes)]] == nodes for pair in told)
                 return happened or (False if kind in self.frame.trace.records else None)
@@ -317,6 +319,9 @@ class Search:
             return None
         return {"MIN": min, "MAX": max, "AVG": lambda v: sum(v) / len(v)}[e.word](values)
 
+
+EITHER_WAY = {"collision", "lane_invasion", "environment"}
+"""Events of which it is not told who is the first of two."""
 
 NUMBERS = {
     "sqrt": cmath.sqrt,

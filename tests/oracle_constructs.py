@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     Asked = Callable[[World, Store, random.Random], int | Counter[str]]
     """Asks a query; how much it found, or cases of constructs, and how many of these found something."""
 
-MANY = 12
+MANY = 24
 """Cases that a query asks at once."""
 
 
@@ -279,6 +279,8 @@ WATCHED = ("yes", "monitor", "yes")
 """A monitor searches the graph of each frame in memory."""
 OF_ROWS = ("yes", "at end", "at end")
 """About the rows of all traces, which are known when the last of them has ended: only a store answers."""
+OF_TABLES = ("yes", "columns", "no")
+"""Tables stand beside a store: conditions over time are read as columns, and a monitor has none."""
 SMALL = {"traces": 2, "frames": 7}
 
 PROGRAMS = (
@@ -295,17 +297,30 @@ PROGRAMS = (
         MANY + 1,
     ),
     of_store(
+        "over alternatives",
+        WATCHED,
+        partial(compare_over_sequence, many=MANY, expression=True),
+        MANY + 1,
+        **SMALL,
+    ),
+    of_store(
         "over violations",
         WATCHED,
         partial(compare_over_check, many=MANY),
         MANY + 2,
     ),
-    *(of_store(name, WATCHED, asked, MANY) for name, asked in ASKED.items()),
+    *(of_store(name, WATCHED, asked, MANY, **SMALL) for name, asked in ASKED.items()),
     of_store(STEPS, WATCHED, of_steps, 1, **SMALL),
     of_store("MATCH s(v = w)", WATCHED, oracle_answers.of_scenario, 1, **SMALL),
     of_store("second MATCH", WATCHED, oracle_answers.of_second, 1, **SMALL),
     of_store("UNION", WATCHED, oracle_answers.of_union, oracle_answers.POOL, **SMALL),
     of_store("sgql()", OF_ROWS, oracle_answers.of_sql, 2 * oracle_answers.POOL, **SMALL),
+    of_store(
+        "HAPPENS by table", OF_TABLES, oracle_answers.of_tables, 6 * oracle_answers.POOL, **SMALL
+    ),
+    of_store(
+        "chosen INTERVALS", OF_ROWS, oracle_answers.of_intervals, oracle_answers.POOL, **SMALL
+    ),
     of_writer(ALL, oracle_parts.ROWS, oracle_parts.try_many_parts),
     of_writer(OF_ROWS, oracle_after.ROWS, oracle_after.try_many_after),
     Program(oracle_lanes.ROWS, ("yes", "yes", "yes"), oracle_lanes.tried),

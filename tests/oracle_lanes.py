@@ -1,9 +1,9 @@
 """How far it is along the lanes, and how they run: ``python oracle_constructs.py 5000 lane_dist``.
 
-Cars stand anywhere on the lanes of a town. ``lane_dist`` from car to car, the next junction, light and the
-like, curvature and slope are asked of a store, of its graphs in memory, and of a monitor that sees these. By
-definition every way is tried from where a car stands, by Dijkstra; lanes are cut into metres, and heights are
-those of the file.
+Cars stand anywhere on the lanes of a town. ``lane_dist`` from car to car and to parts of the map, the next
+junction, light and the like, curvature and slope are asked of a store, of its graphs in memory, and of a
+monitor that sees these. By definition every way is tried from where a car stands, by Dijkstra; lanes are cut
+into metres, and heights are those of the file.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from builders import Recording
 from graph_blocks import trace_info
 from test_lane_courses import by_elevation, by_its_points
 from test_lane_dist import FARTHEST, lane_ways
-from test_lane_places import SORTS, columns_of, town, traffic
+from test_lane_places import PARTS, SORTS, columns_of, stretches, town, traffic
 
 from sgstore.config import Config
 from sgstore.lang import FrameView
@@ -42,7 +42,7 @@ TOWNS = ("Town07", "multi_intersections", "Town01", "fabriksgatan")
 DATA = Path(os.environ.get("SGSTORE_DATA", Path(__file__).parents[2] / "shared/data"))
 COURSES = ("curvature", "slope")
 NEXT = tuple(f"to_{sort}" for sort in SORTS)
-ROWS = ("lane_dist", "next places", "curvature, slope")
+ROWS = ("lane_dist", "next places", "curvature, slope", "lane_dist of parts")
 
 
 @cache
@@ -70,6 +70,16 @@ class Around:
         return self.rest + self.far.get((lane, "start"), math.inf) + along
 
 
+@cache
+def stretches_of(name: str) -> dict[int, list[tuple[int, float, float]]]:
+    return stretches(known(name)[0])
+
+
+@cache
+def around(name: str, lane: int, along: float) -> Around:
+    return Around(known(name)[1], (lane, along))
+
+
 def tried(number: int) -> Counter[str]:
     """Ask of the traffic of a number; how many cases there were."""
     name = TOWNS[number % len(TOWNS)]
@@ -94,9 +104,22 @@ def compared(store: Store, name: str) -> Counter[str]:
     alone = {tuple(row[:2]): tuple(row[2:]) for row in store.find(one).rows()}
     pairs = {tuple(row[:3]): row[3] for row in store.find(two).rows()}
     seen["tried"] += 2
+    parts = {
+        label: {
+            tuple(row[:3]): row[3]
+            for row in store.find(
+                f"MATCH (v:Car), (p:{label}) RETURN frame.id, v.id, p.id, lane_dist(v, p)"
+            )
+        }
+        for label in PARTS
+    }
+    seen["tried"] += len(PARTS)
     over = [f"FIRST({value}) OVER match" for value in of_one]
     online = f"MATCH (v:Car) RETURN {', '.join(over)};"
-    online += "MATCH (v:Car), (w:Car) RETURN FIRST(lane_dist(v, w)) OVER match"
+    online += "MATCH (v:Car), (w:Car) RETURN FIRST(lane_dist(v, w)) OVER match;"
+    online += ";".join(
+        f"MATCH (v:Car), (p:{label}) RETURN FIRST(lane_dist(v, p)) OVER match" for label in PARTS
+    )
     for frame in sorted({frame for frame, _ in alone}):
         graph = store.file.graph(frame)
         view = FrameView(graph)
@@ -105,7 +128,7 @@ def compared(store: Store, name: str) -> Counter[str]:
         monitor.look([graph])
         monitor.finish()
         told = {
-            tuple(e.nodes[n] for n in "vw" if n in e.nodes): tuple(e.values.values())
+            tuple(e.nodes[n] for n in "vwp" if n in e.nodes): tuple(e.values.values())
             for e in events
         }
         wanted = Defined(graph, name)
@@ -128,7 +151,18 @@ def compared(store: Store, name: str) -> Counter[str]:
             same(far, wanted.between(a, b), (name, frame, a, b))
             seen["lane_dist"] += 1
             seen["lane_dist with rows"] += far is not None
+        for label, rows in parts.items():
+            name_of_it = "lane_dist" if label in SIGNALS_OF_MAP else "part_dist"
+            for _, v, p in [key for key in rows if key[0] == frame]:
+                far, about = rows[frame, v, p], (name, frame, v, label, p)
+                assert far == view.pair(name_of_it, v, p) == told[v, p][0], (about, far)
+                same(far, wanted.part(v, p), about)
+                seen[ROWS[3]] += 1
+                seen[f"{ROWS[3]} with rows"] += far is not None
     return seen
+
+
+SIGNALS_OF_MAP = {"TrafficLight", "StopSign", "Sign", "YieldSign"}
 
 
 def same(found: float | None, wanted: float | None, about: Any) -> None:
@@ -149,6 +183,7 @@ class Defined:
         self.map, ways, self.places = known(name)
         own = graph.places()
         self.own = {node: [Around(ways, (-2 - n, at)) for n, at in own[node]] for node in own}
+        self.idents = {node: about.get("ident", "") for node, about in graph.nodes.items()}
         self.primary = {
             src: (-2 - dst, about["along"])
             for src, relation, dst, about in graph.edges
@@ -168,6 +203,20 @@ class Defined:
         here, there = self.own.get(a, []), self.own.get(b, [])
         ahead = min((one.to(o.lane, o.along) for one in here for o in there), default=math.inf)
         back = min((o.to(one.lane, one.along) for one in here for o in there), default=math.inf)
+        nearest = ahead if ahead <= back else -back
+        return nearest if abs(nearest) <= FARTHEST else None
+
+    def part(self, node: int, part: int) -> float | None:
+        """From an entity to a part of the map: to where it begins, or back to where it ended."""
+        # A light that was recorded is that of the map after whose column it is called.
+        column = -1 - part if part < 0 else int(self.idents[part].split()[1])
+        there = stretches_of(self.name).get(column, [])
+        here = self.own.get(node, [])
+        if any(o.lane == lane and a <= o.along <= b for o in here for lane, a, b in there):
+            return 0.0
+        ahead = min((one.to(lane, a) for one in here for lane, a, _ in there), default=math.inf)
+        ends = [around(self.name, lane, b) for lane, _, b in there] if here else []
+        back = min((end.to(o.lane, o.along) for end in ends for o in here), default=math.inf)
         nearest = ahead if ahead <= back else -back
         return nearest if abs(nearest) <= FARTHEST else None
 

@@ -98,6 +98,8 @@ class Told:
     links: dict[str, tuple[s.EdgePattern, str, str]] = field(default_factory=dict)
     """Edge variables: the edge of the pattern, and the names of the nodes to its left and right."""
     known: dict[Any, Any] = field(default_factory=dict)
+    taken: list[s.StepClause] = field(default_factory=list)
+    """The steps of the match that :meth:`sequences` told last, in the order of its frames."""
 
     def __post_init__(self) -> None:
         self.slack = max(1000, self.period // 100)
@@ -465,6 +467,7 @@ class Told:
                 last = max(n for n, step in enumerate(steps) if not step.absent)
                 if steps[last].hold is not None:
                     end = self.run(end, own[last])[-1]
+                self.taken = [step for step in steps if not step.absent]
                 yield binding, best, end
                 if policy == "first":
                     break
@@ -495,6 +498,7 @@ class Told:
             if policy == "longest":
                 begin = [one for one in found if one[0][0] == best[0][0]]
                 best = max(begin, key=lambda one: (one[0], -one[1]))
+            self.taken = [step for step in ways[best[1]][0] if not step.absent]
             yield best[3], best[0], best[2]
 
     def over(self, e: s.OverExpression, span: tuple[int, int], binding: Binding) -> Any:
@@ -520,7 +524,8 @@ class Told:
     def beside(self, e: Any, span: Any, i: int, binding: Binding) -> Any:
         """A value over some frames, or one of a frame less such a value."""
         if isinstance(e, s.OverExpression):
-            return self.over(e, span(e), binding)
+            frames = span(e)
+            return None if frames is None else self.over(e, frames, binding)
         ((_, over),) = e.rest
         return arithmetic(
             "-", self.value(e.first, i, binding), self.over(over, span(over), binding)
@@ -530,10 +535,10 @@ class Told:
         return (self.times[i] - self.times[0]) / 1e9
 
     def spans(
-        self, sequence: s.SequenceClause, binding: Binding, frames: list[int], end: int
+        self, binding: Binding, frames: list[int], end: int
     ) -> dict[tuple[str, str], tuple[int, int]]:
         """The frames of a match, by the names of the steps that a part of it begins and ends with."""
-        steps = [step for step in sequence.steps if not step.absent]
+        steps = self.taken
         known = set().union(*map(names_of, steps))
         found = {("", ""): (frames[0], end)}
         for n, one in enumerate(steps):
@@ -949,14 +954,18 @@ def compare_condition(world: World, store: Store, rng: random.Random, where: str
     """Ask a pattern with a condition over time both ways; how many rows there are."""
     where = where or condition(rng, pair=True, depth=rng.randint(1, 3), temporal=True)
     value = f"ONCE[0s, 0.2s] ({condition(rng, pair=True, depth=1, temporal=True)})"
-    text = (
-        f"MATCH (e:Ego), (v:Entity) WHERE {where} RETURN trace.name, frame.seq, e, v, {value} AS y"
-    )
+    return compare_values(world, store, where, [value])
+
+
+def compare_values(world: World, store: Store, where: str, values: Sequence[str]) -> int:
+    """Ask values of the frames in which a condition holds both ways; how many rows there are."""
+    told_as = ", ".join(f"{value} AS y{n}" for n, value in enumerate(values))
+    text = f"MATCH (e:Ego), (v:Entity) WHERE {where} RETURN trace.name, frame.seq, e, v, {told_as}"
     found = Counter(tuple(row) for row in store.find(f"USING UNKNOWN false {text}"))
     (statement,) = parse(text)
     assert isinstance(statement, s.MatchClause)
     assert statement.returns is not None
-    asked = statement.returns.items[-1].value
+    asked = [item.value for item in statement.returns.items[4:]]
     expected: Counter[Any] = Counter()
     period = periods(store)
     for trace in world.traces:
@@ -966,13 +975,9 @@ def compare_condition(world: World, store: Store, rng: random.Random, where: str
         )
         for i, binding in told.holds(step, {"e", "v"}):
             nodes = dict(binding)
-            y = (
-                told.true(asked, i, nodes)
-                if is_temporal(asked)
-                else told.searches[i].value(asked, nodes)
-            )
-            expected[trace.name, trace.frames[i].seq, nodes["e"], nodes["v"], y] += 1
-    assert found == expected, (text, found - expected, expected - found)
+            row = [told.either(value, i, nodes) for value in asked]
+            expected[trace.name, trace.frames[i].seq, nodes["e"], nodes["v"], *row] += 1
+    assert found == expected, differing(text, found, expected)
     return sum(expected.values())
 
 
@@ -988,8 +993,10 @@ PAIR_OPERANDS = (
 OVER = ("MIN", "MAX", "AVG", "SUM", "FIRST", "LAST", "ARGMIN", "ARGMAX")
 
 
-def over_values(rng: random.Random, names: list[str], *, pair: bool, many: int = 4) -> list[str]:
-    """Values over a match whose steps have these names."""
+def over_values(
+    rng: random.Random, names: Sequence[str], *, pair: bool, many: int = 4
+) -> list[str]:
+    """Values over a match whose steps have these names, which are told in their order."""
     found: list[str] = []
     for _ in range(many):
         operands = OPERANDS + (PAIR_OPERANDS * 2 if pair else ())
@@ -1003,30 +1010,61 @@ def over_values(rng: random.Random, names: list[str], *, pair: bool, many: int =
     return found
 
 
-def compare_over_sequence(world: World, store: Store, rng: random.Random, *, many: int = 4) -> int:
-    """Ask values over the matches of a sequence both ways; how many there are."""
-    text = random_sequence(rng)
+def named_expression(rng: random.Random) -> tuple[str, list[str]]:
+    """An expression of steps of which those that are not repeated have names, and the names of one way."""
+    while True:
+        text = short_expression(rng)
+        (statement,) = parse(text)
+        assert isinstance(statement, s.MatchClause)
+        ends = once_only(statement.sequence)
+        if len(ends) > 1:
+            break
+    for number, end in reversed([*enumerate(ends)]):
+        text = f"{text[:end]} AS s{number}{text[end:]}"
+    (statement,) = parse(text)
+    assert isinstance(statement, s.MatchClause)
+    steps, _ = rng.choice([*spelled_out(statement.sequence)])
+    return text, [step.name for step in steps if step.name]
+
+
+def once_only(sequence: s.SequenceClause) -> list[int]:
+    """Where the steps of an expression end that are not repeated."""
+    found: list[int] = []
+    for step in sequence.steps:
+        if isinstance(step, s.GroupStep):
+            inner = step.alternatives if step.high == 1 else ()
+            found += [end for one in inner for end in once_only(one)]
+        elif not step.absent:
+            found.append(step.span.end)
+    return found
+
+
+def compare_over_sequence(
+    world: World, store: Store, rng: random.Random, *, many: int = 4, expression: bool = False
+) -> int:
+    """Ask values over the matches of a sequence, or of an expression of steps; how many there are."""
+    text, names = named_expression(rng) if expression else (random_sequence(rng), [])
+    names = names or re.findall(r" AS (s\d)", text)
     policy = rng.choice(("all", "first", "longest"))
-    (plain,) = parse(text)
-    assert isinstance(plain, s.MatchClause)
-    steps = [one for one in plain.sequence.steps if isinstance(one, s.StepClause) and one.name]
-    names = [str(step.name) for step in steps]
     asked = over_values(rng, names, pair="(v" in text, many=many)
-    returns = ", ".join(f"{value} AS y{n}" for n, value in enumerate(asked))
-    query = f"USING UNKNOWN false, MATCHES {policy} {text} RETURN trace.name, t(s0), {returns}"
+    returns = ", ".join(
+        [f"t({name})" for name in names] + [f"{value} AS y{n}" for n, value in enumerate(asked)]
+    )
+    query = f"USING UNKNOWN false, MATCHES {policy} {text} RETURN trace.name, {returns}"
     found = Counter(rounded_row(row) for row in store.find(query))
     (statement,) = parse(query)
     assert isinstance(statement, s.MatchClause)
     assert statement.returns is not None
-    values = [item.value for item in statement.returns.items[2:]]
+    values = [item.value for item in statement.returns.items[1 + len(names) :]]
     expected: Counter[Any] = Counter()
     for trace in world.traces:
         told = Told(trace, periods(store)[trace.name])
         for binding, frames, end in told.sequences(statement.sequence, policy):
-            spans = told.spans(statement.sequence, binding, frames, end)
-            parts = partial(lambda e, spans: spans[part_of(e)], spans=spans)
+            spans = told.spans(binding, frames, end)
+            times = {step.name: told.seconds(i) for step, i in zip(told.taken, frames, strict=True)}
+            parts = partial(lambda e, spans: spans.get(part_of(e)), spans=spans)
             row = [told.beside(one, parts, frames[-1], binding) for one in values]
-            expected[rounded_row((trace.name, told.seconds(frames[0]), *row))] += 1
+            expected[rounded_row((trace.name, *map(times.get, names), *row))] += 1
     assert found == expected, differing(query, found, expected)
     seen = Counter(row for trace in world.traces for row in watched(trace, query, periods(store)))
     assert seen == expected, differing(f"online {query}", seen, expected)

@@ -56,7 +56,7 @@ def key(row: tuple[Any, ...]) -> tuple[Any, ...]:
 def test_random_answers_are_what_their_definition_says(tmp_path: Path) -> None:
     found = run(range(4) if LONG else range(1), 50 if LONG else 2, tmp_path)
 
-    assert {"union", "sql", "second", "scenario"} <= found.keys()
+    assert {"union", "sql", "second", "scenario", "tables", "intervals"} <= found.keys()
 
 
 @pytest.mark.parametrize("form", RETURNS)
