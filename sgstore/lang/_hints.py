@@ -274,7 +274,7 @@ def variable_hint(name: str, visible: Iterable[str], elsewhere: bool) -> str | N
         Whether another part of the query binds one of that name.
     """
     if elsewhere:
-        return "a variable of a block is known in this block only: bind it in MATCH"
+        return "what a block, or one of several steps, binds is known there only: bind it in MATCH"
     word = normalize_name(name)
     if (said := said_of("variables", name)) is not None:
         return said.format(name=name)

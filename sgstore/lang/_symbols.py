@@ -287,7 +287,9 @@ class SymbolTable:
             hint = self._hint(name)
             self.session.unknown("variable", name, span, known, hint)
         elif meaning.node is None:
-            self.session.refuse(f"'{name}' is not a node", span)
+            way = meaning.value is not None and meaning.value.type is Type.list
+            hint = f"of a path there are length({name}) and nodes({name})" if way else None
+            self.session.refuse(f"'{name}' is not a node", span, hint)
         else:
             key = meaning.node
         self.scope.mention(key)
