@@ -98,6 +98,8 @@ class Told:
     links: dict[str, tuple[s.EdgePattern, str, str]] = field(default_factory=dict)
     """Edge variables: the edge of the pattern, and the names of the nodes to its left and right."""
     known: dict[Any, Any] = field(default_factory=dict)
+    bridge: bool = False
+    """Whether a gap between frames ends nothing."""
     taken: list[s.StepClause] = field(default_factory=list)
     """The steps of the match that :meth:`sequences` told last, in the order of its frames."""
 
@@ -108,7 +110,9 @@ class Told:
         self.searches = [Search(frame, frame.graph, injective=True) for frame in self.frames]
 
     def gap_before(self, i: int) -> bool:
-        return self.times[i] - self.times[i - 1] > GAP * self.period + self.slack
+        return (
+            not self.bridge and self.times[i] - self.times[i - 1] > GAP * self.period + self.slack
+        )
 
     # Conditions
 
@@ -1050,7 +1054,9 @@ def compare_over_sequence(
     returns = ", ".join(
         [f"t({name})" for name in names] + [f"{value} AS y{n}" for n, value in enumerate(asked)]
     )
-    query = f"USING UNKNOWN false, MATCHES {policy} {text} RETURN trace.name, {returns}"
+    bridge = len(text) % 4 == 0
+    using = f"USING UNKNOWN false, MATCHES {policy}" + ", GAPS bridge" * bridge
+    query = f"{using} {text} RETURN trace.name, {returns}"
     found = Counter(rounded_row(row) for row in store.find(query))
     (statement,) = parse(query)
     assert isinstance(statement, s.MatchClause)
@@ -1058,7 +1064,7 @@ def compare_over_sequence(
     values = [item.value for item in statement.returns.items[1 + len(names) :]]
     expected: Counter[Any] = Counter()
     for trace in world.traces:
-        told = Told(trace, periods(store)[trace.name])
+        told = Told(trace, periods(store)[trace.name], bridge=bridge)
         for binding, frames, end in told.sequences(statement.sequence, policy):
             spans = told.spans(binding, frames, end)
             times = {step.name: told.seconds(i) for step, i in zip(told.taken, frames, strict=True)}
@@ -1124,7 +1130,9 @@ def compare_over_pattern(
     pattern = pattern or "(e:Ego), (v:Entity)"
     pair = "(v:Lane)" not in pattern
     where = condition(rng, pair=pair, depth=rng.randint(0, 1), temporal=rng.random() < 0.3)
-    text = f"USING UNKNOWN false MATCH {pattern} WHERE {where} RETURN trace.name, frame.seq, e, v, "
+    bridge = len(where) % 4 == 0
+    using = "USING UNKNOWN false" + ", GAPS bridge" * bridge
+    text = f"{using} MATCH {pattern} WHERE {where} RETURN trace.name, frame.seq, e, v, "
     text += ", ".join(f"{value} AS y{n}" for n, value in enumerate(asked))
     found = Counter(rounded_row(row) for row in store.find(text))
     (statement,) = parse(text)
@@ -1134,7 +1142,7 @@ def compare_over_pattern(
     expected: Counter[Any] = Counter()
     runs: Counter[Any] = Counter()
     for trace in world.traces:
-        told = Told(trace, periods(store)[trace.name], edges_of(statement.block))
+        told = Told(trace, periods(store)[trace.name], edges_of(statement.block), bridge=bridge)
         step = replace(statement.sequence.steps[0], hold=None)
         held = told.holds(step, {"e", "v"})
         frames: dict[Any, set[int]] = {}
