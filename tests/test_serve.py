@@ -225,6 +225,15 @@ def test_sql_is_answered_in_the_same_place(page: Page) -> None:
     assert (answer["columns"], answer["rows"]) == (["n"], [[750]])
 
 
+def test_numbers_that_a_page_would_round_are_texts(page: Page, store: Store) -> None:
+    statement = "SELECT max(frame_id) AS id, 9007199254740992 AS most FROM frames"
+    ((frame, most),) = store.sql(statement).values
+    (answer,) = page.find(statement)
+
+    assert frame > most
+    assert answer["rows"] == [[str(frame), most]]
+
+
 def test_numbers_that_json_has_no_word_for_are_texts(page: Page) -> None:
     (answer,) = page.find("SELECT 'inf'::DOUBLE AS a, '-inf'::DOUBLE AS b, 'nan'::DOUBLE AS c")
     check = page.post("/api/check", text="CHECK p: ALWAYS FALSE IMPLIES TRUE ROBUSTNESS")

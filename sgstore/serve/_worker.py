@@ -55,13 +55,15 @@ def _told_matches(store: Store, question: dict[str, Any], most: int) -> Iterator
 def _told_rows(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
     """Rows of a pattern or of a statement of SQL, as JSON holds them."""
     key = "sql" if question["ask"] == "sql" else "find"
-    yield rows_found(store, {key: question["text"], "parameters": question["parameters"]}, most)
+    told = rows_found(store, {key: question["text"], "parameters": question["parameters"]}, most)
+    for row in told["rows"]:  # identifiers of frames are larger than numbers of a page are exact
+        row[:] = [str(v) if isinstance(v, int) and abs(v) > 2**53 else v for v in row]
+    yield told
 
 
 def _told_parts(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
     """Lanes of truth."""
-    binding = question["binding"]
-    text, values = question["text"], question["parameters"]
+    text, values, binding = question["text"], question["parameters"], question["binding"]
     yield store.parts(text, question["frame"], binding, **values).as_dict()
 
 
