@@ -4,15 +4,7 @@ import { unpacked } from "./wire.js";
 
 /** @typedef {Record<string, any>} Plain */
 
-export class Refused extends Error {
-  /** @param {string} reason @param {Plain} about */
-  constructor(reason, about = {}) {
-    super(reason);
-    this.about = about;
-  }
-}
-
-/** @param {string} path @param {Plain | undefined} body @param {RequestInit} [how] */
+/** @param {string} path @param {Plain} [body] @param {RequestInit} [how] */
 async function send(path, body, how = {}) {
   const given = body === undefined
     ? {}
@@ -22,13 +14,13 @@ async function send(path, body, how = {}) {
     answer = await fetch(path, { credentials: "same-origin", ...given, ...how });
   } catch (error) {
     if (error instanceof DOMException && error.name === "AbortError") throw error;
-    throw new Refused("The server does not answer. Is 'sgstore serve' still running?");
+    throw new Error("The server does not answer. Is 'sgstore serve' still running?");
   }
   if (answer.ok) return answer;
   /** @type {Plain} */
   let about = {};
   try { about = await answer.json(); } catch { /* no JSON */ }
-  throw new Refused(about.reason || `the server answered ${answer.status}`, about);
+  throw new Error(about.reason || `the server answered ${answer.status}`);
 }
 
 /** @param {string} path @param {Plain} values */
@@ -36,20 +28,13 @@ export function address(path, values) {
   return `${path}?${new URLSearchParams(Object.entries(values).map(([k, v]) => [k, String(v)]))}`;
 }
 
-/** @param {string} path @param {Plain} [body] @param {RequestInit} [how] @returns {Promise<any>} */
-export async function json(path, body, how) {
-  return (await send(path, body, how)).json();
-}
-
-/** @param {string} path @param {Plain} [body] @param {RequestInit} [how] */
-export async function blob(path, body, how) {
-  return (await send(path, body, how)).blob();
-}
-
-/** @param {string} path @param {Plain} [body] @param {RequestInit} [how] */
-export async function columns(path, body, how) {
-  return unpacked(await (await send(path, body, how)).arrayBuffer());
-}
+/** @typedef {Parameters<typeof send>} Asked */
+/** @param {Asked} asked @returns {Promise<any>} */
+export const json = async (...asked) => (await send(...asked)).json();
+/** @param {Asked} asked */
+export const blob = async (...asked) => (await send(...asked)).blob();
+/** @param {Asked} asked */
+export const columns = async (...asked) => unpacked(await (await send(...asked)).arrayBuffer());
 
 /** Lines of an answer, as they come. @param {string} path @param {Plain} body @param {RequestInit} [how] */
 export async function* lines(path, body, how) {
@@ -71,8 +56,8 @@ export async function* lines(path, body, how) {
 export async function work(path, body, progress, how) {
   for await (const { progress: done, error, result } of lines(path, body, how)) {
     if (done) progress?.(done[0], done[1]);
-    else if (error) throw new Refused(error.reason, error);
+    else if (error) throw new Error(error.reason);
     else return result;
   }
-  throw new Refused("the server ended before it was done");
+  throw new Error("the server ended before it was done");
 }

@@ -18,15 +18,17 @@ export const series = signal(/** @type {any} */ (null));
 export const frame = computed(() => Math.round(seq.value));
 export const asked = computed(() => answer.value.query || text.value.trim());
 
+/** The trace that is open. */
+export const about = computed(() => traces.value.get(open.value?.trace || ""));
 /** First and last frame of the timeline: of the trace; of a monitor of what is kept. */
-export const range = computed(/** @returns {[number, number]} */ () => (live.value ? span.value : [0, Math.max((traces.value.get(open.value?.trace || "")?.frames || 1) - 1, 0)]));
+export const range = computed(/** @returns {[number, number]} */ () => (live.value ? span.value : [0, (about.value?.frames || 1) - 1]));
 
 /** First and last frame that can be shown: of the timeline; in a report of what it holds around the match. */
 const bounds = computed(/** @returns {[number, number]} */ () => {
-  if (live.value) return span.value;
-  const about = traces.value.get(open.value?.trace || ""), match = open.value?.match;
-  const end = Math.max((about?.frames || 1) - 1, 0), around = Math.floor((store.value?.around || 0) / (about?.period || 0.1));
-  return offline.value && match ? [Math.max(match.first - around, 0), Math.min(match.last + around, end)] : [0, end];
+  const [first, last] = range.value, match = open.value?.match;
+  if (live.value || !offline.value || !match) return [first, last];
+  const around = Math.floor(store.value.around / (about.value?.period || 0.1));
+  return [Math.max(match.first - around, first), Math.min(match.last + around, last)];
 });
 
 /** Which parts hold now, by lane; of a monitor whose last frames were not looked at yet, in the last that was. @param {number} now @param {any} [of] */
@@ -50,23 +52,19 @@ export async function refresh() {
   if (more && series.value === curve) series.value = { ...curve, columns: more.columns };
 }
 
-let turn = 0, answered = /** @type {any} */ (null);
+let answered = /** @type {any} */ (null);
 // Lanes are asked for when another match is opened, not when their answer said which nodes are bound.
 effect(() => {
   const now = open.value, query = asked.value;
   if (now && now === answered) return;
-  const mine = ++turn;
-  lanes.value = null;
-  why.value = null;
-  series.value = null;
-  const body = now && lanesWanted(now, query);
+  lanes.value = why.value = series.value = null;
+  const body = now && lanesWanted(now, query), current = () => open.value === now && asked.value === query;
   if (!body) return;
   api.json("api/parts", body).then((found) => {
-    if (mine !== turn) return;
-    if (found.error) return;
+    if (found.error || !current()) return;
     lanes.value = found;
     if (!now.binding && Object.keys(found.binding).length) open.value = answered = { ...now, binding: found.binding };
-  }).catch((error) => { if (mine === turn) say(reasonOf(error)); });
+  }).catch((error) => { if (current()) say(reasonOf(error)); });
 });
 
 /** Lanes of the same match in the second store, while that is shown beside. */
@@ -93,7 +91,7 @@ function sameIn(other, now) {
 
 // The first camera of a trace, unless one was chosen that it has.
 effect(() => {
-  const cameras = traces.value.get(open.value?.trace || "")?.cameras || [];
+  const cameras = about.value?.cameras || [];
   if (!cameras.includes(camera.peek())) camera.value = cameras[0] || "";
 });
 
@@ -120,11 +118,9 @@ export function copyLink() {
 let last = 0;
 /** @param {number} now */
 function step(now) {
-  const about = traces.value.get(open.value?.trace || "");
-  if (playing.value && about) {
-    const next = seq.value + ((now - last) / 1000) * rate.value / (about.period || 0.1);
-    if (next >= bounds.value[1]) { seq.value = bounds.value[1]; playing.value = false; } else seq.value = next;
-  }
+  const next = seq.value + ((now - last) / 1000) * rate.value / (about.value?.period || 0.1);
+  if (playing.value) goTo(next);
+  if (next >= bounds.value[1]) playing.value = false;
   last = now;
   if (playing.value) requestAnimationFrame(step);
 }

@@ -3,10 +3,9 @@
 import { computed, h, htm, signal, useEffect, useState } from "../vendor/core.js";
 import * as api from "./api.js";
 import { beside } from "./clock.js";
-import { setQuery } from "./editor.js";
 import { Gallery } from "./gallery.js";
 import { abstraction, Table, useWork } from "./sheets.js";
-import { find, inOther, matchesIn, openFrame, parametersOf, reasonOf, say, store, text, traces, view } from "./state.js";
+import { find, inOther, matchesIn, openFrame, parametersOf, reasonOf, say, store, text, traces } from "./state.js";
 
 const html = htm.bind(h);
 const MOST = 2000; // tiles of what differs
@@ -37,8 +36,7 @@ async function framesOf(query, of, signal) {
 /** Open a frame that differs, in the store that has it, and ask the query that finds it. @param {string} trace @param {number} at @param {string} query */
 async function go(trace, at, query) {
   if (!traces.value.has(trace)) { say(`only the second store has ${trace}`); return; }
-  view.value = "find";
-  if (query !== text.value.trim()) setQuery(query);
+  text.value = query;
   await find();
   beside.value = !!store.value.other;
   openFrame(trace, at);

@@ -2,7 +2,7 @@
 // Columns of states, maps and pictures as the page needs them: asked for once, kept while they are near.
 import { signal } from "../vendor/core.js";
 import * as api from "./api.js";
-import { live, store, traces } from "./state.js";
+import { live, offline, store, traces } from "./state.js";
 
 /** @typedef {import("./state.js").Match} Match */
 
@@ -14,50 +14,61 @@ const PICTURES = 120;
 /** Counts what has come, so that what waits for it is drawn again. */
 export const arrived = signal(0);
 
-/** @type {Map<string, any>} */
-const maps = new Map();
-/** @type {Map<string, any>} */
-const still = new Map();
-/** @type {Map<string, any>} */
-const chunks = new Map();
-/** @type {Map<string, any>} */
-const thumbs = new Map();
-/** @type {Map<string, any>} */
-const pictures = new Map();
+/** What the server was asked for, by key; of more than `most` those go that were not used for the longest time.
+ * @extends {Map<string, any>} */
+class Kept extends Map {
+  /** @param {number} [most] @param {(value: any) => void} [end] */
+  constructor(most = Infinity, end = () => {}) {
+    super();
+    this.most = most;
+    this.end = end;
+  }
+
+  /** What is known of a key; asks for it if nothing is. @param {string} key @param {() => Promise<any>} ask */
+  known(key, ask) {
+    const found = this.get(key);
+    if (found === undefined) {
+      const tell = (/** @type {any} */ told) => { this.set(key, told); arrived.value++; };
+      this.set(key, null);
+      ask().then(tell, (failed) => tell({ failed }));
+    } else { // the one that was used last is the last to go
+      this.delete(key);
+      this.set(key, found);
+    }
+    this.trim();
+    return found && !found.failed ? found : null;
+  }
+
+  trim() {
+    for (const [key, value] of this) {
+      if (this.size <= this.most) break;
+      this.end(value);
+      this.delete(key);
+    }
+  }
+}
+
+const maps = new Kept(), still = new Kept(), chunks = new Kept(KEPT), thumbs = new Kept(6000);
+/** A report keeps all that it holds. */
+export const keepAll = () => { chunks.most = Infinity; };
+const pictures = new Kept(PICTURES, (found) => found?.image?.close());
 
 /** What a request calls a trace. @param {import("./state.js").Trace} about */
 const of = (about) => (about.side ? { trace: about.name, side: about.side } : { trace: about.name });
-
-/** What is known of a key; asks for it if nothing is. @param {Map<string, any>} kept @param {string} key @param {() => Promise<any>} ask */
-function known(kept, key, ask) {
-  if (!kept.has(key)) {
-    kept.set(key, null);
-    ask().then((found) => { kept.set(key, found); arrived.value++; })
-      .catch((error) => { kept.set(key, { failed: error }); arrived.value++; });
-  }
-  const found = kept.get(key);
-  return found && !found.failed ? found : null;
-}
 
 /** The road map of a trace: each ring with its path, its box and its node.
  * @param {string} trace */
 export function mapOf(trace) {
   const about = traces.value.get(trace);
   if (!about?.map_key) return null;
-  return known(maps, about.map_key, async () => {
+  return maps.known(about.map_key, async () => {
     const { header, columns } = await api.columns(api.address("api/map", of(about)));
     if (!columns.x) return { origin: [0, 0], rings: [], nodes: new Map() };
     const rings = [], nodes = new Map();
     for (let i = 0; i + 1 < columns.start.length; i++) {
-      const path = new Path2D(), from = columns.start[i], to = columns.start[i + 1];
-      /** @type {[number, number, number, number]} */
-      const box = [Infinity, Infinity, -Infinity, -Infinity];
-      for (let k = from; k < to; k++) {
-        const x = columns.x[k], y = columns.y[k];
-        if (k === from) path.moveTo(x, y); else path.lineTo(x, y);
-        box[0] = Math.min(box[0], x); box[1] = Math.min(box[1], y);
-        box[2] = Math.max(box[2], x); box[3] = Math.max(box[3], y);
-      }
+      const path = new Path2D(), [xs, ys] = [columns.x, columns.y].map((all) => all.subarray(columns.start[i], columns.start[i + 1]));
+      xs.forEach((/** @type {number} */ x, /** @type {number} */ k) => path.lineTo(x, ys[k]));
+      const box = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
       if (columns.closed[i]) path.closePath();
       const ring = { path, box, word: header.words[columns.word[i]], closed: columns.closed[i], node: columns.node[i] };
       rings.push(ring);
@@ -71,7 +82,7 @@ export function mapOf(trace) {
 /** What never moves in a trace, and the names of its entities. @param {string} trace */
 export function stillOf(trace) {
   const about = traces.value.get(trace);
-  return about ? known(still, trace, () => api.columns(api.address("api/static", of(about)))) : null;
+  return about ? still.known(trace, () => api.columns(api.address("api/static", of(about)))) : null;
 }
 
 /** A person's name of a node. @param {string} trace @param {number} node */
@@ -109,6 +120,7 @@ export function feedStill(trace, rows, names) {
 export function keepThumb(trace, frame) {
   const found = fed.get(frame);
   if (found) thumbs.set(`${trace}#${frame}`, found);
+  thumbs.trim();
 }
 
 /** States of a frame: arrays, and the rows that are of it. @param {string} trace @param {number} frame */
@@ -117,18 +129,10 @@ export function statesAt(trace, frame) {
   const number = Math.floor(frame / CHUNK), key = `${trace}\n${number}`;
   const about = traces.value.get(trace);
   if (!about) return null;
-  const found = known(chunks, key, async () => {
+  const found = chunks.known(key, async () => {
     const first = number * CHUNK, last = Math.min(first + CHUNK, about.frames) - 1;
     return (await api.columns(api.address("api/states", { ...of(about), first, last }))).columns;
   });
-  if (found) { // the one that was used last is the last to go
-    chunks.delete(key);
-    chunks.set(key, found);
-    for (const old of chunks.keys()) {
-      if (chunks.size <= KEPT) break;
-      if (chunks.get(old)) chunks.delete(old);
-    }
-  }
   const next = (number + 1) * CHUNK;
   if (frame - number * CHUNK > CHUNK * 0.6 && next < about.frames && !chunks.has(`${trace}\n${number + 1}`)) {
     statesAt(trace, next);
@@ -151,12 +155,12 @@ const MANY = 60;
 
 /** @param {string} trace @param {number} frame */
 export function thumbOf(trace, frame) {
-  return thumbs.get(`${trace}#${frame}`) || null;
+  return offline.value && !live.value ? statesAt(trace, frame) : thumbs.get(`${trace}#${frame}`) || null;
 }
 
 /** @param {[string, number][]} frames what is in sight, the first first */
 export function wantThumbs(frames) {
-  wanted = live.value ? [] : frames.filter(([trace, frame]) => !thumbs.has(`${trace}#${frame}`));
+  wanted = offline.value ? [] : frames.filter(([trace, frame]) => !thumbs.has(`${trace}#${frame}`));
   ask();
 }
 
@@ -175,7 +179,7 @@ async function ask() {
       while (row < columns.at.length && columns.at[row] === at) row++;
       thumbs.set(`${trace}#${frame}`, { columns, from, to: row });
     });
-    if (thumbs.size > 6000) for (const key of [...thumbs.keys()].slice(0, 2000)) thumbs.delete(key);
+    thumbs.trim();
   } catch (error) {
     for (const [trace, frame] of now) thumbs.set(`${trace}#${frame}`, { columns: null, from: 0, to: 0 });
   }
@@ -208,19 +212,12 @@ export function pictureAt(trace, channel, frame, ahead) {
 
 /** @param {string} trace @param {string} channel @param {number} seq */
 function fetchPicture(trace, channel, seq) {
-  known(pictures, `${trace}\n${channel}\n${seq}`, async () => {
+  pictures.known(`${trace}\n${channel}\n${seq}`, async () => {
     fetching++;
     const data = await api.blob(api.address("api/picture", { trace, channel, seq })).finally(() => { fetching--; });
     if (!data.size) throw new Error("no picture of this frame is kept");
     return { image: await createImageBitmap(data), seq };
   });
-  if (pictures.size > PICTURES) {
-    for (const key of pictures.keys()) {
-      if (pictures.size <= PICTURES) break;
-      pictures.get(key)?.image?.close();
-      pictures.delete(key);
-    }
-  }
 }
 
 /** Name of a kind by its number. @param {number} code @returns {string} */

@@ -1,5 +1,6 @@
 // @ts-check
 // Scenes on a canvas, from columns: the road map, what stands and what moves, what is matched.
+import { computed } from "../vendor/core.js";
 import { kindOf, lightOf, mapOf, stillOf } from "./data.js";
 import { paints, traces } from "./state.js";
 
@@ -31,29 +32,20 @@ const DARK_KINDS = { ...KINDS, building: "#3d434c", vegetation: "#33432f", prop:
 const LIGHTS = { red: "#e5383b", red_yellow: "#ff8c1a", yellow: "#ffb703", green: "#2ec4a0", flashing: "#ffe08a", off: "#5a626f" };
 export const SCENERY = new Set(["building", "vegetation", "prop", "pole", "barrier"]);
 
-/** @type {{at: number, ink: ReturnType<typeof inksNow> | null}} */
-const known = { at: -1, ink: null };
-
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { paints.value++; });
+const scheme = matchMedia("(prefers-color-scheme: dark)");
+scheme.addEventListener("change", () => { paints.value++; });
 
 /** Colours of the page, light or dark; looked for again when they change. */
-export function inks() {
-  if (known.at !== paints.peek() || !known.ink) { known.at = paints.peek(); known.ink = inksNow(); }
-  return known.ink;
-}
-
-function inksNow() {
-  const style = getComputedStyle(document.documentElement);
-  const of = (/** @type {string} */ name) => style.getPropertyValue(name).trim();
-  const dark = matchMedia("(prefers-color-scheme: dark)").matches;
-  const theme = document.documentElement.dataset.theme;
-  const isDark = theme ? theme === "dark" : dark;
+const inks = computed(() => {
+  const { theme } = document.documentElement.dataset, isDark = theme ? theme === "dark" : scheme.matches;
+  const style = getComputedStyle(document.documentElement), of = (/** @type {string} */ name) => style.getPropertyValue(name).trim();
   return {
-    dark: isDark, ink: of("--ink"), faint: of("--faint"), ego: of("--ego"), hold: of("--hold"), fail: of("--fail"),
+    at: paints.value, ink: of("--ink"), faint: of("--faint"), ego: of("--ego"), hold: of("--hold"), fail: of("--fail"),
     mark: of("--mark"), ground: of("--map-ground"), raised: of("--raised"), lanes: isDark ? DARK_LANES : LANES, kinds: isDark ? DARK_KINDS : KINDS,
     line: isDark ? "#59636f" : "#ffffff",
   };
-}
+});
+/** @typedef {typeof inks.value} Inks */
 
 /** Make the points of a canvas those of the screen; its size in points of the page. @param {HTMLCanvasElement} canvas */
 export function fitted(canvas) {
@@ -63,39 +55,19 @@ export function fitted(canvas) {
   return { width: width / ratio, height: height / ratio, ratio };
 }
 
-/** Set the axes of a canvas to those of a trace: metres, y to the left of x.
- * @param {CanvasRenderingContext2D} ctx @param {Look} look @param {number} ratio */
-function toWorld(ctx, look, ratio) {
-  ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
-  ctx.translate(look.width / 2, look.height / 2);
-  ctx.scale(look.scale, -look.scale);
-  ctx.rotate(look.turn);
-  ctx.translate(-look.x, -look.y);
-}
-
-/** A place of the trace on the canvas. @param {Look} look @param {number} x @param {number} y */
-export function placeOf(look, x, y) {
-  const dx = x - look.x, dy = y - look.y, cos = Math.cos(look.turn), sin = Math.sin(look.turn);
-  return [look.width / 2 + look.scale * (dx * cos - dy * sin), look.height / 2 - look.scale * (dx * sin + dy * cos)];
-}
-
-/** A place on the canvas in the trace. @param {Look} look @param {number} px @param {number} py */
-export function worldOf(look, px, py) {
-  const u = (px - look.width / 2) / look.scale, v = -(py - look.height / 2) / look.scale;
-  const cos = Math.cos(look.turn), sin = Math.sin(look.turn);
-  return [look.x + u * cos + v * sin, look.y - u * sin + v * cos];
-}
+/** The axes of a trace on a canvas: metres, y to the left of x. @param {Look} look @param {number} [ratio] */
+const axes = (look, ratio = 1) => new DOMMatrix([ratio, 0, 0, ratio, 0, 0]).translate(look.width / 2, look.height / 2)
+  .scale(look.scale, -look.scale).rotate((look.turn * 180) / Math.PI).translate(-look.x, -look.y);
 
 /** @param {CanvasRenderingContext2D} ctx @param {string} trace @param {Look} look @param {number} ratio
- * @param {ReturnType<typeof inks>} ink @param {Set<number>} marked @param {Set<number>} lit @param {boolean} small */
+ * @param {Inks} ink @param {Set<number>} marked @param {Set<number>} lit @param {boolean} small */
 function paintMap(ctx, trace, look, ratio, ink, marked, lit, small) {
   const map = mapOf(trace), about = traces.value.get(trace);
   if (!map || !about) return;
   const dx = map.origin[0] - about.origin[0], dy = map.origin[1] - about.origin[1];
   const reach = Math.hypot(look.width, look.height) / look.scale / 2;
   const x = look.x - dx, y = look.y - dy;
-  toWorld(ctx, look, ratio);
-  ctx.translate(dx, dy);
+  ctx.setTransform(axes(look, ratio).translate(dx, dy));
   ctx.lineWidth = (small ? 0.5 : 0.9) / look.scale;
   ctx.strokeStyle = ink.line;
   for (const ring of map.rings) {
@@ -124,7 +96,7 @@ function paintMap(ctx, trace, look, ratio, ink, marked, lit, small) {
 }
 
 /** @param {CanvasRenderingContext2D} ctx @param {any} c @param {number} i @param {number} scale
- * @param {ReturnType<typeof inks>} ink @param {{marked: Set<number>, lit: Set<number>, chosen?: number | null}} what */
+ * @param {Inks} ink @param {{marked: Set<number>, lit: Set<number>, chosen?: number | null}} what */
 function paintEntity(ctx, c, i, scale, ink, what) {
   const kind = kindOf(c.kind[i]), node = c.node[i], ego = c.ego ? c.ego[i] : 0;
   const least = (what.marked.has(node) ? 7 : 3.5) / scale;
@@ -163,11 +135,14 @@ function paintEntity(ctx, c, i, scale, ink, what) {
   ctx.restore();
 }
 
-/** The row of a node among the states of a frame; -1: it is not there. @param {any} states @param {number} node */
-export function rowOf(states, node) {
-  for (let i = states.from; i < states.to; i++) if (states.columns.node[i] === node) return i;
-  return -1;
+/** The first row of a frame that has a value; -1: none. @param {any} states @param {number} value @param {string} [column] */
+export function rowOf(states, value, column = "node") {
+  const row = states.columns[column].subarray(states.from, states.to).indexOf(value);
+  return row < 0 ? row : states.from + row;
 }
+
+/** @param {any} states */
+export const egoRow = (states) => rowOf(states, 1, "ego");
 
 /** A place of a node, of a part of the map too. @param {string} trace @param {any} states @param {number} node
  * @param {number[]} [near] where it should be near, of a long lane */
@@ -188,17 +163,24 @@ export function spotOf(trace, states, node, near) {
   return [x, y];
 }
 
+/** @param {CanvasRenderingContext2D} ctx @param {number[][]} points */
+function strokeLine(ctx, points) {
+  ctx.beginPath();
+  for (const [x, y] of points) ctx.lineTo(x || 0, y || 0);
+  ctx.stroke();
+}
+
 /** Paint a scene.
  * @param {CanvasRenderingContext2D} ctx @param {string} trace @param {any} states @param {Look} look @param {number} ratio
  * @param {{marked: Set<number>, lit: Set<number>, chosen?: number | null, names?: Map<number, string>, edges?: DrawnEdge[],
  *   track?: number[][], small?: boolean}} what */
 export function paintScene(ctx, trace, states, look, ratio, what) {
-  const ink = inks();
+  const ink = inks.value;
   ctx.setTransform(1, 0, 0, 1, 0, 0);
   ctx.fillStyle = ink.ground;
   ctx.fillRect(0, 0, ctx.canvas.width, ctx.canvas.height);
   paintMap(ctx, trace, look, ratio, ink, what.marked, what.lit, !!what.small);
-  toWorld(ctx, look, ratio);
+  ctx.setTransform(axes(look, ratio));
   const reach = Math.hypot(look.width, look.height) / look.scale / 2 + 12;
   const still = stillOf(trace)?.columns;
   for (const [c, from, to] of [[still, 0, still?.node?.length || 0], [states?.columns, states?.from || 0, states?.to || 0]]) {
@@ -212,9 +194,7 @@ export function paintScene(ctx, trace, states, look, ratio, what) {
     ctx.strokeStyle = ink.ink;
     ctx.lineWidth = 1.4 / look.scale;
     ctx.setLineDash([4 / look.scale, 3 / look.scale]);
-    ctx.beginPath();
-    what.track.forEach(([x, y], i) => (i ? ctx.lineTo(x || 0, y || 0) : ctx.moveTo(x || 0, y || 0)));
-    ctx.stroke();
+    strokeLine(ctx, what.track);
     ctx.setLineDash([]);
   }
   if (!states || what.small) return;
@@ -226,20 +206,24 @@ export function paintScene(ctx, trace, states, look, ratio, what) {
   paintScale(ctx, look, ink);
 }
 
-/** Names beside what they name, none of them on another. @param {CanvasRenderingContext2D} ctx @param {string} trace
- * @param {any} states @param {Look} look @param {ReturnType<typeof inks>} ink @param {Map<number, string>} names */
+/** Names beside what they name, none of them on another, or on what another names. @param {CanvasRenderingContext2D} ctx @param {string} trace
+ * @param {any} states @param {Look} look @param {Inks} ink @param {Map<number, string>} names */
 function paintNames(ctx, trace, states, look, ink, names) {
-  /** @type {[number, number, number][]} */
-  const taken = [];
-  for (const [node, name] of [...names].sort(([a], [b]) => b - a)) { // entities before parts of the map
-    const at = spotOf(trace, states, node, [look.x, look.y]);
-    if (!at) continue;
-    const [px, py] = /** @type {[number, number]} */ (placeOf(look, at[0] || 0, at[1] || 0)), wide = ctx.measureText(name).width + 10;
-    /** @type {[number, number][]} */
-    const spots = [[px + 10, py - 24], [px + 10, py + 6], [px - wide - 10, py - 24], [px - wide - 10, py + 6], [px + 10, py - 46], [px + 10, py + 28]];
-    const free = spots.find(([x, y]) => taken.every(([tx, ty, w]) => Math.abs(y - ty) > 20 || x > tx + w + 3 || tx > x + wide + 3));
-    const [x, y] = free || /** @type {[number, number]} */ (spots[0]);
-    taken.push([x, y, wide]);
+  const place = axes(look), c = states.columns;
+  const named = [...names].sort(([a], [b]) => b - a).flatMap(([node, name]) => { // entities before parts of the map
+    const at = spotOf(trace, states, node, [look.x, look.y]), row = rowOf(states, node);
+    if (!at) return [];
+    const angle = (c.heading[row] || 0) + look.turn, cos = Math.abs(Math.cos(angle)), sin = Math.abs(Math.sin(angle));
+    const long = ((c.length[row] || 0) * look.scale) / 2, wide = ((c.width[row] || 0) * look.scale) / 2;
+    return [{ name, at: place.transformPoint({ x: at[0], y: at[1] }), aside: long * cos + wide * sin, along: long * sin + wide * cos }];
+  });
+  const taken = named.map(({ at, aside, along }) => ({ x: at.x - aside, y: at.y - along, wide: 2 * aside, high: 2 * along }));
+  for (const { name, at, aside } of named) {
+    const wide = ctx.measureText(name).width + 10, right = at.x + aside + 8, left = at.x - aside - 8 - wide;
+    const spots = [-24, 6, -46, 28].flatMap((down) => [{ x: right, y: at.y + down }, { x: left, y: at.y + down }]);
+    const free = spots.find(({ x, y }) => taken.every((o) => y > o.y + o.high + 2 || o.y > y + 20 || x > o.x + o.wide + 3 || o.x > x + wide + 3));
+    const { x, y } = free || { x: right, y: at.y - 24 };
+    taken.push({ x, y, wide, high: 18 });
     ctx.fillStyle = ink.raised;
     ctx.globalAlpha = 0.88;
     ctx.beginPath();
@@ -252,34 +236,25 @@ function paintNames(ctx, trace, states, look, ink, names) {
 }
 
 /** @param {CanvasRenderingContext2D} ctx @param {string} trace @param {any} states @param {Look} look
- * @param {ReturnType<typeof inks>} ink @param {DrawnEdge} edge */
+ * @param {Inks} ink @param {DrawnEdge} edge */
 function paintEdge(ctx, trace, states, look, ink, edge) {
   const near = spotOf(trace, states, edge.src >= 0 ? edge.src : edge.dst);
   const from = spotOf(trace, states, edge.src, near || undefined), to = spotOf(trace, states, edge.dst, near || undefined);
   if (!from || !to) return;
-  const [ax, ay] = placeOf(look, from[0] || 0, from[1] || 0), [bx, by] = placeOf(look, to[0] || 0, to[1] || 0);
   ctx.strokeStyle = edge.holds === false ? ink.fail : edge.holds ? ink.hold : ink.faint;
   ctx.lineWidth = edge.holds === null ? 1.2 : 2.2;
   ctx.setLineDash(edge.holds === false ? [5, 4] : []);
-  ctx.beginPath();
-  ctx.moveTo(ax || 0, ay || 0);
-  ctx.lineTo(bx || 0, by || 0);
-  ctx.stroke();
+  strokeLine(ctx, [from, to].map(([x, y]) => axes(look).transformPoint({ x, y })).map(({ x, y }) => [x, y]));
   ctx.setLineDash([]);
 }
 
-/** A bar that says how long some metres are. @param {CanvasRenderingContext2D} ctx @param {Look} look @param {ReturnType<typeof inks>} ink */
+/** A bar that says how long some metres are. @param {CanvasRenderingContext2D} ctx @param {Look} look @param {Inks} ink */
 function paintScale(ctx, look, ink) {
   const long = [1, 2, 5, 10, 20, 50, 100, 200, 500].find((m) => m * look.scale > 50) || 1000;
   const x = 14, y = look.height - 16;
   ctx.strokeStyle = ctx.fillStyle = ink.ink;
   ctx.lineWidth = 1.5;
-  ctx.beginPath();
-  ctx.moveTo(x, y - 4);
-  ctx.lineTo(x, y);
-  ctx.lineTo(x + long * look.scale, y);
-  ctx.lineTo(x + long * look.scale, y - 4);
-  ctx.stroke();
+  strokeLine(ctx, [[x, y - 4], [x, y], [x + long * look.scale, y], [x + long * look.scale, y - 4]]);
   ctx.font = "11px system-ui, sans-serif";
   ctx.textBaseline = "alphabetic";
   ctx.fillText(`${long} m`, x + 4, y - 5);
@@ -292,31 +267,19 @@ export function lookAt(trace, states, nodes, width, height, most = 70) {
   const ego = egoRow(states), c = states.columns;
   const centre = ego >= 0 ? [c.x[ego], c.y[ego]] : [c.x[states.from] || 0, c.y[states.from] || 0];
   const turn = ego >= 0 && Number.isFinite(c.heading[ego]) ? Math.PI / 2 - c.heading[ego] : 0;
-  let reach = 20, x = 0, y = 0, many = 0;
-  const spots = [];
-  for (const node of nodes) {
-    if (node < 0) continue;
-    const at = spotOf(trace, states, node);
-    if (at) { spots.push(at); x += at[0] || 0; y += at[1] || 0; many++; }
-  }
-  const middle = many ? [(x / many + centre[0]) / 2, (y / many + centre[1]) / 2] : centre;
-  for (const [sx, sy] of [...spots, centre]) reach = Math.max(reach, Math.hypot((sx || 0) - middle[0], (sy || 0) - middle[1]) * 1.25 + 6);
-  reach = Math.min(reach, most);
-  return { x: middle[0], y: middle[1], turn, scale: Math.min(width, height) / 2 / reach, width, height };
-}
-
-/** @param {any} states */
-export function egoRow(states) {
-  for (let i = states.from; i < states.to; i++) if (states.columns.ego[i]) return i;
-  return -1;
+  const spots = [...nodes].flatMap((node) => (node < 0 ? [] : [spotOf(trace, states, node) || []])).filter((at) => at.length);
+  // Half way between the ego and the middle of the nodes.
+  const [x, y] = [0, 1].map((i) => (spots.length ? spots.reduce((sum, at) => sum + at[i], centre[i] * spots.length) / spots.length / 2 : centre[i]));
+  const reach = Math.max(20, ...[...spots, centre].map((at) => Math.hypot(at[0] - x, at[1] - y) * 1.25 + 6));
+  return { x, y, turn, scale: Math.min(width, height) / 2 / Math.min(reach, most), width, height };
 }
 
 /** The node at a place of the canvas. @param {any} states @param {Look} look @param {number} px @param {number} py */
 export function nodeAt(states, look, px, py) {
-  const [x, y] = worldOf(look, px, py), c = states.columns;
+  const { x, y } = axes(look).inverse().transformPoint({ x: px, y: py }), c = states.columns;
   let best = -1, away = 8 / look.scale;
   for (let i = states.from; i < states.to; i++) {
-    const far = Math.hypot(c.x[i] - (x || 0), c.y[i] - (y || 0)) - Math.max(c.length[i] || 0, 1) / 2;
+    const far = Math.hypot(c.x[i] - x, c.y[i] - y) - Math.max(c.length[i] || 0, 1) / 2;
     if (far < away) { best = c.node[i]; away = far; }
   }
   return best;

@@ -5,8 +5,8 @@ import {
   EditorState, EditorView, highlightSpecialChars, HighlightStyle, history, historyKeymap, keymap, placeholder, setDiagnostics,
   StreamLanguage, syntaxHighlighting, tags,
 } from "../vendor/codemirror.js";
-import { h, htm, signal, useEffect, useRef } from "../vendor/core.js";
-import { answer, editing, find, text, words } from "./state.js";
+import { effect, h, htm, signal, useEffect, useRef } from "../vendor/core.js";
+import { answer, find, text, words } from "./state.js";
 
 const html = htm.bind(h);
 const nonce = document.querySelector("meta[name=csp-nonce]")?.getAttribute("content") || "";
@@ -58,26 +58,22 @@ function complete(context) {
   const told = (told, type) => told.map((one) => ({
     label: one.name, type, detail: one.meaning, info: one.values?.length ? one.values.join(", ") : undefined,
   }));
-  let found = /(\w+)\.(\w*)$/.exec(before);
-  if (found) {
-    const owner = found[1] || "", edges = new RegExp(`\\[\\s*${owner}\\s*[:\\]]`).test(context.state.doc.toString());
+  const word = context.matchBefore(/\w+/), from = word ? word.from : context.pos, validFor = /^\w*$/;
+  const owner = /(\w+)\.\w*$/.exec(before)?.[1];
+  if (owner) {
+    const edges = new RegExp(`\\[\\s*${owner}\\s*[:\\]]`).test(context.state.doc.toString());
     const group = known.attributes[owner] && owner !== "node" ? owner : edges ? "edge" : "node";
-    return { from: context.pos - (found[2] || "").length, options: told(known.attributes[group], "property"), validFor: /^\w*$/ };
+    return { from, options: told(known.attributes[group], "property"), validFor };
   }
-  found = /\[\s*\w*\s*:(?:[\w!|&]*\|)?(\w*)$/.exec(before);
-  if (found) return { from: context.pos - (found[1] || "").length, options: of(known.relations, "enum"), validFor: /^\w*$/ };
-  found = /\(\s*\w*\s*:(?:[\w!|&()]*[|&!(])?(\w*)$/.exec(before);
-  if (found) return { from: context.pos - (found[1] || "").length, options: of(known.labels, "class"), validFor: /^\w*$/ };
-  const word = context.matchBefore(/\w+/);
+  if (/\[\s*\w*\s*:(?:[\w!|&]*\|)?\w*$/.test(before)) return { from, options: of(known.relations, "enum"), validFor };
+  if (/\(\s*\w*\s*:(?:[\w!|&()]*[|&!(])?\w*$/.test(before)) return { from, options: of(known.labels, "class"), validFor };
   if (!word && !context.explicit) return null;
   const variables = [...new Set([...context.state.doc.toString().matchAll(/[([]\s*([A-Za-z_]\w*)/g)].map((m) => m[1] || ""))];
   return {
-    from: word ? word.from : context.pos,
-    options: [
+    from, validFor, options: [
       ...of(variables.filter((one) => one !== word?.text), "variable", 2), ...of(known.keywords, "keyword"),
       ...told(known.functions, "function"), ...told(known.predicates, "function"),
     ],
-    validFor: /^\w*$/,
   };
 }
 
@@ -110,21 +106,10 @@ function numberAt(state) {
   return null;
 }
 
-/** Put a text in place of a part of the query, and ask again. @param {number} from @param {number} to @param {string} insert */
-export function replacePart(from, to, insert) {
+/** Put a text in place of a part of the query. @param {number} from @param {number} to @param {string} insert */
+function replacePart(from, to, insert) {
   editor?.dispatch({ changes: { from, to, insert }, selection: { anchor: from + insert.length } });
 }
-
-/** @param {string} query */
-export function setQuery(query) {
-  text.value = query;
-  if (editor && editor.state.doc.toString() !== query) {
-    editor.dispatch({ changes: { from: 0, to: editor.state.doc.length, insert: query }, selection: { anchor: query.length } });
-  }
-}
-
-editing.replace = replacePart;
-editing.set = setQuery;
 
 export const focusEditor = () => editor?.focus();
 
@@ -152,11 +137,12 @@ export function Editor() {
         ],
       }),
     });
-    const stop = answer.subscribe((/** @type {any} */ told) => diagnosed(told.error));
-    return () => { stop(); editor.destroy(); editor = null; };
+    const stops = [
+      effect(() => { const query = text.value; if (editor.state.doc.toString() !== query) replacePart(0, editor.state.doc.length, query); }),
+      effect(() => diagnosed(answer.value.error)),
+    ];
+    return () => { stops.forEach((stop) => stop()); editor.destroy(); editor = null; };
   }, []);
-  useEffect(() => { if (editor && editor.state.doc.toString() !== text.value) setQuery(text.value); });
-  text.value; // a link that is opened sets it
   return html`<div class="editor" ref=${place}></div>`;
 }
 

@@ -73,27 +73,21 @@ function Tile({ match, x, y, wide, high, flies }) {
 export function Gallery({ found, none, word = ["match", "matches"] }) {
   const place = useRef(/** @type {HTMLElement | null} */ (null));
   const [box, setBox] = useState({ width: 900, height: 600, top: 0 });
+  const measure = () => {
+    const seen = place.current;
+    if (seen) setBox({ width: seen.clientWidth, height: seen.clientHeight, top: seen.scrollTop });
+  };
   useEffect(() => {
-    const element = place.current;
-    if (!element) return undefined;
-    const measure = () => setBox({ width: element.clientWidth, height: element.clientHeight, top: element.scrollTop });
     const watch = new ResizeObserver(measure);
-    watch.observe(element);
-    element.addEventListener("scroll", measure, { passive: true });
-    measure();
-    return () => { watch.disconnect(); element.removeEventListener("scroll", measure); };
+    if (place.current) watch.observe(place.current);
+    return () => watch.disconnect();
   }, []);
   // Of thousands of matches it is made once, not while it is scrolled.
   const { rows, height, wide, high } = useMemo(() => layout(found, box.width), [found, box.width]);
-  // The first row in sight, by halving.
-  let low = 0, end = rows.length;
-  while (low < end) {
-    const middle = (low + end) >> 1, row = /** @type {any} */ (rows[middle]);
-    if (row.top + row.height < box.top - 200) low = middle + 1; else end = middle;
-  }
+  const low = Math.max(0, rows.findIndex((row) => row.top + row.height >= box.top - 200)), end = box.top + box.height + 200;
   // As many rows each time: what leaves the sight lends its elements to what comes, for to make new ones takes most of the time.
-  const most = useRef(0), was = useRef(0), jumped = useRef(false), seen = /** @type {any[]} */ ([]);
-  for (let i = low; i < rows.length && (seen.length < most.current || /** @type {any} */ (rows[i]).top < box.top + box.height + 200); i++) seen.push(/** @type {any} */ (rows[i]));
+  const most = useRef(0), was = useRef(0), jumped = useRef(false);
+  const seen = rows.slice(low).filter((row, i) => i < most.current || row.top < end);
   most.current = Math.max(most.current, seen.length);
   // Of a jump the pictures are asked for at once; of what goes on flying past none, until it rests.
   const jumps = Math.abs(box.top - was.current) > high, flies = jumps && jumped.current;
@@ -113,7 +107,7 @@ export function Gallery({ found, none, word = ["match", "matches"] }) {
     const row = rows.find((one) => !one.group && found.slice(one.first, one.last).some((m) => keyOf(m) === keyOf(now)));
     if (row && (row.top < box.top || row.top + row.height > box.top + box.height)) place.current.scrollTop = row.top - box.height / 3;
   }, [now]);
-  return html`<section class="gallery" ref=${place} aria-label="Matches"><div class="inner" style=${{ height: `${height}px` }}>
+  return html`<section class="gallery" ref=${place} onScroll=${measure} aria-label="Matches"><div class="inner" style=${{ height: `${height}px` }}>
     ${found.length || !none ? null : html`<p class="faint none">${none}</p>`}
     ${drawn.map(({ row, slot }) => (row.group
       ? html`<div class="group" key=${`g ${slot}`} style=${{ top: `${row.top}px` }}>${row.group} <span>${row.many} ${row.many === 1 ? word[0] : word[1]}</span></div>`

@@ -1,11 +1,11 @@
 // @ts-check
 // Keys of the scene: what they do, and the list of them.
-import { h, htm } from "../vendor/core.js";
-import { askWhy, camera, frame, goTo, matchEnd, nextMatch, panel } from "./clock.js";
-import { dialog, open, playing, tick, traces, writeAddress } from "./state.js";
+import { h, htm, useEffect } from "../vendor/core.js";
+import { about, askWhy, camera, frame, goTo, matchEnd, nextMatch, panel } from "./clock.js";
+import { dialog, open, playing, tick, toast, writeAddress } from "./state.js";
 
 const html = htm.bind(h);
-const second = () => Math.max(1, Math.round(1 / (traces.value.get(open.value?.trace || "")?.period || 0.1)));
+const second = () => Math.max(1, Math.round(1 / (about.value?.period || 0.1)));
 
 /** Keys as they are listed: their signs, what they do, and the act of each.
  * @type {[string, string, Record<string, () => void>][]} */
@@ -17,7 +17,7 @@ export const keys = [
   ["[ ]", "ends of the match", { "[": () => matchEnd(-1), "]": () => matchEnd(1) }],
   ["x", "select the match", { x: () => { if (open.value?.match) tick(open.value.match); } }],
   ["c", "next camera", { c: () => {
-    const all = traces.value.get(open.value?.trace || "")?.cameras || [];
+    const all = about.value?.cameras || [];
     camera.value = all[(all.indexOf(camera.value) + 1) % (all.length || 1)] || "";
   } }],
   ["g", "next panel: pattern, neighbours, nodes, edges", { g: () => {
@@ -32,8 +32,15 @@ export const keys = [
   ["?", "these keys", { "?": () => { dialog.value = "keys"; } }],
 ];
 
-export function Keys() {
-  return html`<h2>Keys</h2><dl>${keys.map(([sign, what]) => html`<dt><kbd>${sign}</kbd></dt><dd>${what}</dd>`)}</dl>`;
+/** What lies above the page: the keys, or a form; and what was just said. @param {{children?: any}} props */
+export function Above({ children }) {
+  const what = dialog.value, close = () => { dialog.value = ""; };
+  useEffect(() => { /** @type {HTMLElement | null} */ (document.querySelector(".dialog input, .dialog button"))?.focus(); }, [what]);
+  return html`${what ? html`<div class="dialog" onClick=${(/** @type {any} */ e) => { if (e.target === e.currentTarget) close(); }}>
+    <div role="dialog" aria-modal="true" aria-label=${what}>${what !== "keys" ? children
+      : html`<h2>Keys</h2><dl>${keys.map(([sign, does]) => html`<dt><kbd>${sign}</kbd></dt><dd>${does}</dd>`)}</dl>`}
+      <p><button onClick=${close}>Close</button></p></div></div>` : null}
+    ${toast.value ? html`<div class="toast" role="status">${toast.value}</div>` : null}`;
 }
 
 addEventListener("keydown", (event) => {

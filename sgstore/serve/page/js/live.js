@@ -5,9 +5,9 @@ import * as api from "./api.js";
 import { frame, range, refresh } from "./clock.js";
 import { feed, feedStill, keepThumb } from "./data.js";
 import { Gallery } from "./gallery.js";
-import { Keys, keys } from "./keys.js";
+import { Above, keys } from "./keys.js";
 import { Scene } from "./scene.js";
-import { answer, dialog, live, offline, open, playing, reasonOf, seq, span, store, toast } from "./state.js";
+import { answer, dialog, live, offline, open, playing, reasonOf, seq, span, store } from "./state.js";
 import { Bars } from "./timeline.js";
 import { bytesOf, unpacked } from "./wire.js";
 
@@ -110,9 +110,7 @@ function Statements() {
 }
 
 function Live() {
-  return html`<${Head} /><${Statements} /><main class="open"><${Gallery} found=${answer.value.matches} word=${["event", "events"]} none=${"What is found, and what is violated, stands here as it comes."} /><${Scene} /></main>
-    ${dialog.value ? html`<div class="dialog" onClick=${() => { dialog.value = ""; }}><div role="dialog" aria-modal="true" aria-label="Keys"><${Keys} /></div></div>` : null}
-    ${toast.value ? html`<div class="toast" role="status">${toast.value}</div>` : null}`;
+  return html`<${Head} /><${Statements} /><main class="open"><${Gallery} found=${answer.value.matches} word=${["event", "events"]} none=${"What is found, and what is violated, stands here as it comes."} /><${Scene} /></main><${Above} />`;
 }
 
 keys.splice(keys.findIndex(([one]) => one === "x"), 1);

@@ -1,17 +1,17 @@
 // @ts-check
 // The page: its head, the search, what was found, and the view that is open; keys.
-import { effect, h, htm, render, untracked, useEffect } from "../vendor/core.js";
+import { effect, h, htm, render, untracked } from "../vendor/core.js";
 import * as api from "./api.js";
 import { copyLink, frame } from "./clock.js";
-import { Editor, focusEditor, NumberSlider, setQuery } from "./editor.js";
+import { Editor, focusEditor, NumberSlider } from "./editor.js";
 import { Gallery } from "./gallery.js";
-import { Keys, keys } from "./keys.js";
+import { Above, keys } from "./keys.js";
 import { Scene } from "./scene.js";
 import { Compare } from "./compare.js";
 import { Coverage, countLibrary, Selection, Start } from "./sheets.js";
 import {
-  answer, cancel, dialog, find, history, keep, library, matches, namesIn, notes, open, openFrame, paints, playing, readAddress, reasonOf, say, seq, store, tag,
-  text, theme, ticked, toast, values, view, words, writeAddress, writeAddressSoon,
+  answer, ask, cancel, dialog, find, history, keep, library, matches, namesIn, notes, open, openFrame, paints, playing, readAddress, reasonOf, say, seq, store, tag,
+  text, theme, ticked, values, view, words, writeAddress, writeAddressSoon,
 } from "./state.js";
 import { Status } from "./status.js";
 import { Verdicts } from "./verdicts.js";
@@ -22,7 +22,8 @@ const VIEWS = [["find", "Find"], ["coverage", "Coverage"], ["selection", "Select
 function Head() {
   const about = store.value, frames = about.traces.reduce((/** @type {number} */ n, /** @type {any} */ t) => n + t.frames, 0);
   const next = theme.value === "" ? "dark" : theme.value === "dark" ? "light" : "";
-  return html`<header><span class="brand"><img src="static/icon.svg" alt="" />sgstore</span>
+  const home = () => { open.value = null; view.value = "find"; ask(""); };
+  return html`<header><button class="brand" title="the library" onClick=${home}><img src="static/icon.svg" alt="" />sgstore</button>
     <h1>${about.store} · ${about.traces.length} ${about.traces.length === 1 ? "trace" : "traces"} · ${frames.toLocaleString("en")} frames</h1>
     <nav aria-label="Views">${VIEWS.map(([key, name]) => html`<button aria-current=${view.value === key ? "page" : undefined}
       onClick=${() => { view.value = key || "find"; writeAddress(); }}>${name}${key === "selection" && ticked.value.size ? html` <span class="badge">${ticked.value.size}</span>` : null}</button>`)}</nav>
@@ -35,14 +36,14 @@ function Search() {
   const choose = (/** @type {any} */ event) => {
     const one = library.value.find((p) => p.name === event.target.value);
     event.target.value = "";
-    if (one) usePattern(one);
+    if (one) ask(one.text);
   };
   const groups = [...new Set(patterns.map((p) => p.library))];
   return html`<section class="search" aria-label="Search"><${Editor} />
     <div class="tools">
       <select aria-label="Library of patterns" onChange=${choose}><option value="">library</option>
         ${groups.map((name) => html`<optgroup label=${name}>${patterns.filter((p) => p.library === name).map((p) => html`<option value=${p.name} title=${p.sentence}>${p.name}</option>`)}</optgroup>`)}</select>
-      <select aria-label="History" onChange=${(/** @type {any} */ e) => { if (e.target.value) { setQuery(e.target.value); find(); } e.target.value = ""; }}><option value="">history</option>
+      <select aria-label="History" onChange=${(/** @type {any} */ e) => { if (e.target.value) { text.value = e.target.value; find(); } e.target.value = ""; }}><option value="">history</option>
         ${history().map((one) => html`<option value=${one}>${one.replace(/\s+/g, " ").slice(0, 90)}</option>`)}</select>
       ${names.map((name) => html`<label>$${name} <input size="8" aria-label=${`Value of $${name}`} value=${values.value[name] || ""}
         onInput=${(/** @type {any} */ e) => { values.value = { ...values.value, [name]: e.target.value }; }}
@@ -51,13 +52,6 @@ function Search() {
       ${answer.value.state === "busy" ? html`<button onClick=${cancel}>Stop</button>` : null}
       <button class="main" onClick=${() => find()}>Find <kbd>${navigator.platform.startsWith("Mac") ? "⌘" : "Ctrl "}⏎</kbd></button>
     </div></section>`;
-}
-
-/** Put a pattern of the library into the editor, its parameters being fields. @param {any} one */
-export function usePattern(one) {
-  values.value = {};
-  setQuery(one.text);
-  find();
 }
 
 function Rows() {
@@ -93,15 +87,6 @@ function TagForm() {
     <p class="faint">Tags lie in a file beside the store; a query can ask for them: WHERE notes.tag = '…'</p>`;
 }
 
-function Dialog() {
-  const what = dialog.value;
-  useEffect(() => { /** @type {HTMLElement | null} */ (document.querySelector(".dialog input, .dialog button"))?.focus(); }, [what]);
-  if (!what) return null;
-  return html`<div class="dialog" onClick=${(/** @type {any} */ e) => { if (e.target === e.currentTarget) dialog.value = ""; }}>
-    <div role="dialog" aria-modal="true" aria-label=${what}>${what === "keys" ? html`<${Keys} />` : html`<${TagForm} />`}
-      <p><button onClick=${() => { dialog.value = ""; }}>Close</button></p></div></div>`;
-}
-
 function Found() {
   const told = answer.value;
   if (told.state === "idle" && !open.value) return html`<${Start} />`;
@@ -129,8 +114,7 @@ function App() {
   if (!store.value) return html`<p class="loading">Reading the store …</p>`;
   const shownView = view.value;
   return html`<${Head} />${shownView === "find" ? html`<${Search} /><${Status} /><${Found} />`
-    : shownView === "coverage" ? html`<${Coverage} />` : shownView === "selection" ? html`<${Selection} />` : html`<${Compare} />`}
-    <${Dialog} />${toast.value ? html`<div class="toast" role="status">${toast.value}</div>` : null}`;
+    : shownView === "coverage" ? html`<${Coverage} />` : shownView === "selection" ? html`<${Selection} />` : html`<${Compare} />`}<${Above}><${TagForm} /></${Above}>`;
 }
 
 keys.unshift(["/", "editor", { "/": focusEditor }], ["Ctrl ⏎", "find", {}]);

@@ -1,12 +1,13 @@
 // @ts-check
 // A report: what a query found, to be looked at without a server. One file holds this page and its answers.
 import { h, htm, render } from "../vendor/core.js";
+import { keepAll } from "./data.js";
 import { Gallery } from "./gallery.js";
-import { Keys, keys } from "./keys.js";
+import { Above, keys } from "./keys.js";
 import { kept } from "./offline.js";
 import { Scene } from "./scene.js";
 import { Verdicts } from "./verdicts.js";
-import { answer, dialog, find, matches, notes, offline, open, store, text, toast, values } from "./state.js";
+import { answer, dialog, find, matches, notes, offline, open, store, text, values } from "./state.js";
 import { Status } from "./status.js";
 
 const html = htm.bind(h);
@@ -24,11 +25,11 @@ function Report() {
     : told.verdicts ? html`<${Verdicts} /><main><${Gallery} found=${matches.value} /></main>`
     : told.state === "done" && !told.matches.length ? html`<div class="sheet"><h2>Nothing matches</h2></div>` : html`<main><${Gallery} found=${matches.value} /></main>`;
   return html`<${Head} /><${Status} />${body}
-    ${dialog.value ? html`<div class="dialog" onClick=${() => { dialog.value = ""; }}><div role="dialog" aria-modal="true" aria-label="Keys"><${Keys} /></div></div>` : null}
-    ${toast.value ? html`<div class="toast" role="status">${toast.value}</div>` : null}`;
+<${Above} />`;
 }
 
 offline.value = true;
+keepAll();
 store.value = kept.about;
 notes.value = kept.notes;
 text.value = kept.query;

@@ -7,7 +7,7 @@ import { arrived, nameOf, pictureAt, statesAt } from "./data.js";
 import { egoRow, fitted, lookAt, nodeAt, paintScene, rowOf } from "./draw.js";
 import { hop, Neighbours } from "./neighbours.js";
 import { PatternDrawing } from "./pattern.js";
-import { chosen, editing, find, inOther, lit, live, offline, open, openFrame, paints, playing, rate, reasonOf, say, store, text, traces, writeAddress } from "./state.js";
+import { ask, chosen, find, inOther, lit, live, offline, open, openFrame, paints, playing, rate, reasonOf, say, store, text, traces, writeAddress } from "./state.js";
 import { Timeline } from "./timeline.js";
 
 const html = htm.bind(h);
@@ -18,9 +18,8 @@ effect(() => { open.value?.trace; zoom.value = { ...zoom.peek(), dx: 0, dy: 0 };
 
 /** Let a number be what it must be so that this frame may match, and ask again. @param {any} change */
 function relax(change) {
-  const raw = text.value, lead = raw.length - raw.trimStart().length;
-  const now = open.value;
-  editing.replace(change.start + lead, change.end + lead, change.text);
+  const query = text.value.trim(), now = open.value;
+  text.value = query.slice(0, change.start) + change.text + query.slice(change.end);
   find({ keep: true }).then(() => { if (now) { why.value = null; openFrame(now.trace, frame.value, null); } });
 }
 
@@ -99,11 +98,6 @@ function Above({ trace }) {
     e.preventDefault();
     zoom.value = { ...zoom.value, factor: Math.max(0.15, Math.min(12, factor * Math.exp(-e.deltaY / 500))) };
   };
-  useEffect(() => {
-    const element = canvas.current;
-    element?.addEventListener("wheel", wheel, { passive: false });
-    return () => element?.removeEventListener("wheel", wheel);
-  });
   const down = (/** @type {PointerEvent} */ e) => {
     drag.current = { x: e.clientX, y: e.clientY, dx, dy, moved: false };
     canvas.current?.setPointerCapture(e.pointerId);
@@ -131,7 +125,7 @@ function Above({ trace }) {
       ${beside.value ? html`<span class="chip">${about?.side ? store.value.other.store : store.value.store}</span>` : null}
       ${factor !== 1 || dx || dy ? html`<button class="small" onClick=${() => { zoom.value = { factor: 1, dx: 0, dy: 0, north }; }}>reset</button>` : null}
     </div>
-    <canvas ref=${canvas} role="img" aria-label=${about?.side ? "View from above, second store" : "View from above"} onPointerDown=${down} onPointerMove=${move} onPointerUp=${up}></canvas>
+    <canvas ref=${canvas} role="img" aria-label=${about?.side ? "View from above, second store" : "View from above"} onWheel=${wheel} onPointerDown=${down} onPointerMove=${move} onPointerUp=${up}></canvas>
   </div>`;
 }
 
@@ -174,7 +168,7 @@ function NodePanel() {
       ${Object.entries(OF_NODE).map(([name, unit]) => html`<button class="small" aria-pressed=${series.value?.attribute === name} onClick=${() => showSeries(name, unit, node)}>${name}</button>`)}
       ${other === undefined ? null : Object.entries(PAIRS).map(([name, unit]) => html`<button class="small" onClick=${() => showSeries(name, unit, other, node)}>${name} from ego</button>`)}
     </div>
-    ${live.value ? null : html`<p class="row wrap"><button class="small" onClick=${() => { editing.set(`MATCH (e:Ego), (x) WHERE x.id = ${node} AND trace.name = '${now.trace.replace(/'/g, "\\'")}' AND dist(e, x) < 30`); find(); }}>as a query</button></p>`}`}
+    ${live.value ? null : html`<p class="row wrap"><button class="small" onClick=${() => ask(`MATCH (e:Ego), (x) WHERE x.id = ${node} AND trace.name = '${now.trace.replace(/'/g, "\\'")}' AND dist(e, x) < 30`)}>as a query</button></p>`}`}
   </div>`;
 }
 

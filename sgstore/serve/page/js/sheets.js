@@ -1,20 +1,11 @@
 // @ts-check
 // Views beside the search: the library before anything is asked, coverage, the selection.
-import { h, htm, signal, useEffect, useState } from "../vendor/core.js";
+import { h, htm, signal, useEffect, useRef, useState } from "../vendor/core.js";
 import * as api from "./api.js";
 import { beside } from "./clock.js";
-import { setQuery } from "./editor.js";
-import { answer, find, idle, keyOf, library, open, openFrame, openMatch, reasonOf, store, tally, tick, ticked, values, view } from "./state.js";
+import { answer, ask, idle, keyOf, library, matchesIn, open, openFrame, openMatch, reasonOf, store, tally, tick, ticked, view } from "./state.js";
 
 const html = htm.bind(h);
-
-/** Ask for a pattern. @param {string} query */
-function ask(query) {
-  values.value = {};
-  view.value = "find";
-  setQuery(query);
-  find();
-}
 
 // Before anything is asked -----------------------------------------------------------------------------------------
 
@@ -32,10 +23,8 @@ export async function countLibrary() {
     let count = 0;
     idle.stop = () => mine.abort();
     try {
-      for await (const line of api.lines("api/find", { text: one.text }, { signal: mine.signal })) {
-        for (const row of line.matches || []) if (spans.length < 300) spans.push([placeOf(row[0], row[1]), placeOf(row[0], row[2] + 1)]);
-        if (line.error) count = -1;
-        if (line.count !== undefined) count = line.count;
+      for await (const { trace, first, last } of matchesIn(api.lines("api/find", { text: one.text }, { signal: mine.signal }))) {
+        if (count++ < 300) spans.push([placeOf(trace, first), placeOf(trace, last + 1)]);
       }
     } catch { count = -1; }
     if (mine.signal.aborted) left.unshift(one); // somebody asks: again later
@@ -56,8 +45,10 @@ function placeOf(trace, at) {
 
 export function Start() {
   const some = library.value.filter((one) => one.kind !== "predicate"), kinds = [...new Set(some.map((one) => one.library))];
-  const found = (/** @type {any} */ one) => tally.value[one.name]?.count || 0;
-  return html`<div class="sheet" tabindex="0">
+  const over = useRef(false), known = useRef(tally.value); // no card moves away from under the pointer
+  if (!over.current) known.current = tally.value;
+  const found = (/** @type {any} */ one) => known.current[one.name]?.count || 0;
+  return html`<div class="sheet" tabindex="0" onPointerEnter=${() => { over.current = true; }} onPointerLeave=${() => { over.current = false; }}>
     <p class="faint">Type a pattern above, or begin with one of these ${some.length}. Each says how often it is found in this store, and where in time.</p>
     ${kinds.map((kind) => html`<h2>${kind}</h2><div class="cards">
       ${some.filter((one) => one.library === kind).sort((a, b) => Number(found(b) > 0) - Number(found(a) > 0)).map((one) => {
@@ -79,18 +70,23 @@ function go(name) {
   if (found) openFrame(found[1] || "", Number(found[2]));
 }
 
-/** @param {{table: any, most?: number}} props */
+/** A table; columns that hold nothing are left out. @param {{table: any, most?: number}} props */
 export function Table({ table, most = 200 }) {
-  const number = (/** @type {any} */ v) => (Number.isInteger(v) ? v.toLocaleString("en") : v.toPrecision(4));
+  const columns = table.columns.map((/** @type {string} */ name, /** @type {number} */ at) => {
+    const all = table.rows.map((/** @type {any[]} */ row) => row[at]), numbers = all.filter(Number.isFinite), top = Math.max(...numbers.map(Math.abs));
+    // As many digits behind the point in all of a column, four that count of the largest.
+    const digits = numbers.every(Number.isInteger) ? 0 : Math.min(Math.max(3 - Math.floor(Math.log10(top)), 0), 6);
+    return { name, at, digits, number: numbers.length > 0, known: all.some((/** @type {any} */ v) => v !== null && v !== "") };
+  }).filter((/** @type {any} */ one) => one.known);
   return html`${(table.said || []).map((/** @type {string} */ line) => html`<p class="faint">${line}</p>`)}
-    <table><thead><tr>${table.columns.map((/** @type {string} */ c, /** @type {number} */ i) => html`<th class=${table.rows.some((/** @type {any[]} */ r) => typeof r[i] === "number") ? "number" : ""}>${c.replace(/_/g, " ")}</th>`)}</tr></thead><tbody>
-    ${table.rows.slice(0, most).map((/** @type {any[]} */ row) => html`<tr>${row.map((v, i) => {
-      const name = table.columns[i];
+    <table><thead><tr>${columns.map((/** @type {any} */ one) => html`<th class=${one.number ? "number" : ""}>${one.name.replace(/_/g, " ")}</th>`)}</tr></thead><tbody>
+    ${table.rows.slice(0, most).map((/** @type {any[]} */ row) => html`<tr>${columns.map((/** @type {any} */ { name, at, digits }) => {
+      const v = row[at];
       if (name === "query") return html`<td>${v ? html`<button class="small" onClick=${() => ask(v)}>find</button> <code class="cut" title=${v}>${v}</code>` : ""}</td>`;
       if ((name === "frame" || name === "first") && v) return html`<td><button class="quiet small" onClick=${() => go(v)}>${v}</button></td>`;
       if (name === "class" && String(v).length > 24) return html`<td><code title=${v}>${String(v).slice(0, 12)}</code></td>`;
       if ((name === "share" || name === "cumulative") && typeof v === "number") return html`<td class="number">${(v * 100).toFixed(2)} %</td>`;
-      return html`<td class=${typeof v === "number" ? "number" : ""}>${v === null ? "" : typeof v === "number" ? number(v) : html`<span class="cut" title=${String(v)}>${v}</span>`}</td>`;
+      return html`<td class=${typeof v === "number" ? "number" : ""}>${v === null ? "" : typeof v === "number" ? v.toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits }) : html`<span class="cut" title=${String(v)}>${v}</span>`}</td>`;
     })}</tr>`)}</tbody></table>
     ${table.of > most ? html`<p class="faint">${most} of ${table.of.toLocaleString("en")} rows</p>` : null}`;
 }

@@ -38,11 +38,6 @@ export const offline = signal(false);
 export const live = signal(false);
 export const span = signal(/** @type {[number, number]} */ ([0, 0]));
 export const theme = signal(remembered("theme"));
-/** What the editor does; a report has none. */
-export const editing = {
-  replace: (/** @type {number} */ _from, /** @type {number} */ _to, /** @type {string} */ _insert) => {},
-  set: (/** @type {string} */ query) => { text.value = query; },
-};
 
 /** Counts changes of colours: what is painted is painted again. */
 export const paints = signal(0);
@@ -61,22 +56,14 @@ export const matches = computed(() => {
 });
 /** Frames that match, each once. */
 export const framesFound = computed(() => {
-  /** @type {Map<string, [number, number][]>} */
-  const by = new Map();
-  for (const m of matches.value) {
-    if (!by.has(m.trace)) by.set(m.trace, []);
-    by.get(m.trace)?.push([m.first, m.last]);
+  const ends = new Map();
+  let frames = 0;
+  for (const { trace, first, last } of [...matches.value].sort((a, b) => a.first - b.first)) {
+    const end = ends.get(trace) ?? -1;
+    frames += Math.max(0, last - Math.max(first, end + 1) + 1);
+    ends.set(trace, Math.max(end, last));
   }
-  let many = 0;
-  for (const spans of by.values()) {
-    spans.sort((a, b) => a[0] - b[0]);
-    let end = -1;
-    for (const [a, z] of spans) {
-      many += Math.max(0, z - Math.max(a, end + 1) + 1);
-      end = Math.max(end, z);
-    }
-  }
-  return { frames: many, traces: by.size };
+  return { frames, traces: ends.size };
 });
 
 /** @param {Match} m */
@@ -115,15 +102,8 @@ export function history() {
 /** Values of the parameters of a text, as numbers where they are numbers.
  * @param {string} query */
 export function parametersOf(query) {
-  /** @type {Record<string, any>} */
-  const found = {};
-  for (const name of namesIn(query)) {
-    const told = values.value[name];
-    if (told === undefined || told === "") continue;
-    const plain = Number(told);
-    found[name] = told === "true" || told === "false" ? told === "true" : Number.isFinite(plain) ? plain : told;
-  }
-  return found;
+  const plain = (/** @type {string} */ told) => (told === "true" || told === "false" ? told === "true" : Number.isFinite(Number(told)) ? Number(told) : told);
+  return Object.fromEntries(namesIn(query).flatMap((name) => (values.value[name] ? [[name, plain(values.value[name])]] : [])));
 }
 
 /** Names of parameters in a text, those in quotes and comments left out.
@@ -141,11 +121,18 @@ export function cancel() {
   if (answer.value.state === "busy") answer.value = { ...answer.value, state: "cancelled" };
 }
 
+/** Ask for a pattern of the library, or of a table. @param {string} query */
+export function ask(query) {
+  values.value = {};
+  text.value = query;
+  find();
+}
+
 /** Ask for the matches of the text in the editor. @param {{keep?: boolean}} [how] */
 export async function find(how = {}) {
   const query = text.value.trim();
-  if (!query) { answer.value = { state: "idle", matches: [], names: [], reasons: {}, notes: [] }; return; }
   cancel();
+  if (!query) { answer.value = { state: "idle", matches: [], names: [], reasons: {}, notes: [] }; return; }
   idle.stop();
   const id = `q${Date.now().toString(36)}${number++}`;
   const mine = (under = new AbortController());
@@ -289,12 +276,9 @@ export function writeAddressSoon() {
 
 export async function readAddress() {
   const parts = new URLSearchParams(location.hash.slice(1));
-  /** @type {Record<string, string>} */
-  const told = {};
-  for (const [name, value] of parts) if (name.startsWith("$")) told[name.slice(1)] = value;
   batch(() => {
     text.value = parts.get("q") || "";
-    values.value = told;
+    values.value = Object.fromEntries([...parts].filter(([name]) => name.startsWith("$")).map(([name, value]) => [name.slice(1), value]));
     view.value = parts.get("show") || "find";
   });
   const at = /^(.*)@([\d.]+)s$/.exec(parts.get("at") || "");

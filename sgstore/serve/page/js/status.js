@@ -9,7 +9,8 @@ export function Status() {
   const told = answer.value, { frames, traces: many } = framesFound.value, found = matches.value.length;
   const left = Object.entries(told.reasons || {});
   if (told.state === "idle") return null;
-  const where = filter.value, maps = [...new Set(store.value.traces.map((/** @type {any} */ t) => t.map).filter(Boolean))];
+  const where = filter.value, all = /** @type {import("./state.js").Trace[]} */ (store.value.traces);
+  const known = { trace: all.map((t) => t.name), map: [...new Set(all.map((t) => t.map).filter(Boolean))] };
   return html`<div class="status" role="status" aria-live="polite">
     ${told.state === "busy" ? html`<span class="busy" aria-hidden="true"></span>` : null}
     ${told.error ? html`<div class="error"><b>${told.error.reason}</b>${told.error.hint ? html` · ${told.error.hint}` : null}</div>`
@@ -22,10 +23,8 @@ export function Status() {
     ${left.length ? html`<details class="why-left"><summary>${left.length} ${left.length === 1 ? "trace" : "traces"} cannot answer</summary>
       <ul>${left.map(([trace, reason]) => html`<li><b>${trace}</b>: ${reason}</li>`)}</ul></details>` : null}
     <span class="grow"></span>
-    ${store.value.traces.length > 1 ? html`<select aria-label="Trace" value=${where.trace} onChange=${(/** @type {any} */ e) => { filter.value = { ...where, trace: e.target.value }; }}>
-      <option value="">all traces</option>${store.value.traces.map((/** @type {any} */ t) => html`<option>${t.name}</option>`)}</select>` : null}
-    ${maps.length > 1 ? html`<select aria-label="Map" value=${where.map} onChange=${(/** @type {any} */ e) => { filter.value = { ...where, map: e.target.value }; }}>
-      <option value="">all maps</option>${maps.map((m) => html`<option>${m}</option>`)}</select>` : null}
+    ${/** @type {const} */ (["trace", "map"]).map((of) => (known[of].length < 2 ? null : html`<select aria-label=${of} value=${where[of]} onChange=${(/** @type {any} */ e) => { filter.value = { ...where, [of]: e.target.value }; }}>
+      <option value="">${`all ${of}s`}</option>${known[of].map((one) => html`<option>${one}</option>`)}</select>`))}
     ${found && !told.rows && !offline.value ? html`<button class="small" onClick=${() => { for (const m of matches.value) if (!ticked.value.has(keyOf(m))) tick(m); }}>select all</button>` : null}
   </div>`;
 }
