@@ -29,6 +29,7 @@ sync = pytest.importorskip("playwright.sync_api", reason="Playwright is not inst
 pytest.importorskip("uvicorn", reason="the extra [ui] is not installed")
 
 expect = sync.expect
+expect.set_options(timeout=60_000)
 
 NEAR = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle)"
 PICTURES = os.environ.get("SGSTORE_SCREENSHOTS")
@@ -172,6 +173,10 @@ def test_the_library_is_there_before_anything_is_typed(page: Any) -> None:
     assert page.locator(".card").count() > 50
     page.locator(".card .badge").first.wait_for()
     seen(page, "start")
+    search(page, NEAR)
+    expect(page.locator(".card")).to_have_count(0)
+    page.get_by_role("button", name="sgstore").click()
+    page.locator(".card").first.wait_for()
 
 
 def test_matches_are_those_of_the_store(page: Any, town_store: Path) -> None:
@@ -195,6 +200,8 @@ def test_lanes_are_the_parts_of_the_pattern(page: Any, town_store: Path) -> None
 
     assert [text.lstrip("✓✗? ").strip() for text in texts] == [one.part.text for one in lanes.lanes]
     assert page.locator(".timeline .lane[data-holds=true]").count() == len(lanes.lanes)
+    marks = page.locator(".timeline .ticks span").all_inner_texts()
+    assert marks == [f"{t} s" for t in range(0, 80, 10)]  # of 74.9 s
     seen(page, "scene")
     page.get_by_role("tab", name="neighbours").click()
     graph = store.graph(f"town#{first.start_seq}")
@@ -388,6 +395,9 @@ def test_coverage_is_shown_and_a_gap_is_a_query(page: Any) -> None:
     page.locator(".chart").wait_for()
     seen(page, "coverage")
     page.get_by_role("button", name="Combinations").click()
+    page.get_by_role("columnheader", name="query").first.wait_for()
+    empty = page.get_by_role("columnheader", name="frames in reference")
+    expect(empty).to_have_count(0)  # nothing stands in it without a reference
     page.get_by_role("button", name="find").first.click()
     expect(page.locator(".cm-content")).to_have_text(re.compile("^MATCH"))
 

@@ -48,7 +48,8 @@ export function Timeline() {
   const tags = notes.value.filter((n) => n[0] === now.trace), holds = holdsAt(frame.value);
   const all = lanes.value?.lanes || [], steps = new Set(all.map((/** @type {any} */ l) => l.step)).size > 1;
   const first = [...mine].sort((a, b) => Number(a.index === now.match?.index) - Number(b.index === now.match?.index));
-  const ticks = [0, 0.25, 0.5, 0.75, 1];
+  const end = about.seconds, every = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000].find((s) => (frames * about.period) / s < 9) || 5000;
+  const ticks = [...Array(Math.floor(end / every) + 1).keys()].map((i) => i * every).filter((t) => t >= from * about.period);
   return html`<div class="timeline" role="group" aria-label="Timeline">
     <div class="lane"><div class="label">${mine.length} ${mine.length === 1 ? "match" : "matches"} <span class="faint">in this trace</span></div>
       <${Bars} spans=${first.map((m) => [m.first, m.last])}
@@ -61,7 +62,7 @@ export function Timeline() {
     })}
     ${tags.length ? html`<div class="lane"><div class="label">${tags.length} ${tags.length === 1 ? "tag" : "tags"}</div><${Bars} spans=${tags.map((n) => [n[1], n[1] + frames / 200])} kind=${() => "bar-tag"} /></div>` : null}
     ${series.value ? html`<${Series} />` : null}
-    <div class="lane" style=${{ height: "15px" }}><div class="label"></div><div class="row" style=${{ justifyContent: "space-between" }}>
-      ${ticks.map((share) => html`<span class="faint" style=${{ fontSize: "10.5px" }}>${(from * about.period + share * (about.seconds - from * about.period)).toFixed(1)} s</span>`)}</div></div>
+    <div class="lane"><div class="label"></div><div class="ticks">
+      ${ticks.map((t) => html`<span style=${{ left: `${(100 * (t / about.period - from + 0.5)) / frames}%` }}>${Number(t.toFixed(1))} s</span>`)}</div></div>
   </div>`;
 }
