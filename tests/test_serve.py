@@ -6,6 +6,8 @@ import asyncio
 import json
 import socket
 import time
+import zlib
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -19,12 +21,12 @@ from columns_read import unpacked
 from probes import PROBES
 from thorough import LONG
 
+import sgstore.serve
 from sgstore.query import Store
 from sgstore.serve import Explorer, application, serve
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
 HOST = "127.0.0.1:8123"
 TOKEN = "a-token-of-the-tests"
@@ -195,6 +197,13 @@ def test_only_files_of_the_page_are_given(page: Page) -> None:
 
 
 # What is answered --------------------------------------------------------------------------------------
+
+
+def test_it_is_a_small_part_of_a_wheel() -> None:
+    files = [one for one in Path(sgstore.serve.__file__).parent.rglob("*.*") if one.is_file()]
+    sizes = [len(zlib.compress(one.read_bytes())) for one in files if one.suffix != ".pyc"]
+
+    assert 100_000 < sum(sizes) < 400_000
 
 
 def test_it_tells_what_the_store_holds(page: Page, store: Store) -> None:
