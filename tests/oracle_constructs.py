@@ -4,8 +4,8 @@ So many random cases of each are asked of random worlds: of a store (SQL, and co
 memory, frame by frame by a monitor, and of an exhaustive definition that shares no code with them. Printed is a
 table: who was asked, how many cases there were, which share of them is about something that was found, how many
 queries were refused, and the time of the processor. "monitor": a monitor searches the graph of each frame in
-memory. "at end": about rows of all traces, which only a store has. "columns": conditions over time are worked out
-on columns of a store, beside which tables stand; a monitor has none.
+memory. "at end": about rows of all traces, which only a store has. "columns": conditions over time are worked
+out on columns of a store, beside which tables stand; a monitor has none.
 
 A case is one random expression of the construct, asked of all traces of a world; a query asks several at once.
 Names behind the number choose constructs: ``python oracle_constructs.py 5000 UNION HAPPENS``.
