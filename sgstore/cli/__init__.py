@@ -39,8 +39,7 @@ VERBS: Final = {
     "coverage": ("coverage", "select", "diff", "lock"),
     "prioritize": ("criticality", "prioritize"),
     "exports": ("show", "export", "shrink"),
-    "serve": ("serve", "report"),
-    "assistant": ("mcp",),
+    "serve": ("serve", "report", "mcp"),
     "collections": ("collection",),
 }
 """The modules of the verbs, and what is in them; help lists the modules in this order.

@@ -25,9 +25,7 @@ from sgstore.cli._options import (
     AsJson,
     AskedPath,
     AskOptions,
-    EngineName,
     Parameters,
-    Partial,
     PatternNames,
     QueryLimits,
     ReadingOptions,
@@ -42,7 +40,7 @@ from sgstore.cli._options import (
     text_of,
 )
 from sgstore.cli._output import json_text, say
-from sgstore.cli._places import collection_at, url_of
+from sgstore.cli._places import CollectionOptions, url_of
 from sgstore.cli._process import was_ended
 from sgstore.files import without_controls, write_bytes
 
@@ -137,9 +135,8 @@ def check(
         Path | None,
         Option(metavar="FILE", help="Write the verdicts as JUnit's XML, too, for build servers."),
     ] = None,
-    engine: EngineName = "local",
-    partial: Partial = False,
     *,
+    whole: CollectionOptions,
     statements: Statements,
     ask: AskOptions,
 ) -> int:
@@ -153,8 +150,8 @@ def check(
     asked, values = statements.asked(files)
     text = joined([*chain.from_iterable(asked.values())])
     if (url := url_of(store)) is not None:
-        with collection_at(url, ask, engine, None, partial=partial, safe=False) as whole:
-            asked_of = whole.check(text, sgsm_compat=statements.sgsm_compat, **values)
+        with whole.collection_at(url, ask) as opened:
+            asked_of = opened.check(text, sgsm_compat=statements.sgsm_compat, **values)
             return _reported(asked_of, ask, explain=explain, require=require, junit=junit)
     run = ask.opened(store).check(text, sgsm_compat=statements.sgsm_compat, **values)
     return _reported(run, ask, explain=explain, require=require, junit=junit)

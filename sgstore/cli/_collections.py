@@ -10,6 +10,7 @@ from typer import Argument, Option
 from sgstore.cli._options import (
     ERROR,
     Jobs,
+    LookIn,
     PrintedRows,
     StorePath,
     Verbs,
@@ -102,14 +103,7 @@ def verify(url: Place, *, out: PrintedRows) -> int:
 @collection.command()
 def rebuild(
     url: Place,
-    look_in: Annotated[
-        list[Path] | None,
-        Option(
-            "--look-in",
-            metavar="FOLDER",
-            help="Folder to look in for recordings that were moved; repeatable.",
-        ),
-    ] = None,
+    look_in: LookIn = None,
     everything: Annotated[
         bool, Option("--all", help="Also bundles of this version of the schema.")
     ] = False,

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 from typer import Argument, Option
 
-from sgstore.cli import _completion as completion
 from sgstore.cli._options import (
     ERROR,
     NO_MATCH,
@@ -19,10 +18,8 @@ from sgstore.cli._options import (
     AskOptions,
     Budget,
     CaseUnit,
-    EngineName,
     LongestClip,
     Parameters,
-    Partial,
     Picture,
     PrintedRows,
     QueryLimits,
@@ -32,11 +29,12 @@ from sgstore.cli._options import (
     app,
     asked_of,
     parameters_of,
+    pattern_option,
     say_left_out,
     seconds_of,
 )
 from sgstore.cli._output import count_bar, say
-from sgstore.cli._places import note_asked, opened_at
+from sgstore.cli._places import CollectionOptions, note_asked
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -110,11 +108,8 @@ Within = Annotated[
 
 
 @dataclass(frozen=True)
-class FrameAskOptions(AskOptions):
+class FrameAskOptions(CollectionOptions, AskOptions):
     """Options of a verb that asks stores or collections for classes of frames."""
-
-    engine: EngineName = "local"
-    partial: Partial = False
 
     def frames(self, *texts: str) -> Iterator[ChosenFrames]:
         """Frames that each of some texts means."""
@@ -633,9 +628,8 @@ def select(
     picture: Annotated[
         Path | None, Option("--picture", metavar="FILE", help="Draw the curve: .png or .svg.")
     ] = None,
-    engine: EngineName = "local",
-    partial: Partial = False,
     *,
+    whole: CollectionOptions,
     out: PrintedRows,
     bounds: QueryLimits,
 ) -> None:
@@ -653,7 +647,7 @@ def select(
     if output is not None and output.suffix != ENDING:  # before anything is searched
         raise typer.BadParameter(f"--output {output}: the name of a lock ends in {ENDING}")
     shares = parse_split(split) if split else {}
-    opened = opened_at(store, bounds, engine, partial=partial)
+    opened = whole.opened_at(store, bounds)
     found = choose(chosen_frames(opened, str(store), query, parameters), spec)
     parts = split_up(found, shares) if shares else {}
     for text in found.said:
@@ -735,9 +729,8 @@ def verify_(
     strict: Annotated[
         bool, Option("--strict", help="Count another version of sgstore as a difference.")
     ] = False,
-    engine: EngineName = "local",
-    partial: Partial = False,
     *,
+    whole: CollectionOptions,
     ask: AskOptions,
 ) -> int:
     """Verify that a store holds the cases of a lock: recordings, settings, graphs, sensor messages.
@@ -748,7 +741,7 @@ def verify_(
     from sgstore.locks import read_lock, verify
 
     known = read_lock(path)
-    opened = opened_at(store, ask, engine, partial=partial)
+    opened = whole.opened_at(store, ask)
     found = list(verify(known, opened, payloads=not no_payloads))
     ask.write(("where", "what", "detail"), [(one.where, one.what, one.detail) for one in found])
     wrong = [one for one in found if strict or one.matters]
@@ -806,16 +799,7 @@ def diff(
         str, Argument(metavar="A", help="Before: a store or collection, STORE:QUERY, or a lock.")
     ],
     b: Annotated[str, Argument(metavar="B", help="After, as A.")],
-    name: Annotated[
-        str | None,
-        Option(
-            "--pattern",
-            "-p",
-            metavar="NAME",
-            help="Compare by a pattern of the library.",
-            autocompletion=completion.patterns,
-        ),
-    ] = None,
+    name: Annotated[str | None, pattern_option("Compare by a pattern of the library.")] = None,
     query: Annotated[
         str | None,
         Option("--query", "-q", metavar="TEXT", help="Compare by a query, or by 'CHECK …'."),
@@ -841,9 +825,7 @@ def diff(
     if name is not None or query is not None:
         text, values = asked_of(query, None, name, values)
         compare = differences.verdicts if differences.has_checks(text) else differences.matches
-        before, after = (
-            opened_at(Path(one), ask, ask.engine, partial=ask.partial) for one in (a, b)
-        )
+        before, after = (ask.opened_at(Path(one), ask) for one in (a, b))
         table = compare(before, after, text, values)
     else:
         compare = differences.by_frame if by_frame else differences.scenes

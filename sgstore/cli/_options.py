@@ -321,24 +321,6 @@ AskedPath = Annotated[
         autocompletion=completion.stores,
     ),
 ]
-COLLECTIONS: Final = "Collections"
-EngineName = Annotated[
-    str,
-    Option(
-        "--engine",
-        metavar="NAME",
-        help="Of a collection: local:N processes, ray, ray://HOST:PORT, spark, spark:MASTER.",
-        rich_help_panel=COLLECTIONS,
-    ),
-]
-Partial = Annotated[
-    bool,
-    Option(
-        "--partial",
-        help="Of a collection: answer without bundles that cannot be asked; exit code 3.",
-        rich_help_panel=COLLECTIONS,
-    ),
-]
 FrameName = Annotated[
     str,
     Argument(
@@ -368,16 +350,15 @@ QueryText = Annotated[str | None, Argument(metavar="QUERY", help="A pattern: 'MA
 QueryFile = Annotated[
     Path | None, Option("--file", "-f", help="Read the query from a file; - is stdin.")
 ]
-PatternNames = Annotated[
-    list[str] | None,
-    Option(
-        "--pattern",
-        "-p",
-        metavar="NAME",
-        help="One of the library; repeatable.",
-        autocompletion=completion.patterns,
-    ),
-]
+
+
+def pattern_option(about: str) -> Any:
+    """The option ``-p NAME``, for a pattern of the library."""
+    names = ("--pattern", "-p")
+    return Option(*names, metavar="NAME", help=about, autocompletion=completion.patterns)
+
+
+PatternNames = Annotated[list[str] | None, pattern_option("One of the library; repeatable.")]
 Budget = Annotated[str, Option("--budget", help="At most 600s, 10min, 5GB, 1000frames or 40units.")]
 CaseUnit = Annotated[
     Literal["frame", "clip", "trace"], Option("--unit", help="Frames, clips, or whole traces.")
@@ -398,6 +379,14 @@ Picture = Annotated[
 Traces = Annotated[
     list[str] | None,
     Option("--trace", help="Only this trace; repeatable.", autocompletion=completion.traces),
+]
+LookIn = Annotated[
+    list[Path] | None,
+    Option(
+        "--look-in",
+        metavar="FOLDER",
+        help="Folder to look in for recordings that were moved; repeatable.",
+    ),
 ]
 Jobs = Annotated[
     int, Option("--jobs", "-j", min=0, help="Recordings read at a time; 0: one for each core.")
@@ -566,14 +555,7 @@ class Question:
     query: QueryText = None
     file: QueryFile = None
     name: Annotated[
-        str | None,
-        Option(
-            "--pattern",
-            "-p",
-            metavar="NAME",
-            help="A pattern of the library, in place of a query.",
-            autocompletion=completion.patterns,
-        ),
+        str | None, pattern_option("A pattern of the library, in place of a query.")
     ] = None
     parameters: Parameters = None
 

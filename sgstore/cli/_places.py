@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any, Final
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
+from typer import Option
 
 from sgstore.cli._options import COLLECTION_FILE, LOSS, QueryLimits, tables_of
 from sgstore.cli._output import say
@@ -28,37 +30,55 @@ def url_of(store: Path) -> str | None:
     return None
 
 
-@contextmanager
-def collection_at(
-    url: str,
-    bounds: QueryLimits,
-    engine: str,
-    tables: list[str] | None,
-    *,
-    partial: bool,
-    safe: bool,
-) -> Generator[Collection]:
-    """Open a collection within bounds of time, with tables of the user's own."""
-    from sgstore.collection import Collection
-
-    if safe:
-        raise typer.BadParameter("--safe asks one store; a collection is asked without it")
-    if bounds.max_spill is not None:
-        raise typer.BadParameter("--max-spill bounds a question to one store, not to a collection")
-    bounds.spill()
-    with Collection(url, engine=engine, tables=tables_of(tables), partial=partial) as whole:
-        note_asked(whole)
-        yield whole
+COLLECTIONS: Final = "Collections"
 
 
-def opened_at(
-    place: Path, bounds: QueryLimits, engine: str, *, partial: bool
-) -> Store | Collection:
-    """Open a store or a collection within bounds."""
-    if (url := url_of(place)) is None:
-        return bounds.opened(place)
-    with collection_at(url, bounds, engine, None, partial=partial, safe=False) as whole:
-        return whole
+@dataclass(frozen=True)
+class CollectionOptions:
+    """Options for a collection that is asked where a store is expected."""
+
+    engine: Annotated[
+        str,
+        Option(
+            "--engine",
+            metavar="NAME",
+            help="Of a collection: local:N processes, ray, ray://HOST:PORT, spark, spark:MASTER.",
+            rich_help_panel=COLLECTIONS,
+        ),
+    ] = "local"
+    partial: Annotated[
+        bool,
+        Option(
+            "--partial",
+            help="Of a collection: answer without bundles that cannot be asked; exit code 3.",
+            rich_help_panel=COLLECTIONS,
+        ),
+    ] = False
+
+    @contextmanager
+    def collection_at(
+        self, url: str, bounds: QueryLimits, tables: list[str] | None = None, *, safe: bool = False
+    ) -> Generator[Collection]:
+        """Open a collection within bounds of time, with tables of the user's own."""
+        from sgstore.collection import Collection
+
+        if safe:
+            raise typer.BadParameter("--safe asks one store; a collection is asked without it")
+        if bounds.max_spill is not None:
+            reason = "--max-spill bounds a question to one store, not to a collection"
+            raise typer.BadParameter(reason)
+        bounds.spill()
+        how: dict[str, Any] = {"engine": self.engine, "partial": self.partial}
+        with Collection(url, tables=tables_of(tables), **how) as whole:
+            note_asked(whole)
+            yield whole
+
+    def opened_at(self, place: Path, bounds: QueryLimits) -> Store | Collection:
+        """Open a store or a collection within bounds."""
+        if (url := url_of(place)) is None:
+            return bounds.opened(place)
+        with self.collection_at(url, bounds) as whole:
+            return whole
 
 
 _asked: Final[list[Any]] = []  # Collection

@@ -12,16 +12,13 @@ from typer import Argument, Option
 
 from sgstore.cli import _completion as completion
 from sgstore.cli._options import (
-    COLLECTIONS,
     NO_MATCH,
     Abstraction,
     AsJson,
     AskedPath,
     AskOptions,
-    EngineName,
     FrameName,
     Output,
-    Partial,
     QueryFile,
     QueryLimits,
     Question,
@@ -40,7 +37,7 @@ from sgstore.cli._options import (
     text_of,
 )
 from sgstore.cli._output import BINARY, Format, say, write_binary, write_document, write_text
-from sgstore.cli._places import collection_at, opened_at, url_of
+from sgstore.cli._places import COLLECTIONS, CollectionOptions, url_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -76,12 +73,11 @@ def find(
     safe: Safe = False,
     max_rows: MaxRows = 10_000,
     tables: With = None,
-    engine: EngineName = "local",
-    partial: Partial = False,
     each_frame: Annotated[
         bool, Option("--rows", help="On a terminal too, one row for each match in each frame.")
     ] = False,
     *,
+    whole: CollectionOptions,
     ask: AskOptions,
 ) -> int:
     """Find frames by a pattern of their scene graphs.
@@ -91,9 +87,9 @@ def find(
     """
     text, values = question.asked()
     if (url := url_of(store)) is not None:
-        with collection_at(url, ask, engine, tables, partial=partial, safe=safe) as whole:
+        with whole.collection_at(url, ask, tables, safe=safe) as opened:
             return _found_in(
-                whole, text, values, ask, count=count, explain=explain, require=require
+                opened, text, values, ask, count=count, explain=explain, require=require
             )
     if safe:
         if count or explain:
@@ -249,9 +245,8 @@ def like(
     pattern: Annotated[
         bool, Option("--pattern", help="Print a pattern that describes the frame instead.")
     ] = False,
-    engine: EngineName = "local",
-    partial: Partial = False,
     *,
+    whole: CollectionOptions,
     out: RowOptions,
     bounds: QueryLimits,
 ) -> int:
@@ -261,7 +256,7 @@ def like(
     many, how like, whether the graphs are the same, and what only the example has, or only they.
     Frames less than 5 s from the example are left out; --all takes them, and every run, too.
     """
-    opened = opened_at(store, bounds, engine, partial=partial)
+    opened = whole.opened_at(store, bounds)
     if pattern:
         write_text(f"{opened.pattern(frame, ignore=ignore or ())}\n", out.output)
         return 0
@@ -341,9 +336,8 @@ def sql(
             rich_help_panel=COLLECTIONS,
         ),
     ] = False,
-    engine: EngineName = "local",
-    partial: Partial = False,
     *,
+    whole: CollectionOptions,
     ask: AskOptions,
 ) -> int:
     """Ask a store in SQL, read only.
@@ -352,8 +346,8 @@ def sql(
     What a pattern returns is a table, too: FROM sgql('MATCH … RETURN …').
     """
     if (url := url_of(store)) is not None:
-        with collection_at(url, ask, engine, tables, partial=partial, safe=safe) as whole:
-            rows = whole.sql(query_of(statement, file), each=each)
+        with whole.collection_at(url, ask, tables, safe=safe) as opened:
+            rows = opened.sql(query_of(statement, file), each=each)
             ask.write(rows.columns, rows)
             say_left_out(rows)
             return 0
@@ -550,7 +544,7 @@ def run_pattern(
 def _check(store: Path, **options: Any) -> int:
     from sgstore.cli._checks import check  # only here: the verb is none of this module's
 
-    return check(store, **options)
+    return check(store, whole=CollectionOptions(), **options)
 
 
 def _write_intervals(intervals: Iterator[Interval], ask: AskOptions) -> int:

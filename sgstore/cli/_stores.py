@@ -16,6 +16,7 @@ from sgstore.cli._options import (
     FrameName,
     GraphOptions,
     Jobs,
+    LookIn,
     Output,
     PrintedRows,
     StorePath,
@@ -92,14 +93,7 @@ def remove(
 @app.command(rich_help_panel=PANEL)
 def rebuild(
     store: StorePath,
-    look_in: Annotated[
-        list[Path] | None,
-        Option(
-            "--look-in",
-            metavar="FOLDER",
-            help="Folder to look in for recordings that were moved; repeatable.",
-        ),
-    ] = None,
+    look_in: LookIn = None,
     leave_out: Annotated[
         list[str] | None,
         Option(
