@@ -22,15 +22,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 from pydantic import Field
 
-from sgstore.assistant._text import remarks, rows_text
 from sgstore.assistant._vocabulary import Topic, topic_text
+from sgstore.display import cell
 from sgstore.errors import ExportError, StoreError
 from sgstore.json_text import finite
 from sgstore.query import Store
 from sgstore.sandbox import TIMEOUT_S, Sandbox
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from PIL.Image import Image
 
@@ -44,6 +44,12 @@ MOST_ROWS: Final = 1_000
 
 MOST_BYTES: Final = 2 << 20
 """Longest answer; bytes. A model reads a small part of it, a program more."""
+
+MOST_TEXT: Final = 30_000
+"""Characters of rows in one answer; some ten thousand tokens."""
+
+LONGEST: Final = 400
+"""Characters of one value; of a query more than a table of a notebook has room for."""
 
 SIDE: Final = 1_024
 """Longest side of what a camera saw; pixels: models see no more."""
@@ -159,7 +165,7 @@ class StoreTools:
 
     def _rows(self, ask: str, **about: Any) -> ToolAnswer:
         reply = self._ask(ask, **about)
-        return ToolAnswer(rows_text(reply), finite(reply))
+        return ToolAnswer(_rows_text(reply), finite(reply))
 
     # What there is ----------------------------------------------------------------------------
 
@@ -271,7 +277,7 @@ class StoreTools:
         """Check a rule over time: for each trace true, false or unknown, and each violation."""
         reply = self._ask("check", text=rule, limit=limit, parameters=parameters or {})
         tally = ", ".join(f"{number} {word}" for word, number in reply["verdicts"].items())
-        return ToolAnswer(f"{rows_text(reply)}\n({tally or 'no trace'})", finite(reply))
+        return ToolAnswer(f"{_rows_text(reply)}\n({tally or 'no trace'})", finite(reply))
 
     def timeline(
         self,
@@ -294,7 +300,7 @@ class StoreTools:
         if reply["truncated"]:
             lines.append(f"(the first {TRACES_DRAWN} traces; name others in traces)")
         unknown = {one.trace: lane.reason for one in found for lane in one.lanes if lane.reason}
-        text = "\n".join([*map(_one_line, lines), *remarks({"left_out": unknown})])
+        text = "\n".join([*map(_one_line, lines), *_remarks({"left_out": unknown})])
         image = self._drawn(lambda to: draw_timelines(found, to)) if picture and found else b""
         return ToolAnswer(text, finite(reply), image)
 
@@ -320,7 +326,7 @@ class StoreTools:
             known = KnownBindings(reply["bindings"])
             names = ", ".join(known.found[0]) if known.found else ""
             marked = f"marked: {names}" if names else "the query does not match here: see why_not"
-            text = "\n".join([f"{text}; {marked}", *remarks(reply)])
+            text = "\n".join([f"{text}; {marked}", *_remarks(reply)])
         with self._turn:
             image = frame_image(
                 self._store,
@@ -395,7 +401,7 @@ class StoreTools:
         )
         share = reply["share"]
         head = f"{share['part']} of {share['of']} covered; of: {share['denominator']}. Missing:"
-        return ToolAnswer("\n".join([*reply["said"], head, rows_text(reply)]), finite(reply))
+        return ToolAnswer("\n".join([*reply["said"], head, _rows_text(reply)]), finite(reply))
 
     def export_clips(
         self,
@@ -429,7 +435,7 @@ class StoreTools:
         )
         clips = tuple(Clip(*row) for row in reply["rows"])
         if not clips:
-            return ToolAnswer(rows_text(reply), {"files": []})
+            return ToolAnswer(_rows_text(reply), {"files": []})
         with self._turn:
             order = Export(self._store, clips, with_graph=with_graph, provenance={"query": query})
             written = write_export(order, self._write_to / name, form)
@@ -438,7 +444,7 @@ class StoreTools:
         listed = {"columns": [*rows[0]], "rows": [[*row.values()] for row in rows]}
         about = {**listed, "truncated": reply["truncated"], "left_out": reply["left_out"]}
         about["notes"] = [*reply["notes"], *losses]
-        return ToolAnswer(rows_text(about), finite(about))
+        return ToolAnswer(_rows_text(about), finite(about))
 
 
 TRACES_DRAWN: Final = 12
@@ -455,3 +461,50 @@ def _encoded(image: Image, form: str) -> bytes:
     buffer = io.BytesIO()
     image.save(buffer, form)
     return buffer.getvalue()
+
+
+# Answers as they are read in a prompt: few characters, and nothing left out that is not told ----------------
+
+
+def _rows_text(reply: Mapping[str, Any]) -> str:
+    """Rows as lines with ``|`` between the values, and what has to be known of them.
+
+    Parameters
+    ----------
+    reply : mapping
+        ``columns``, ``rows``, ``truncated``; ``notes`` and ``left_out`` where there are any.
+    """
+    rows = reply["rows"]
+    lines, shown = _lines(reply["columns"], rows)
+    told = lines if rows else ["nothing"]
+    if shown < len(rows):
+        told.append(
+            f"({shown} of {len(rows)} rows: more have no room in an answer; return less of each)"
+        )
+    elif reply["truncated"]:
+        told.append(
+            f"(the first {len(rows)} rows; there are more: raise limit, count, or narrow it)"
+        )
+    return "\n".join([*told, *_remarks(reply)])
+
+
+def _lines(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> tuple[list[str], int]:
+    """A head and as many rows as have room; and how many these are."""
+    lines = [" | ".join(columns)]
+    left = MOST_TEXT
+    for number, row in enumerate(rows):
+        line = " | ".join(cell(value, LONGEST) for value in row)
+        left -= len(line) + 1
+        if left < 0 and number:
+            return lines, number
+        lines.append(line)
+    return lines, len(rows)
+
+
+def _remarks(reply: Mapping[str, Any]) -> list[str]:
+    """Sentences on the traces that cannot answer, and on what may be a mistake."""
+    of: dict[str, list[str]] = {}
+    for name, reason in reply.get("left_out", {}).items():
+        of.setdefault(reason, []).append(name)
+    left_out = [f"(cannot answer: {', '.join(names)}: {reason})" for reason, names in of.items()]
+    return [*left_out, *(f"(note: {note})" for note in reply.get("notes", ()))]

@@ -32,8 +32,7 @@ from mcap.writer import CompressionType, Writer
 
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import ChannelCount, WrittenClip, clip_name, tool
-from sgstore.exporters._layout import LAYOUT, layout
-from sgstore.exporters._mcap_graphs import GRAPH, SCENE, Added, is_added
+from sgstore.exporters._mcap_graphs import LAYOUT, Added, is_added, layout
 from sgstore.files import working_folder
 from sgstore.mcap import CLIP, HEAD, READ_ERRORS, Loss, digest_of, near
 from sgstore.readers import open_recording
@@ -94,7 +93,7 @@ def write(export: Export, folder: Path) -> list[WrittenClip]:
         ego = ego or (added.transforms.ego if added is not None else "")
     if export.with_graph:
         channels = [one for number in sorted(written) for one in written[number].messages]
-        text = layout(channels, scene=SCENE, graph=GRAPH, ego=ego)
+        text = layout(channels, ego)
         (folder / LAYOUT).write_text(text, encoding="utf-8", errors="backslashreplace")
     return [written[number] for number in sorted(written)]
 

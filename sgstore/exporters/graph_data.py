@@ -334,13 +334,10 @@ class GraphDataset:
 
     def triples(self) -> list[tuple[str, str, str]]:
         """All (type, relation, type) that occur in the data, in order."""
-        if self._triples is None:
-            self._triples = self._found_triples()
         return self._triples
 
-    _triples: list[tuple[str, str, str]] | None = None
-
-    def _found_triples(self) -> list[tuple[str, str, str]]:
+    @cached_property
+    def _triples(self) -> list[tuple[str, str, str]]:
         found: set[tuple[int, int, int]] = set()
         columns = self.data.columns
         ends, nodes = columns["edge_ptr"], columns["node_ptr"]
