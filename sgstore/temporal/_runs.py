@@ -167,10 +167,10 @@ class BindingRows:
             frames, keys = frames[known], keys[known]
             values = {name: _rows(value, known) for name, value in values.items()}
         owners = line.owners[frames]
-        order = _order([owners, *keys.T, frames])
-        frames, keys, owners = frames[order], keys[order], owners[order]
+        order = _order([owners, *keys.T, frames - line.starts[owners]])
+        frames, keys = frames[order], keys[order]
         fresh = np.ones(len(order), np.bool_)
-        fresh[1:] = np.diff(owners) != 0
+        fresh[1:] = np.diff(owners[order]) != 0
         for key in keys.T:
             fresh[1:] |= key[1:] != key[:-1]
         found = cls(line, frames, keys, fresh, {n: _rows(v, order) for n, v in values.items()})
@@ -422,9 +422,10 @@ def _whole(column: Column, rows: int) -> Column:
 
 def _order(columns: Sequence[Ints]) -> Ints:
     """The order of rows by some columns, the first of them first."""
-    if not len(columns[0]):
+    rows = len(columns[0])
+    if not rows:
         return np.zeros(0, np.int64)
-    code, size = np.zeros(len(columns[0]), np.int64), 1
+    code, size = np.zeros(rows, np.int64), 1
     for column in columns:
         low = int(column.min())
         many = int(column.max()) - low + 1
@@ -435,7 +436,14 @@ def _order(columns: Sequence[Ints]) -> Ints:
             code *= many
             code += column
             code -= low
-    return np.argsort(code, kind="stable")  # a merge of the runs in which a store has its rows
+    bits = rows.bit_length()
+    if size.bit_length() + bits > 62:
+        return np.argsort(code, kind="stable")
+    code <<= bits  # numbers that say their rows, too, are sorted much faster than rows by numbers
+    code |= np.arange(rows)
+    code.sort()
+    code &= (1 << bits) - 1
+    return code
 
 
 def _earliest(at: Ints, limit: Ints, low: Ints, high: Ints) -> Ints:
