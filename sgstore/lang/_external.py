@@ -59,6 +59,9 @@ if TYPE_CHECKING:
     from sgstore.lang.ir import Bound, Query
 
 
+_WORDS: Final = frozenset({Type.text, Type.edge})
+"""Types of values that may be enumerations in the database."""
+
 FRAME: Final = "frame_id"
 GATHERED: Final = ":gathered"
 """The table of what is found, where a statement speaks of all of it."""
@@ -112,6 +115,7 @@ def relation(
     ]
     for number, value in enumerate(values):
         told = expression_text(value, lambda leaf: f'":rows".{quoted(column_of(leaf))}', sql.values)
+        told = f"CAST({told} AS VARCHAR)" if value.type in _WORDS else told
         columns.append(f'{told} AS ":{number}"')
     body = "SELECT " + ",\n  ".join(columns) + "\nFROM " + nested(text, ":rows")
     body += "" if most is None else f"\nLIMIT {most}"

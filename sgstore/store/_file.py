@@ -198,10 +198,22 @@ class StoreFile:
             return found
 
     def arrays(
-        self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
+        self,
+        sql: str,
+        parameters: Parameters | None = None,
+        *,
+        given: Iterable[Given] = (),
+        plain: bool = False,
     ) -> dict[str, NDArray[np.generic]]:
-        """All columns of a statement of ours, as :meth:`rows` takes it; masked where something is NULL."""
-        with self._answered(lambda at, _: rows.arrays(at, sql, parameters), sql, given) as found:
+        """All columns of a statement of ours, as :meth:`rows` takes it; masked where something is NULL.
+
+        ``plain``: none of them is an enumeration, so that the statement need not be planned to know that.
+        """
+
+        def ask(connection: DuckDBPyConnection, _: ExitStack) -> dict[str, NDArray[np.generic]]:
+            return rows.arrays(connection, sql, parameters, plain=plain)
+
+        with self._answered(ask, sql, given) as found:
             return found
 
     def table(

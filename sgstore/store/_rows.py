@@ -378,10 +378,14 @@ def _described(result: DuckDBPyConnection) -> tuple[tuple[str, ...], tuple[str, 
 
 
 def arrays(
-    connection: DuckDBPyConnection, sql: str, parameters: Parameters | None
+    connection: DuckDBPyConnection, sql: str, parameters: Parameters | None, *, plain: bool = False
 ) -> dict[str, NDArray[np.generic]]:
-    """All columns of a statement of ours; masked arrays where something is NULL, enumerations as texts."""
-    described = connection.execute(f"DESCRIBE {sql}", parameters or None).fetchall()
+    """All columns of a statement of ours; masked arrays where something is NULL, enumerations as texts.
+
+    ``plain``: no column is an enumeration.
+    """
+    asked = f"DESCRIBE {sql}"
+    described = [] if plain else connection.execute(asked, parameters or None).fetchall()
     # As enumerations they would come as categories of pandas.
     listed = [quoted(str(row[0])) for row in described if "ENUM" in str(row[1])]
     if listed:

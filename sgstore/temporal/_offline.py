@@ -434,7 +434,7 @@ def frame_times(file: StoreFile, window: Window | None) -> dict[str, Ints]:
     sql, values = CLOCK, (low, high)
     if window and window.traces is not None:
         sql, values = CLOCK_OF_TRACES, (low, high, list(window.traces))
-    found = file.arrays(sql, values).items()
+    found = file.arrays(sql, values, plain=True).items()
     return {name: np.ma.getdata(column).astype(np.int64) for name, column in found}
 
 
@@ -476,7 +476,7 @@ def arrays_of(
     bound = {*ask.variables, *ask.edges}
     statement = relation(ask.query, catalog, window, values, bound, most + 1)
     *before, last = statement.steps()
-    arrays = file.arrays(*last, given=before)
+    arrays = file.arrays(*last, given=before, plain=True)
     ids = np.ma.getdata(arrays["frame_id"]).astype(np.int64, copy=False)
     if len(ids) > most:
         held = (one.name for one in catalog.traces if window is None or one.extent[0] in window)
