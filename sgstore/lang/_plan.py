@@ -33,7 +33,7 @@ from sgstore.quoting import quoted
 from sgstore.records import dataclass
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from sgstore.lang._catalog import Catalog
     from sgstore.lang._formulas import BoundValues
@@ -54,6 +54,13 @@ class Window:
         low, high = min(first for first, _ in extents), max(first + many for first, many in extents)
         traces = tuple(first >> TRACE_OF_BUCKET for first, _ in extents)
         return cls(low, high, traces if len(traces) > 1 else None)
+
+    def whole(self, extents: Iterable[tuple[int, int]]) -> Window:
+        """The same as a range alone, if no other of all extents, such as are given, begins in it."""
+        if self.traces is None:
+            return self
+        many = sum(self.low <= first < self.high for first, _ in extents)
+        return Window(self.low, self.high) if many == len(self.traces) else self
 
     def __contains__(self, bucket: int) -> bool:
         inside = self.low <= bucket < self.high

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -325,13 +325,16 @@ class RunFinder:
             What is worked out for each run.
         within : Window or None
         """
-        asked = [one for one in extents(self._catalog) if within is None or one[0] in within]
-        # Traces that are alike stand beside one another: each window is to have some of all kinds.
-        apart = 1 + sum(buckets for _, buckets in asked) // FIRST_WINDOW
-        asked = [one for first in range(apart) for one in asked[first::apart]]
+        # By their ids, which are digests: each window has traces of all kinds, and a part of each table.
+        every = sorted(extents(self._catalog))
+        asked = [one for one in every if within is None or one[0] in within]
         steps = Windows(asked, first=FIRST_WINDOW, whole_traces=True)
+
+        def ask(window: Window | None) -> tuple[RunsTold, int]:
+            return self._found(places, None if window is None else window.whole(every))
+
         for window in steps:
-            for told, rows in steps.parts(window or within, partial(self._found, places)):
+            for told, rows in steps.parts(window or within, ask):
                 steps.rows += rows * ROWS_EACH
                 yield told
 
