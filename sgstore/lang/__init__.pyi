@@ -35,7 +35,9 @@ from ._evaluate import Evaluate as Evaluate
 from ._evaluate import FrameView as FrameView
 from ._evaluate import column_evaluator as column_evaluator
 from ._external import CLOCK as CLOCK
+from ._external import BUCKETS as BUCKETS
 from ._external import CLOCK_OF_TRACES as CLOCK_OF_TRACES
+from ._external import TIMES as TIMES
 from ._external import TOLD_WEATHER as TOLD_WEATHER
 from ._external import TRACES as TRACES
 from ._external import ExternalRelation as ExternalRelation
@@ -110,7 +112,9 @@ __all__ = [
     "CheckInCatalog",
     "CLASSES_GIVEN",
     "CLOCK",
+    "BUCKETS",
     "CLOCK_OF_TRACES",
+    "TIMES",
     "CONSTANTS",
     "Catalog",
     "ClassQuestion",

@@ -131,6 +131,14 @@ CLOCK_OF_TRACES: Final = f"""{_CLOCK}
   AND "frame_id" >> {TRACE_OF_FRAME} IN (SELECT unnest(CAST($3 AS BIGINT[]))) ORDER BY "frame_id" """
 """The frames of some traces in a range, in order."""
 
+BUCKETS: Final = """SELECT "bucket", "valid", "joined" FROM "bucket"
+WHERE "bucket" >= $1 AND "bucket" < $2"""
+"""The buckets of a range: their frames, and those that follow soon on the one before; in any order."""
+
+TIMES: Final = """SELECT "frame_id", "time_ns" FROM "frame"
+WHERE "frame_id" >= $1 AND "frame_id" < $2"""
+"""The times of the frames of a range, in any order."""
+
 TRACES: Final = 'SELECT "trace_id", "name", "start_ns", coalesce("period_ns", 0) FROM "trace"'
 """All traces: what the times of their frames are counted by."""
 

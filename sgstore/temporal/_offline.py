@@ -14,8 +14,10 @@ import numpy as np
 
 from sgstore.errors import QueryError
 from sgstore.lang import (
+    BUCKETS,
     CLOCK,
     CLOCK_OF_TRACES,
+    TIMES,
     TRACES,
     Column,
     Window,
@@ -178,6 +180,11 @@ ROW_BYTES: Final = 100
 
 EDGE_BYTES: Final = 100
 """Memory that an edge of a binding takes beside its nodes, as a word; bytes."""
+
+BUCKET_SHIFT: Final = 6
+"""``frame_id >> 6`` is the bucket of a frame."""
+
+_LAST: Final = (1 << 63) - 1
 
 MOST_BINDINGS: Final = 5_000_000
 """Most combinations of nodes that are made of one trace, whatever frames they have."""
@@ -430,12 +437,36 @@ def chosen_traces(file: StoreFile, query: Query, catalog: Catalog) -> dict[int, 
 
 def frame_times(file: StoreFile, window: Window | None) -> dict[str, Ints]:
     """Ids, numbers, times and log times of the frames of a window, in order of the ids."""
-    low, high = (window.low << 6, window.high << 6) if window else (0, (1 << 63) - 1)
+    low, high = (window.low << BUCKET_SHIFT, window.high << BUCKET_SHIFT) if window else (0, _LAST)
     sql, values = CLOCK, (low, high)
     if window and window.traces is not None:
         sql, values = CLOCK_OF_TRACES, (low, high, list(window.traces))
     found = file.arrays(sql, values, plain=True).items()
     return {name: np.ma.getdata(column).astype(np.int64) for name, column in found}
+
+
+def buckets_of(file: StoreFile, window: Window | None) -> dict[str, Ints]:
+    """The buckets from the first to the last of a window, their frames and those that follow soon, as masks."""
+    low, high = (window.low, window.high) if window else (0, _LAST)
+    return _ordered(file, BUCKETS, low, high)
+
+
+def times_of(file: StoreFile, window: Window | None) -> tuple[Ints, Ints]:
+    """Ids of the frames from the first to the last of a window, in order, and their times; ns."""
+    low, high = (window.low << BUCKET_SHIFT, window.high << BUCKET_SHIFT) if window else (0, _LAST)
+    ids, times = _ordered(file, TIMES, low, high).values()
+    return ids, times
+
+
+def _ordered(file: StoreFile, sql: str, low: int, high: int) -> dict[str, Ints]:
+    """Columns of whole numbers of a range, in ascending order of the first."""
+    asked = file.arrays(sql, (low, high), plain=True).items()
+    found = {name: np.ma.getdata(column).astype(np.int64) for name, column in asked}
+    first = next(iter(found.values()))
+    if np.any(np.diff(first) < 0):
+        order = np.argsort(first, kind="stable")  # a merge of the traces, each of which is in order
+        return {name: column[order] for name, column in found.items()}
+    return found
 
 
 def _clocks(

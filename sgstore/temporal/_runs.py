@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -17,22 +17,24 @@ from sgstore.lang import Column, extents
 from sgstore.lang import ir as b
 from sgstore.matches import Windows
 from sgstore.records import dataclass
-from sgstore.store import seq_of, trace_of
+from sgstore.store import BUCKET_BITS, seq_of, trace_of
 from sgstore.temporal._match_values import over_rows, picked
 from sgstore.temporal._offline import (
+    BUCKET_SHIFT,
     EDGE_BYTES,
     ROW_BYTES,
     arrays_of,
     ascending,
+    buckets_of,
     chosen_traces,
-    frame_times,
+    times_of,
 )
 from sgstore.temporal._signals import Clock, SignalValues
 from sgstore.temporal._windows import over_columns
-from sgstore.world import longest_step_ns, tolerance_ns
+from sgstore.world import BUCKET_FRAMES, longest_step_ns, tolerance_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -60,61 +62,83 @@ RunsTold = tuple["Ints", "Ints", "Keys", list[list[Any]]]
 """Runs: ids of their first and last frames, their nodes and edges, and the values of each place."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class FrameLine:
     """The frames of many traces in one line.
 
+    They are told by the buckets of a store, some sixty at a time; times are read where they are asked for.
+
     Attributes
     ----------
-    ids, times : (F,) int64
-        In order of ``frame_id``; times ascend within a trace; ns.
+    ids : (F,) int64
+        In ascending order.
     owners : (F,) int64
         The place of the trace of each.
-    begins : (F,) bool
-        Whether a trace begins with it, or what follows a gap.
     traces, starts : (T,) int64
         Ids of the traces, and the first frame of each.
     periods, tolerances : (T,) int64
         Of the traces; ns.
+    apart : bool
+        Whether some frame may not follow soon after the one before it in its trace.
+    told : function
+        Tells the ids and times of the frames of all traces that are read; ns.
     """
 
     ids: Ints
-    times: Ints
     owners: Ints
-    begins: Bools
     traces: Ints
     starts: Ints
     periods: Ints
     tolerances: Ints
+    apart: bool
+    told: Callable[[], tuple[Ints, Ints]]
 
     @classmethod
     def read(
-        cls, file: StoreFile, query: b.Query, catalog: Catalog, window: Window | None
+        cls, file: StoreFile, about: Mapping[int, tuple[Any, ...]], window: Window | None
     ) -> FrameLine:
-        """Frames of the traces that a query asks, of those in a window."""
-        about = chosen_traces(file, query, catalog)
-        frames = frame_times(file, window)
-        rows = np.isin(trace_of(frames["frame_id"]), [*about])
-        if not rows.all():
-            frames = {name: column[rows] for name, column in frames.items()}
-        ids, times, numbers = (frames[name] for name in ("frame_id", "time_ns", "seq"))
+        """Frames of some traces, told as by :func:`chosen_traces`, of those in a window."""
+        buckets = buckets_of(file, window)
+        owners = buckets["bucket"] >> BUCKET_BITS
+        rows = np.isin(owners, [*about])
+        if window is not None and window.traces is not None:
+            rows &= np.isin(owners, window.traces)
+        bucket, valid, joined = (buckets[n][rows] for n in ("bucket", "valid", "joined"))
+        held, bits = np.nonzero((valid[:, None] >> np.arange(BUCKET_FRAMES)) & 1)
+        ids = (bucket[held] << BUCKET_SHIFT) + bits
         starts = np.flatnonzero(np.diff(trace_of(ids), prepend=-1))
         traces, counts = trace_of(ids[starts]), np.diff(starts, append=len(ids))
         owners = np.repeat(np.arange(len(traces)), counts)
+        periods = np.array([about[trace][2] for trace in traces.tolist()], np.int64)
+        tolerances = np.array([tolerance_ns(period) for period in periods.tolist()], np.int64)
+        apart = int(np.bitwise_count(joined).sum()) != len(ids) - len(traces)
+        told = partial(times_of, file, window)
+        return cls(ids, owners, traces, starts, periods, tolerances, apart, told)
+
+    @cached_property
+    def times(self) -> Ints:
+        """(F,) the times of the frames, which ascend within a trace; ns."""
+        ids, times = self.told()
+        if len(ids) != len(self.ids):
+            times = times[np.isin(trace_of(ids), self.traces)]
         still = np.diff(times) <= 0
-        still[starts[1:] - 1] = False
-        for owner in np.unique(owners[1:][still]).tolist():
-            own = slice(starts[owner], starts[owner] + counts[owner])
+        still[self.starts[1:] - 1] = False
+        ends = np.append(self.starts[1:], len(times))
+        for owner in np.unique(self.owners[1:][still]).tolist():
+            own = slice(self.starts[owner], ends[owner])
             times[own] = ascending(times[own])
-        periods = [about[trace][2] for trace in traces.tolist()]
-        longest = np.array([longest_step_ns(period) for period in periods])
-        begins = np.diff(numbers, prepend=-2) != 1
-        begins[1:] |= np.diff(times) > longest[owners[1:]]
-        begins[starts] = True
-        tolerances = np.array([tolerance_ns(period) for period in periods], np.int64)
-        return cls(
-            ids, times, owners, begins, traces, starts, np.array(periods, np.int64), tolerances
-        )
+        return times
+
+    @cached_property
+    def begins(self) -> Bools:
+        """(F,) whether a trace begins with a frame, or what follows a gap."""
+        found = np.zeros(len(self.ids), np.bool_)
+        if self.apart:  # a time that goes back is no gap, and is not told apart from one by buckets
+            longest = np.array([longest_step_ns(period) for period in self.periods.tolist()])
+            found[1:] = np.diff(self.times) > longest[self.owners[1:]]
+            found |= np.diff(seq_of(self.ids), prepend=-2) != 1
+        found[self.starts] = True
+        return found
 
     def places(self, ids: Ints) -> Ints:
         """(R,) the place of each of some frames; -1 of those that are not here."""
@@ -316,6 +340,11 @@ class RunFinder:
                 plain = not (b.is_temporal(value) or b.edges_of(value) or [*b.blocks_of(value)])
                 return plain and b.nodes_of(value) <= {*self._ask.variables}
 
+    @cached_property
+    def _about(self) -> dict[int, tuple[Any, ...]]:
+        """The traces that are asked."""
+        return chosen_traces(self._file, self._query, self._catalog)
+
     def found(self, places: Sequence[b.Bound], within: Window | None) -> Iterator[RunsTold]:
         """The runs in whole traces; not more of these at a time than memory may hold.
 
@@ -389,7 +418,7 @@ class RunFinder:
         """The rows of the pattern, with all that tests need of them."""
         signals = (signal.value for test in tests for signal in test.signals.values())
         asked = list(dict.fromkeys(value for value in signals if value is not None))
-        line = FrameLine.read(self._file, self._query, self._catalog, window)
+        line = FrameLine.read(self._file, self._about, window)
         size = ROW_BYTES + EDGE_BYTES * len(self._ask.edges) + VALUE_BYTES * len(asked)
         most = self._file.memory // size
         ids, keys, found = arrays_of(self._file, self._catalog, self._ask, window, asked, most)
