@@ -35,7 +35,7 @@ from sgstore.errors import QueryError
 from sgstore.lang import pattern_named
 from sgstore.lang.ir import BoundHold, Length
 from sgstore.query import Store
-from sgstore.temporal import _offline, _sequences, evaluate
+from sgstore.temporal import _offline, _runs, _sequences, evaluate
 from sgstore.temporal._formula import And
 from sgstore.temporal._sequences import BindingLine, Leg, matches_of
 from sgstore.temporal._signals import Clock, PropositionTable
@@ -181,6 +181,23 @@ def test_edges_over_time_are_what_their_definition_says(asked: tuple[World, Stor
     found = [compare_edges(*asked, *one) for one in edge_questions(random.Random(7))]
 
     assert sum(found) > 50
+
+
+def test_values_over_a_match_are_the_same_however_many_traces_are_read_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, store = worlds(8, tmp_path, traces=5)
+    values = "MIN(dist(v, w)) OVER match AS least, LAST(v.kind) OVER match AS last"
+    text = f"MATCH (v:Entity), (w:Entity) RETURN v, w, INTERVALS, {values}"
+    at_once = store.find(text).rows()
+
+    monkeypatch.setattr(_runs, "TOGETHER", 20)
+    in_halves = store.find(text).rows()
+    monkeypatch.setattr(_runs, "FIRST_WINDOW", 1)
+    one_by_one = store.find(text).rows()
+
+    assert len({row.trace for row in at_once}) == 5
+    assert in_halves == one_by_one == at_once
 
 
 def test_an_edge_without_a_number_has_an_unknown_one(tmp_path: Path) -> None:

@@ -51,6 +51,9 @@ FIRST_WINDOW: Final = 2_048
 ROWS_EACH: Final = 2
 """So many rows of those that :class:`Windows` counts take the memory of one that is put in order here."""
 
+TOGETHER: Final = 1_500_000
+"""Rows of several traces that are read together; where there are more, fewer traces are."""
+
 VALUE_BYTES: Final = 20
 """Memory that a value of a row takes beside its binding; bytes."""
 
@@ -421,6 +424,8 @@ class RunFinder:
         line = FrameLine.read(self._file, self._about, window)
         size = ROW_BYTES + EDGE_BYTES * len(self._ask.edges) + VALUE_BYTES * len(asked)
         most = self._file.memory // size
+        if len(line.traces) > 1:
+            most = min(most, TOGETHER)
         ids, keys, found = arrays_of(self._file, self._catalog, self._ask, window, asked, most)
         values = {value: _column(one) for value, one in zip(asked, found, strict=True)}
         return BindingRows.of(line, ids, keys, values)
