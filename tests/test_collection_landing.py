@@ -17,7 +17,7 @@ from recordings import Recorder, car
 from thorough import LONG
 
 from sgstore.cli import run as run_verb
-from sgstore.collection import Collection, commit, gc, land, rebuild, verify
+from sgstore.collection import Collection, commit, gc, land, pack, rebuild, verify
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection import _landing as landing
 from sgstore.collection import _place as places
@@ -199,6 +199,21 @@ def test_one_trace_read_in_two_ways_is_in_a_collection_once(
     assert "several ways" in reason
 
 
+def test_what_came_from_a_store_and_lands_too_is_there_already(
+    drives: list[Path], tmp_path: Path
+) -> None:
+    place = tmp_path / "c"
+    ingest(tmp_path / "s.sgstore", drives[:2])  # one without a map, one with it
+    assert pack(tmp_path / "s.sgstore", place).added == ["a", "b"]
+    land(place, drives[:3])
+
+    done = commit(place)
+    assert (done.refused, sorted(done.present), done.added) == ([], ["a", "b"], ["c"])
+    land(place, drives[1:2], since=1)
+    (reason,) = commit(place).refused
+    assert "several ways" in reason
+
+
 def test_a_share_that_is_none_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="shard 3/2"):
         land(tmp_path / "c", [], shard=(3, 2))
@@ -234,9 +249,43 @@ def test_the_verbs_do_it(
     drives: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     place = str(tmp_path / "c")
-    for share in ("1/2", "2/2"):
-        assert run_verb(["ingest", place, *map(str, drives), "--shard", share]) == 0
-    assert run_verb(["collection", "commit", place, "--json"]) == 0
-    capsys.readouterr()
+    for share in range(1, 8):
+        assert run_verb(["ingest", place, *map(str, drives), "--shard", f"{share}/7"]) == 0
+        told = capsys.readouterr()
+        assert ("has none of 4 recordings" in told.err) != ("landed" in told.out)
+    assert run_verb(["find", place, NEAR, "--count"]) == 0
+    assert "nothing is committed here yet" in capsys.readouterr().err
+    for news in ("4 traces in 1 bundle, snapshot 1", "nothing new; the last snapshot is 1"):
+        assert run_verb(["collection", "commit", place, "--json"]) == 0
+        assert news in capsys.readouterr().err
     assert run_verb(["find", place, NEAR, "--count"]) == 0
     assert int(capsys.readouterr().out) == sum(65 + number for number in range(4))
+
+
+def cut_off(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:20])
+
+
+@pytest.mark.parametrize("name", ["COLLECTION.json", "catalogue/00000001.json"])
+def test_what_is_cut_off_is_named(
+    unsharded: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = tmp_path / "a fleet, größer"
+    shutil.copytree(unsharded, place)
+    assert run_verb(["find", str(place), NEAR, "--count"]) == 0
+    cut_off(place / name)
+    capsys.readouterr()
+
+    for verb in (["find", str(place), NEAR], ["collection", "commit", str(place)]):
+        assert run_verb(verb) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"{place / name}: damaged or cut off" in line
+
+
+def test_a_file_is_no_collection(drives: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
+    for verb in (
+        ["collection", "commit", str(drives[0])],
+        ["ingest", str(drives[0]), str(drives[1]), "--shard", "1/1"],
+    ):
+        assert run_verb(verb) == 1
+        assert f"{drives[0]}: a file, and a collection is a folder" in capsys.readouterr().err

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 from typer import Argument, Option
 
@@ -21,11 +21,29 @@ from sgstore.cli._options import (
 from sgstore.cli._output import count_bar, say
 from sgstore.cli._places import url_of
 
+if TYPE_CHECKING:
+    from sgstore.collection import Commit
+
 PANEL: Final = "More than one machine"
 
 Place = Annotated[
     Path, Argument(metavar="URL", help="The collection: a folder, or s3://bucket/prefix.")
 ]
+
+
+def _statuses(done: Commit) -> list[tuple[str, str]]:
+    """What became of traces."""
+    return [(name, "added") for name in done.added] + [(name, "present") for name in done.present]
+
+
+def _new_in(done: Commit) -> str:
+    """What a commit has brought into a collection."""
+    if not done.added:
+        return f"nothing new; the last snapshot is {done.number}"
+    traces, bundles = len(done.added), len(done.bundles)
+    told = f"{traces} trace{'s' * (traces > 1)} in {bundles} bundle{'s' * (bundles > 1)}"
+    return f"{told}, snapshot {done.number}"
+
 
 collection = Verbs(no_args_is_help=True)
 app.add_typer(
@@ -54,11 +72,10 @@ def pack(
         done = pack_store(
             store, url_of(url) or url, bundle_traces=bundle_traces, on_bundle=on_bundle
         )
-    rows = [(name, "added") for name in done.added] + [(name, "present") for name in done.present]
-    out.write(("trace", "status"), rows)
+    out.write(("trace", "status"), _statuses(done))
     for old, new in done.renamed.items():
         say(f"{old}: the collection has another trace of this name, so it is {new!r} there")
-    say(f"{url}: {len(done.added)} traces in {len(done.bundles)} bundles, snapshot {done.number}")
+    say(f"{url}: {_new_in(done)}")
     return 0
 
 
@@ -68,10 +85,10 @@ def commit(url: Place, *, out: PrintedRows) -> int:
     from sgstore.collection import commit as commit_landed
 
     done = commit_landed(url_of(url) or url)
-    out.write(("trace", "status"), [(name, "added") for name in done.added])
+    out.write(("trace", "status"), _statuses(done))
     for reason in done.refused:
         say(f"not committed: {reason}")
-    say(f"{url}: {len(done.added)} traces in {len(done.bundles)} bundles, snapshot {done.number}")
+    say(f"{url}: {_new_in(done)}")
     return ERROR if done.refused else 0
 
 

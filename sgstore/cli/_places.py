@@ -87,7 +87,13 @@ _asked: Final[list[Any]] = []  # Collection
 def note_asked(store: Store | Collection) -> None:
     """Note what a verb asks: of a collection, some bundles may not answer."""
     if hasattr(store, "missing"):
-        _asked.append(store)
+        whole: Any = store
+        _asked.append(whole)
+        if not whole.snapshot.bundles:
+            say(
+                f"{whole.place.url}: nothing is committed here yet;"
+                " 'sgstore collection commit' makes bundles of what has landed"
+            )
 
 
 def with_missing(code: int) -> int:

@@ -28,7 +28,7 @@ from sgstore.cli._options import (
     seconds_of,
 )
 from sgstore.cli._output import Format, complain, quiet, say, write_document, write_report
-from sgstore.cli._places import url_of
+from sgstore.cli._places import note_asked, url_of
 from sgstore.errors import StoreError, place_named
 
 if TYPE_CHECKING:
@@ -137,8 +137,11 @@ def _landed(
 
     number, stroke, of = (shard or "1/1").partition("/")
     if not (stroke and number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of)):
-        raise typer.BadParameter(f"--shard {shard}: expected I/N, such as 3/16")
-    return land(url_of(store) or store, paths, shard=(int(number), int(of)), **how)
+        raise typer.BadParameter(f"--shard {shard}: expected I/N, such as 3/16; I is 1 to N")
+    outcomes = land(url_of(store) or store, paths, shard=(int(number), int(of)), **how)
+    if not outcomes:
+        say(f"share {shard} has none of {len(paths)} recordings")
+    return outcomes
 
 
 def _names(traces: list[str]) -> list[str]:
@@ -229,7 +232,9 @@ def _tell_of_collection(url: str, names: list[str], out: PrintedRows) -> None:
     """Print what the catalogue of a collection says of traces; without names of all."""
     from sgstore.collection import Collection
 
-    found = Collection(url).traces()
+    whole = Collection(url)
+    note_asked(whole)
+    found = whole.traces()
     known = {row["name"] for row in found}
     for name in names:
         if name not in known:

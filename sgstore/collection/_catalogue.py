@@ -87,12 +87,18 @@ def about(place: Place) -> About:
             f"{place.url}: not a collection ({error}); 'sgstore collection pack STORE URL' makes one"
         ) from error
     except (ValueError, KeyError, TypeError) as error:
-        raise StoreError(f"{place.url}/{ABOUT}: cannot be read: {error!r}") from error
+        raise StoreError(f"{place.url}/{ABOUT}: {_damage(error)}") from error
     if known[0] != FORMAT:
         raise StoreError(
             f"{place.url}: a collection of format {known[0]}; this version of sgstore reads {FORMAT}"
         )
     return known[1]
+
+
+def _damage(error: Exception) -> str:
+    """What is wrong with a file of JSON."""
+    why = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
+    return f"damaged or cut off ({why}); put it back from a copy"
 
 
 def create(place: Place, wanted: About) -> About:
@@ -366,7 +372,7 @@ def read(place: Place, number: int) -> Snapshot:
         folder: str = told["folder"]
         missing = set(CATALOGUE) - set(digests)
     except (ValueError, KeyError, TypeError) as error:
-        raise StoreError(f"{place.url}/{_name(number)}.json: cannot be read: {error!r}") from error
+        raise StoreError(f"{place.url}/{_name(number)}.json: {_damage(error)}") from error
     if missing:
         raise StoreError(
             f"{place.url}/{_name(number)}.json: has no {', '.join(sorted(missing))}; was it made by another"

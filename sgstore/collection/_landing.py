@@ -249,6 +249,8 @@ class _Landed:
     of_map: str
     map_name: str
     size: int
+    read: tuple[Any, ...]
+    """How it was read, and what of it: settings, map, frames, start."""
 
     @property
     def whose(self) -> str:
@@ -313,6 +315,10 @@ def _waiting(place: Place, before: Snapshot, folder: Path) -> list[_Landed]:
                 identity.map_digest,
                 identity.map_name or "map",
                 sizes[segment],
+                (
+                    *(identity.settings_digest, identity.map_digest),
+                    *(told.trace["frames"], told.trace["start_ns"]),
+                ),
             )
         )
     return sorted(found, key=lambda one: (one.digest, one.ego, one.segment))
@@ -342,7 +348,9 @@ def _accepted(waiting: list[_Landed], before: Snapshot, done: Commit) -> list[_L
             whose.insert(0, f"{held}, which is {row['name']!r}")
         of = {(one.digest, one.ego) for one in same}
         of |= set() if row is None else {(row["digest"], row["ego"])}
-        if len(of) > 1:
+        if row is not None and len(of) == 1 and {one.read for one in same} == {_read_of(row)}:
+            done.present.append(row["name"])
+        elif len(of) > 1:
             done.refused.append(
                 f"the id {trace_id} is that of several traces by chance: {' and '.join(whose)};"
                 " put one of them into a collection of its own"
@@ -355,6 +363,11 @@ def _accepted(waiting: list[_Landed], before: Snapshot, done: Commit) -> list[_L
         else:
             found.append(same[0])
     return found
+
+
+def _read_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    """How a trace of the collection was read, and what of its recording, as :class:`_Landed` has it."""
+    return row["config"], row["map_digest"] or "", row["frames"], row["start_ns"]
 
 
 def _names(waiting: Sequence[_Landed], before: Snapshot, done: Commit) -> dict[int, str]:

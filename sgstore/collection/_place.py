@@ -123,6 +123,8 @@ class _Folder:
         except FileNotFoundError as error:
             raise MissingObjectError(f"{self.root / name}: there is no such file") from error
         except OSError as error:
+            if self.root.is_file():
+                raise StoreError(f"{self.root}: a file, and a collection is a folder") from error
             raise StoreError(f"{self.root / name}: {error.strerror or error}") from error
 
     def read(self, name: str) -> bytes:

@@ -53,7 +53,7 @@ def object_stores() -> Any:
         import_module("obstore.store")
         import_module("obstore.exceptions")
     except ImportError as error:
-        raise MissingExtraError("obstore", "cluster") from error
+        raise MissingExtraError("recordings and collections elsewhere", "cluster") from error
     return found
 
 
