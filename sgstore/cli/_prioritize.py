@@ -219,7 +219,7 @@ def prioritize(
             )
         say_made(made, output)
     # Last: who reads only the first rows has the lock all the same.
-    out.write(found.columns, rows)
+    out.write(found.columns, rows, found.types)
 
 
 def _fault_detection(order: Prioritized, known: dict[str, bool], picture: Path | None) -> None:

@@ -593,12 +593,11 @@ def listed(selection: Selection) -> ReportTable:
 
 def names_of_units(units: Units, picked: Ints) -> list[str]:
     """Units as a lock calls them: ``TRACE#FIRST-LAST``, or ``TRACE#SEQ`` of a single frame."""
-    first = names_of(units.chosen.store, units.first[picked])
-    last = seq_of(units.last[picked]).tolist()
-    return [
-        name if name.rpartition("#")[2] == str(end) else f"{name}-{end}"
-        for name, end in zip(first, last, strict=True)
-    ]
+    first, last = units.first[picked], units.last[picked]
+    names = names_of(units.chosen.store, first)
+    for place in np.flatnonzero(first != last).tolist():
+        names[place] += f"-{seq_of(last[place])}"
+    return names
 
 
 # Parts of a selection that share no recording, such as train and test; and what one knows of another ----

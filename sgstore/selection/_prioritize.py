@@ -30,6 +30,7 @@ from sgstore.pair_numbers import PAIR_FUNCTIONS
 from sgstore.selection._choose import BudgetTracker, names_of_units
 from sgstore.selection._learn import cross_fitted, features_of, learned_elsewhere, model_name
 from sgstore.selection._situations import (
+    MET,
     OTHERS,
     SITUATION,
     WHO,
@@ -214,19 +215,24 @@ class Prioritized:
         likely = ["probability"] * bool(len(self.chance))
         return ("place", "unit", "risk", *likely, *(one.name for one in self.worst), "reason")
 
+    @property
+    def types(self) -> tuple[str, ...]:
+        """The database's types of these columns."""
+        return ("BIGINT", "VARCHAR", *["DOUBLE"] * (len(self.columns) - 3), "VARCHAR")
+
     def rows(self) -> Iterator[tuple[Any, ...]]:
         """The units in order, with the reasons: made some thousand at a time, as they are asked for.
 
         The store is asked at once, and not again.
         """
-        sql = "SELECT trace_id, node_id, kind FROM entities"
+        sql = f"SELECT trace_id, node_id, kind FROM entities WHERE kind {MET}"  # noqa: S608  names of ours
         found = self.units.chosen.one_store.file.rows(sql).values
-        kinds = {tuple(one): kind for *one, kind in found}
+        who = {(trace, node): f" with {kind} {node} at " for trace, node, kind in found}
         times = _times(self.units) if self.worst else np.zeros(0)
-        return self._told(kinds, times, names_of_units(self.units, self.picked))
+        return self._told(who, times, names_of_units(self.units, self.picked))
 
     def _told(
-        self, kinds: dict[tuple[Any, ...], Any], times: Floats, units: list[str]
+        self, who: dict[tuple[int, int], str], times: Floats, units: list[str]
     ) -> Iterator[tuple[Any, ...]]:
         coded = self.code[self.picked] if len(self.code) else np.full(len(self.picked), UNKNOWN)
         turns = _turns(coded)
@@ -235,9 +241,9 @@ class Prioritized:
         for start in range(0, len(self.picked), _TOLD):
             part = self.picked[start : start + _TOLD]
             traces = trace_of(self.units.first[part]).tolist()
-            columns = [one.value[part].tolist() for one in self.worst]
+            columns = [_or_none(one.value[part]) for one in self.worst]
             risk = self.risk[part].tolist() if len(self.risk) else [None] * len(part)
-            told = [_reasons(one, part, traces, kinds, times) for one in self.worst]
+            told = [_reasons(one, part, traces, who, times) for one in self.worst]
             if len(self.chance):
                 columns.insert(0, self.chance[part].tolist())
                 told.insert(0, [f"fails with probability {one:.2g}" for one in columns[0]])
@@ -252,12 +258,13 @@ class Prioritized:
                         for code, turn in classes
                     ]
                 )
-            said = ("; ".join(filter(None, one)) for one in zip(*told, strict=True))
-            known = [[None if v != v else v for v in one] for one in columns]  # noqa: PLR0124 - NaN
+            said = [
+                "; ".join(one if all(one) else filter(None, one)) or "nothing is known of it"
+                for one in zip(*told, strict=True)
+            ]
             names = units[start : start + _TOLD]
             places = range(start + 1, start + 1 + len(part))
-            for *row, reason in zip(places, names, risk, *known, said, strict=True):
-                yield (*row, reason or "nothing is known of it")
+            yield from zip(places, names, risk, *columns, said, strict=True)
 
     def reasons(self) -> list[str]:
         """Reasons for the place of each unit, in the order of :attr:`picked`."""
@@ -306,7 +313,7 @@ def prioritize(
     told: Situations | None = None
     if spec.by is not Priority.diverse:
         if spec.by is Priority.both and {*spec.measures} & {*RANKED}:
-            told = Situations(len(units.frame_id))
+            told = Situations.of_frames(units, len(units.frame_id))
         worst = worst_values(units, spec.measures, told)
         key = worst[0].row
         total = np.sum([one.ranks() for one in worst], axis=0)
@@ -517,28 +524,41 @@ def _times(units: Units) -> Floats:
     return found["t"].astype(np.float64)[at]
 
 
+def _or_none(values: Floats) -> list[float | None]:
+    """Values as plain ones; None: not known."""
+    found: list[float | None] = values.tolist()
+    for place in np.flatnonzero(np.isnan(values)).tolist():
+        found[place] = None
+    return found
+
+
 def _reasons(
     worst: WorstValues,
     part: Ints,
     traces: Sequence[int],
-    kinds: Mapping[tuple[Any, ...], str],
+    who: Mapping[tuple[int, int], str],
     times: Floats,
 ) -> list[str]:
     """What a measure says of each unit; nothing where it is not known."""
-    values, when = worst.value[part].tolist(), times[worst.row[part]].tolist()
-    name = worst.name
-    if name not in RANKED | LATER:
-        told = zip(values, when, strict=True)
-        return ["" if v != v else f"{name} is {v:.3g} at {t:.1f} s" for v, t in told]  # noqa: PLR0124 - NaN
-    unit = (RANKED | LATER)[name].unit
-    of = "" if unit == "ratio" else f" {unit}"
-    whom = worst.other[part].tolist()
-    return [
-        ""
-        if v != v  # noqa: PLR0124 - NaN
-        else f"{name} {v:.3g}{of} with {kinds.get((trace, other))} {other} at {t:.1f} s"
-        for v, t, other, trace in zip(values, when, whom, traces, strict=True)
-    ]
+    name, value = worst.name, worst.value[part]
+    when = times[worst.row[part]].tolist()
+    known = RANKED | LATER
+    if name not in known:
+        found = [
+            f"{name} is {v:.3g} at {t:.1f} s" for v, t in zip(value.tolist(), when, strict=True)
+        ]
+    else:
+        of = "" if known[name].unit == "ratio" else f" {known[name].unit}"
+        with_whom = [
+            who.get(one, "") for one in zip(traces, worst.other[part].tolist(), strict=True)
+        ]
+        found = [
+            f"{name} {v:.3g}{of}{whom}{t:.1f} s"
+            for v, whom, t in zip(value.tolist(), with_whom, when, strict=True)
+        ]
+    for place in np.flatnonzero(np.isnan(value)).tolist():
+        found[place] = ""
+    return found
 
 
 def _of_class(turn: int, many: int, unit: str, of: str) -> str:
