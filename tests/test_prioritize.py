@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 from sgstore.cli import run
-from sgstore.coverage import ChosenFrames, frames_of
+from sgstore.coverage import ChosenFrames, frames_of, selection_of
 from sgstore.errors import ConfigError
+from sgstore.importing import import_graphs
 from sgstore.locks import cases_of, read_lock
 from sgstore.selection import (
     Budget,
@@ -32,6 +33,8 @@ from sgstore.selection import (
 from sgstore.selection._learn import features_of, fitted
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from sgstore.query import Store
 
 OTHERS = """src_is_ego AND dst_kind NOT IN ('traffic_light', 'stop_sign', 'yield_sign', 'speed_limit', 'sign',
@@ -169,6 +172,53 @@ def test_the_measures_of_an_order_are_those_that_the_help_and_the_page_name(
 
     assert f"[default: ({', '.join(names)})]" in re.sub(r"[\s│]+", " ", capsys.readouterr().out)
     assert listed.groups() == names
+
+
+def runs(folder: Path, others: Sequence[Mapping[str, object]]) -> ChosenFrames:
+    """Frames of an ego that stands, each with one other vehicle; None: it is not told."""
+    about = {"kind": "car", "x": 0, "y": 0, "z": 0, "heading": 0, "vx": 0, "vy": 0, "vz": 0}
+    about |= {"length": 4.5, "width": 1.8, "height": 1.5}
+    lines: list[str] = []
+    for number, other in enumerate(others):
+        nodes: list[dict[str, object]] = [
+            {**about, "id": "ego", "is_ego": True},
+            {**about, "id": "v", "x": 20, **other},
+        ]
+        told = [{name: value for name, value in one.items() if value is not None} for one in nodes]
+        graph = {"graph": {"name": f"run {number}"}, "nodes": told, "edges": []}
+        lines.append(json.dumps(graph) + "\n")
+    (folder / "runs.jsonl").write_text("".join(lines))
+    import_graphs(folder / "runs.sgstore", [folder / "runs.jsonl"], "nodelink")
+    return selection_of(str(folder / "runs.sgstore"))
+
+
+def test_it_is_said_how_many_have_no_gap(tmp_path: Path) -> None:
+    chosen = runs(tmp_path, [{"x": 30}, {"length": None}, {"x": 25}, {"heading": None}])
+    order = prioritize(chosen, PrioritySpec())
+    assert order.picked.tolist()[:2] == [2, 0]
+    assert "of 2 none of these is known" in order.said[0]
+    assert order.said[1].startswith("2 pairs of the ego and others have no gap")
+    known = "MATCH (e:Ego) WHERE frame.seq IN [0, 2] RETURN FRAMES"
+    some = ChosenFrames("known", chosen.store, frames_of(chosen.store, known))
+    assert len(prioritize(some, PrioritySpec()).said) == 1
+
+
+def test_a_clip_of_which_one_measure_is_known_has_its_situation_from_there(tmp_path: Path) -> None:
+    # Nobody closes in, so there is no closing_time: the second frame is the most critical one by ttc_mild.
+    chosen = runs(tmp_path, [{"x": 60}, {"x": -9, "heading": 180}, {"x": 70}])
+    order = prioritize(chosen, PrioritySpec(Priority.both, unit=SelectionUnit.trace))
+    (row,) = order.rows()
+    assert row[-1] == (
+        "ttc_mild 1.5 s with car 1 at 1.0 s; the only trace with car that comes towards it in its way, behind"
+    )
+
+
+@pytest.mark.filterwarnings("error")
+def test_speeds_of_almost_nothing_teach_as_well(tmp_path: Path) -> None:
+    chosen = runs(tmp_path, [{"vx": -1e-39 * (1 + n), "x": 20 + n} for n in range(12)])
+    outcomes = {f"run {n}": n % 3 == 0 for n in range(12)}
+    order = prioritize(chosen, PrioritySpec(Priority.learned), outcomes)
+    assert np.isfinite(order.chance).all()
 
 
 def test_a_budget_ends_the_order(some: ChosenFrames) -> None:

@@ -79,8 +79,9 @@ def features_of(units: Units, rows: Ints) -> Singles:
 
 
 def _filled(column: Any) -> Floats:
-    """A column with NaN where it is NULL."""
-    return np.ma.filled(np.ma.asarray(column).astype(np.float64), np.nan)
+    """A column with NaN where it is NULL; what is beyond single precision is its bound."""
+    most = float(np.finfo(np.float32).max)
+    return np.clip(np.ma.filled(np.ma.asarray(column).astype(np.float64), np.nan), -most, most)
 
 
 def _sql() -> str:

@@ -16,7 +16,7 @@ the same cases has more classes in its first k cases, whatever k is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final
 
@@ -153,12 +153,15 @@ class WorstValues:
         The first row of the units' frames that has it.
     other : (U,) int64
         The entity, beside the ego, by its node id; −1: it is of none.
+    blind : int
+        Pairs in these frames of which no gap is known, as a size or a heading is missing.
     """
 
     name: str
     value: Floats
     row: Ints
     other: Ints
+    blind: int = 0
 
     def ranks(self) -> Floats:
         """(U,): one more than the number of units that are worse; unknown ones are last."""
@@ -315,7 +318,7 @@ def prioritize(
         if spec.by is Priority.both and {*spec.measures} & {*RANKED}:
             told = Situations.of_frames(units, len(units.frame_id))
         worst = worst_values(units, spec.measures, told)
-        key = worst[0].row
+        key = _most_critical(units, worst)
         total = np.sum([one.ranks() for one in worst], axis=0)
         if spec.by is Priority.learned:
             chance, lesson = _learned(units, key, spec, outcomes or {}, learn_from)
@@ -336,6 +339,11 @@ def prioritize(
         tracker = BudgetTracker.of(units, spec.budget.measure, spec.budget.most)
         picked = tracker.fitting(order)
     said = [_said(spec, units, picked, worst, code), *([lesson] if lesson else [])]
+    if blind := max((one.blind for one in worst), default=0):
+        said.append(
+            f"{blind:,} pairs of the ego and others have no gap: length, width or heading is missing;"
+            " no measure that takes it counts them"
+        )
     return Prioritized(spec, units, picked, risk, worst, code, said, chance, names)
 
 
@@ -354,7 +362,7 @@ def _learned(
     else:
         others = units_of(learn_from, spec.unit, spec.clip_s, spec.stride_s)
         failed, known = outcomes_of(others, outcomes)
-        rows = worst_values(others, spec.measures)[0].row
+        rows = _most_critical(others, worst_values(others, spec.measures))
         chance = learned_elsewhere(x, features_of(others, rows), failed, known, spec.seed)
     many, wrong = int(known.sum()), int((failed & known).sum())
     return (
@@ -431,6 +439,14 @@ def worst_values(
     return tuple(known[m] if m in known else _worst_of_expression(units, m) for m in measures)
 
 
+def _most_critical(units: Units, worst: Sequence[WorstValues]) -> Ints:
+    """(U,): the row of the most critical frame of each unit, by the first measure that is known of it."""
+    row = units.begin
+    for one in reversed(worst):
+        row = np.where(np.isnan(one.value), row, one.row)
+    return row
+
+
 def _worst_of_encounters(units: Units, measures: Sequence[str]) -> dict[str, WorstValues]:
     """Of what was recorded later: the value of an encounter is that of each frame that has both."""
     if not measures:
@@ -475,6 +491,7 @@ def _worst_of_pairs(
         # Of those that are equally bad the one with the least id: the same whatever the order of rows.
         least = f"min(ROW({sign}{column}, dst)) FILTER (WHERE {column} IS NOT NULL)"
         columns.append(f"{least} AS worst{i}")
+    columns.append("count(*) - count(gap) AS blind")
     parts = ", ".join(
         f"worst{i}[1] AS value{i}, worst{i}[2] AS other{i}" for i in range(len(measures))
     )
@@ -482,11 +499,12 @@ def _worst_of_pairs(
         columns.append(WHO)
         parts += ", situation"
     sql = f"""
-      SELECT frame_id, {parts} FROM (
+      SELECT frame_id, blind, {parts} FROM (
         SELECT {", ".join(columns)} FROM criticality
         WHERE {OTHERS} AND frame_id BETWEEN ? AND ? GROUP BY frame_id)
     """  # noqa: S608  names of ours
     value, other = (np.full((len(measures), len(units.frame_id)), fill) for fill in (np.inf, -1))
+    blind = 0
     for start, part in frames_in_parts(units.frame_id):
         found = units.chosen.one_store.file.arrays(sql, [int(part[0]), int(part[-1])])
         frame_id = found["frame_id"].astype(np.int64)
@@ -495,13 +513,14 @@ def _worst_of_pairs(
         if told is not None:
             told.add(start + at[here], np.asarray(found["situation"])[here])
         here &= units.asked[start + at]
+        blind += int(found["blind"][here].sum())
         for i in range(len(measures)):
             for all_of, name in ((value, "value"), (other, "other")):
                 column = np.ma.asarray(found[f"{name}{i}"])[here]
                 known = ~np.ma.getmaskarray(column)
                 all_of[i, start + at[here][known]] = np.ma.getdata(column)[known]
     return {
-        name: _worst_of(units, name, value[i], other[i].astype(np.int64))
+        name: replace(_worst_of(units, name, value[i], other[i].astype(np.int64)), blind=blind)
         for i, name in enumerate(measures)
     }
 
