@@ -43,6 +43,9 @@ export function Above({ children }) {
     ${toast.value ? html`<div class="toast" role="status">${toast.value}</div>` : null}`;
 }
 
+// A button that was clicked does not keep the keys: space plays.
+addEventListener("click", ({ target, detail }) => { if (detail) /** @type {HTMLElement} */ (target).closest("button")?.blur(); });
+
 addEventListener("keydown", (event) => {
   const at = /** @type {HTMLElement} */ (event.target);
   const typing = at.closest?.("input:not([type=checkbox]):not([type=range]), select, textarea, .cm-editor");
