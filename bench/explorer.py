@@ -253,9 +253,14 @@ def playing(page: Any, seconds: float, *, farther: int = 0) -> dict[str, float]:
     for _ in range(farther):
         page.get_by_role("button", name="Farther").click()
     page.wait_for_timeout(1000)
+    shown = page.locator(".transport .time")
+    was = shown.inner_text()
     page.keyboard.press(" ")
     page.wait_for_timeout(300)
     told, spent = costed(page, STEPS, seconds)
+    if shown.inner_text() == was:
+        msg = "nothing plays: what is measured is a page that stands still"
+        raise RuntimeError(msg)
     return {**told, "spent": spent / (told["fps"] * seconds) * 1e3}
 
 
