@@ -482,6 +482,9 @@ def _block(
 
 def _on_earth(frames: list[FrameRows], roster: EntityTable) -> list[FrameRows]:
     """The same frames without numbers that nothing on earth has; they are counted, and missing from now on."""
+    values = np.concatenate([frame.values for frame in frames] or [np.zeros(0)])
+    if not (np.abs(values) >= FAR).any():
+        return frames
     for frame in frames:
         absurd = np.abs(frame.values) >= FAR
         if absurd.any():

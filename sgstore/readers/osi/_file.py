@@ -40,7 +40,6 @@ from sgstore.readers.osi._schema import (
     SENSOR_VIEW,
     descriptors,
     fields_of,
-    ground_truth_of,
     light_class,
     lights_of,
     message_class,
@@ -477,7 +476,7 @@ def _likeness(name: str, data: bytes) -> int:
     """
     message, objects, bulbs = _classes_of(name)
     try:
-        ground = ground_truth_of(parse(message, data))
+        _, ground, _ = parse(message, data)
         placed = [objects.FromString(content) for content in ground.moving_object]
         placed += [bulbs.FromString(content) for content in lights_of(ground)] if bulbs else []
         return _things([*placed, *ground.stationary_object], ground.lane)

@@ -33,7 +33,6 @@ from sgstore.readers.osi._schema import (
     enum_name,
     fields_of,
     has_field,
-    lights_of,
     map_ref,
     static_pose,
 )
@@ -411,12 +410,10 @@ class Statics:
     unplaced: dict[str, int] = field(default_factory=dict[str, int])
     _found: dict[tuple[str, int], _Static] = field(default_factory=dict)  # pyright: ignore[reportUnknownVariableType]
 
-    def look(self, ground: Any, fields: tuple[str, ...], log_time_ns: int) -> None:
-        """Take note of what a ground truth tells; ``fields``: those that its class has."""
-        for name in fields:
-            if name not in _FIELDS:
-                continue
-            for thing in getattr(ground, name):
+    def look(self, told: Mapping[str, Any], log_time_ns: int) -> None:
+        """Take note of what a ground truth tells; ``told``: its static things by their field."""
+        for name in _FIELDS:
+            for thing in told.get(name, ()):
                 key = (name, thing.id.value)
                 if key in self._found:
                     continue
@@ -622,9 +619,8 @@ class TrafficLights:
         """Heads that have neither a position nor a reference to the map."""
         return len(self._heads) - len(self._rows[0])
 
-    def update(self, ground: Any) -> None:
-        """Take up what a ground truth says of bulbs; of the others the last word stands."""
-        words = lights_of(ground)
+    def update(self, words: list[bytes]) -> None:
+        """Take up what the bulbs of a ground truth say; of the others the last word stands."""
         if words == self._words or self._class is None:
             return
         news = set(words).difference(self._words)

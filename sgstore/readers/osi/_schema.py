@@ -542,21 +542,29 @@ def has_field(message: type[Any], path: str) -> bool:
     return True
 
 
-def parse(message: type[Any], data: bytes) -> Any:
-    """A message of the leading channel, whose objects are not too many to be looked at.
+def parse(message: type[Any], data: bytes) -> tuple[Any, Any, list[bytes]]:
+    """A message of the leading channel, its ground truth, and the moving objects of that.
 
     Raises
     ------
     Exception
-        One of :data:`DECODE_ERRORS`.
+        One of :data:`DECODE_ERRORS`. Of objects there are not too many to be looked at.
     """
-    truth = message.DESCRIPTOR.fields_by_name.get("global_ground_truth")
-    check_size(data, truth.number if truth is not None else 0)
+    truth = _truth_in(message)
+    check_size(data, truth)
     parsed = message.FromString(data)
-    count = len(ground_truth_of(parsed).moving_object)
-    if count > MAX_OBJECTS:
-        raise ValueError(f"{count} moving objects; at most {MAX_OBJECTS} are read")
-    return parsed
+    ground = parsed.global_ground_truth if truth else parsed
+    objects: list[bytes] = list(ground.moving_object)
+    if len(objects) > MAX_OBJECTS:
+        raise ValueError(f"{len(objects)} moving objects; at most {MAX_OBJECTS} are read")
+    return parsed, ground, objects
+
+
+@cache
+def _truth_in(message: type[Any]) -> int:
+    """Number of the field that is the ground truth in messages of a class; 0: they are it."""
+    truth = message.DESCRIPTOR.fields_by_name.get("global_ground_truth")
+    return truth.number if truth is not None else 0
 
 
 def ground_truth_of(message: Any) -> Any:

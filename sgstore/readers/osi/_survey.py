@@ -13,6 +13,7 @@ that says what the entity is to OpenSCENARIO (``Vehicle``, ``cutter``).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -28,7 +29,6 @@ from sgstore.readers.osi._schema import (
     HOST_DATA,
     ROAD_MAP,
     SENSOR_VIEW,
-    ground_truth_of,
     has_field,
     identifiers,
     light_class,
@@ -41,7 +41,7 @@ from sgstore.roads import OF_LANES
 from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping
 
     from mcap.records import Schema
 
@@ -76,19 +76,32 @@ def _names_or_none(moving_object: Any) -> list[str]:
 
 def hosts_of(message: Any) -> list[int]:
     """Ids that a message gives to the host vehicle, the most telling first; 0 is one too."""
-    told = [message, ground_truth_of(message), getattr(message, "host_vehicle_data", None)]
-    hosts = [
-        part.host_vehicle_id.value
-        for part in told
-        if part is not None
-        and "host_vehicle_id" in part.DESCRIPTOR.fields_by_name
-        and part.HasField("host_vehicle_id")
+    told = [getattr(message, part) if part else message for part in _telling(type(message))]
+    return [part.host_vehicle_id.value for part in told if part.HasField("host_vehicle_id")]
+
+
+@cache
+def _telling(message: type[Any]) -> tuple[str, ...]:
+    """Parts of messages of a class that may name the host vehicle; empty: the message itself."""
+    inner = [
+        (part, found.message_type)
+        for part in ("global_ground_truth", "host_vehicle_data")
+        if (found := message.DESCRIPTOR.fields_by_name.get(part)) is not None
     ]
-    return list(dict.fromkeys(hosts))
+    return tuple(
+        part
+        for part, told in [("", message.DESCRIPTOR), *inner]
+        if told is not None and "host_vehicle_id" in told.fields_by_name
+    )
 
 
-def keys_of(objects: Sequence[bytes]) -> list[bytes]:
-    """The beginning of each serialised object, up to where its id ends if it begins with it."""
+def keys_of(objects: list[bytes], last: list[bytes]) -> list[bytes]:
+    """The beginning of each serialised object, up to where its id ends if it begins with it.
+
+    Where the objects are those of ``last``, keys that this has returned, it returns that very list.
+    """
+    if len(objects) == len(last) and all(map(bytes.startswith, objects, last)):
+        return last
     try:
         return [content[: content[1] + 2] for content in objects]
     except IndexError:  # one that is shorter than that
@@ -116,14 +129,26 @@ class Cast:
     names: dict[int, list[str]] = field(default_factory=dict[int, list[str]])
     hosts: dict[int, None] = field(default_factory=dict[int, None])
     _keys: set[bytes] = field(default_factory=set[bytes])
+    _last: list[bytes] = field(default_factory=list[bytes])
 
-    def look(self, message: Any, objects: type[Any]) -> None:
-        """Take note of the objects in a message. ``objects``: the class of its moving objects."""
+    def look(self, message: Any, contents: list[bytes], objects: type[Any]) -> None:
+        """Take note of the objects in a message.
+
+        Parameters
+        ----------
+        message : Message
+        contents : list of bytes
+            Its moving objects.
+        objects : type
+            Class of these.
+        """
         if len(self.hosts) < _MOST_HOSTS:
             self.hosts.update(dict.fromkeys(hosts_of(message)))
-        contents: Sequence[bytes] = list(ground_truth_of(message).moving_object)
-        keys = keys_of(contents)
+        keys = keys_of(contents, self._last)
+        if keys is self._last:
+            return
         if self._keys.issuperset(keys):
+            self._last = keys
             return
         for key, content in zip(keys, contents, strict=True):
             if key in self._keys:
@@ -236,30 +261,42 @@ class _Latch:
     fields: tuple[str, ...]
     bulb: type[Any] | None = None
     words: dict[bytes, int | None] = field(default_factory=dict[bytes, "int | None"])
+    spoken: list[bytes] = field(default_factory=list[bytes])
     told_by: dict[tuple[str, int], Ref] = field(default_factory=dict[tuple[str, int], Ref])
     repeated: set[tuple[str, int]] = field(default_factory=set[tuple[str, int]])
     lights: set[int] = field(default_factory=set[int])
     last: Ref | None = None
     refs: dict[Ref, None] = field(default_factory=dict[Ref, None])
 
-    def look(self, ground: Any, ref: Ref) -> bool:
-        """Take note of a message; whether it tells of a lane or boundary that none before it told of."""
-        items = {(name, item.id.value) for name in self.fields for item in getattr(ground, name)}
-        gone = self.repeated - items
-        for item in gone:
-            self.refs[self.told_by[item]] = None
-        new = {item for item in items if item not in self.told_by}
-        self.repeated = (self.repeated - gone) | new
-        self.told_by.update(dict.fromkeys(new, ref))
+    def look(self, told: Mapping[str, Any], words: list[bytes], ref: Ref) -> bool:
+        """Take note of a message; whether it tells of a lane or boundary that none before it told of.
+
+        Parameters
+        ----------
+        told : mapping
+            Its static things by their field.
+        words : list of bytes
+            Its traffic lights.
+        ref : Ref
+        """
+        new: set[tuple[str, int]] = set()
+        if told or self.repeated:
+            items = {(name, item.id.value) for name, things in told.items() for item in things}
+            gone = self.repeated - items
+            for item in gone:
+                self.refs[self.told_by[item]] = None
+            new = {item for item in items if item not in self.told_by}
+            self.repeated = (self.repeated - gone) | new
+            self.told_by.update(dict.fromkeys(new, ref))
         # Ids of the lights in a message; those that stand in it as in the last one are not read again.
-        words = lights_of(ground)
-        if words != [*self.words]:
+        if words != self.spoken:
             known = self.words
             self.words = {word: known.get(word) or self._ident(word) for word in words}
-        lights = {ident for ident in self.words.values() if ident is not None}
-        if self.last is not None and self.lights - lights:
-            self.refs[self.last] = None
-        self.lights, self.last = lights, ref
+            lights = {ident for ident in self.words.values() if ident is not None}
+            if self.last is not None and self.lights - lights:
+                self.refs[self.last] = None
+            self.spoken, self.lights = words, lights
+        self.last = ref
         return any(name in LANE_FIELDS for name, _ in new)
 
     def _ident(self, word: bytes) -> int | None:
@@ -432,17 +469,19 @@ class OsiSurvey(Survey[OsiLead]):
     def _look_at_frame(self, lead: OsiLead, run: Messages, row: int) -> None:
         try:
             data = bytes(run.data(row))
-            message = parse(lead.message, data)
-            ground = ground_truth_of(message)
-            if lead.latch.look(ground, ref_of(run, row)) and lead.lanes is not None:
+            message, ground, objects = parse(lead.message, data)
+            told = {name: some for name in lead.latch.fields if (some := getattr(ground, name))}
+            words = lights_of(ground)
+            if lead.latch.look(told, words, ref_of(run, row)) and lead.lanes is not None:
                 lead.lanes.take(data)
             for lights in self._lights.values():
-                lights.update(ground)
-            self.statics.look(ground, lead.latch.fields, int(run.log_time_ns[row]))
-            self.cast.look(message, lead.objects)
+                lights.update(words)
+            if told:
+                self.statics.look(told, int(run.log_time_ns[row]))
+            self.cast.look(message, objects, lead.objects)
         except DECODE_ERRORS:  # counted as a loss when the frames are read
             return
-        self.count(run, row, len(ground.moving_object) > 0)
+        self.count(run, row, len(objects) > 0)
 
     def _make_map_of_lanes(self, leading: int) -> None:
         """Make the map of the lanes, those of the leading channel before those of others."""

@@ -29,9 +29,9 @@ from sgstore.readers.osi._schema import (
     LATEST_NS,
     SENSOR_VIEW,
     enum_name,
-    ground_truth_of,
     has_field,
     light_class,
+    lights_of,
     parse,
 )
 from sgstore.readers.osi._survey import OsiSurvey, is_key, keys_of, schema_name
@@ -211,6 +211,9 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
         names = {bulb: one.name for bulb, one in survey.signals.items()}
         self._lights = TrafficLights(self.roster, light_class(lead.message), names)
         self._environment = Environment(lead.message, self.roster)
+        self._has_controls = any(
+            has_field(one.message, "host_vehicle_data") for one in survey.leads.values()
+        )
         self._frames = 0
 
     def decode(self, run: Messages, row: int) -> OsiRawFrame | None:
@@ -221,15 +224,15 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
             if channel in self._survey.hosts:
                 self._controls = controls_of(self._survey.hosts[channel].FromString(data))
                 return None
-            message = parse(self._survey.leads[channel].message, data)
-            ground = ground_truth_of(message)
+            told = parse(self._survey.leads[channel].message, data)
+            message, ground, _ = told
             if not self.is_inside(log_time):
-                self._lights.update(ground)
+                self._lights.update(lights_of(ground))
                 return None
             time_ns = time_of(message, ground)
             if channel == self._leading:
-                return self._frame(message, ground, time_ns, log_time)
-            self._take_aside(message, ground, log_time if time_ns is None else time_ns)
+                return self._frame(told, time_ns, log_time)
+            self._take_aside(told, log_time if time_ns is None else time_ns)
         except DECODE_ERRORS as error:
             what = "a ground truth message cannot be read"
             self.lose(f"{what}: {type(error).__name__}: {error}", run, row)
@@ -262,30 +265,46 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
         values, usable, lights = self._objects.read(objects)
         turned = usable & (np.abs(values[:, _HEADING]) > math.pi)
         values[turned, _HEADING] = np.remainder(values[turned, _HEADING] + np.pi, 2 * np.pi) - np.pi
+        node = np.array([node for frame in frames for node in frame.nodes], np.int64)
+        ego = self._nodes.get(self._ego, -1) if self._ego is not None else -1
+        of_ego, stands = node == ego, np.full(len(node), -1, np.int64)
+        whole = bool(usable.all())
         done: list[FrameRows] = []
         start = 0
         for frame in frames:
             rows = slice(start, start + len(frame.objects))
-            done.append(self._rows(frame, values[rows], usable[rows], lights[rows]))
+            one = FrameRows(
+                time_ns=frame.time_ns,
+                log_time_ns=frame.log_time_ns,
+                ego=ego if of_ego[rows].any() else -1,
+                node=node[rows],
+                values=values[rows],
+                lights=lights[rows],
+                light_state=stands[rows],
+                controls=frame.controls,
+            )
+            one = one if whole else self._usable(one, usable[rows], ego)
+            done.append(one.with_heads(frame.heads))
             start = rows.stop
         return done
 
     # One message ---------------------------------------------------------------------------------------
 
     def _frame(
-        self, message: Any, ground: Any, time_ns: int | None, log_time: int
+        self, told: tuple[Any, Any, list[bytes]], time_ns: int | None, log_time: int
     ) -> OsiRawFrame | None:
         """A frame, unless the message goes on with the last one."""
-        nodes, objects = self._met(ground.moving_object, log_time)
+        message, ground, contents = told
+        nodes, objects = self._met(contents, log_time)
         last = self._open
         if last is not None and time_ns == last.time_ns and not set(nodes) & set(last.nodes):
-            self._lights.update(ground)
+            self._lights.update(lights_of(ground))
             self._join(last, message, nodes, objects)
             return None
         self._untimed += time_ns is None
         if last is None:
             self._enter_statics()
-        self._lights.update(ground)
+        self._lights.update(lights_of(ground))
         frame = OsiRawFrame(log_time if time_ns is None else time_ns, log_time, self._lights.rows())
         self._open = frame
         self._environment.look(ground, frame.time_ns, log_time, self._frames)
@@ -312,22 +331,22 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
                     frame.nodes.append(node)
                     frame.objects.append(content)
         frame.heads = self._lights.rows()
-        data = getattr(message, "host_vehicle_data", None)
-        if data is None and self._controls is NO_INPUTS:
+        if self._controls is NO_INPUTS and not self._has_controls:
             return
+        data = getattr(message, "host_vehicle_data", None)
         known = zip(frame.controls, controls_of(data), self._controls, strict=True)
         frame.controls = tuple(
             next((value for value in three if not math.isnan(value)), NAN) for three in known
         )
 
-    def _take_aside(self, message: Any, ground: Any, time_ns: int) -> None:
+    def _take_aside(self, told: tuple[Any, Any, list[bytes]], time_ns: int) -> None:
         """Take a message of another channel: it tells of the last frame, of one to come, or of none."""
+        message, ground, contents = told
         last = self._open
-        self._lights.update(ground)
-        contents: list[bytes] = list(ground.moving_object)
-        told = controls_of(getattr(message, "host_vehicle_data", None))
-        if not all(math.isnan(value) for value in told):
-            self._controls = told
+        self._lights.update(lights_of(ground))
+        controls = controls_of(getattr(message, "host_vehicle_data", None))
+        if not all(math.isnan(value) for value in controls):
+            self._controls = controls
         if last is not None and time_ns == last.time_ns:
             self._join(last, message, *self._met(contents, last.log_time_ns))
         elif last is None or time_ns > last.time_ns:
@@ -346,11 +365,10 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
 
     # Entities ------------------------------------------------------------------------------------------
 
-    def _met(self, contents: Any, log_time: int) -> tuple[list[int], list[bytes]]:
+    def _met(self, objects: list[bytes], log_time: int) -> tuple[list[int], list[bytes]]:
         """Node ids of serialised objects, and the objects; without those that cannot be read or come twice."""
-        objects = list(contents)
-        keys = keys_of(objects)
-        if keys == self._last_keys:  # the same objects as in the last frame, in the same order
+        keys = keys_of(objects, self._last_keys)
+        if keys is self._last_keys:  # the same objects as in the last frame, in the same order
             return self._last_nodes.copy(), objects
         nodes = [self._keys.get(key, _UNKNOWN) for key in keys]
         known = _UNKNOWN not in nodes
@@ -420,26 +438,20 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
 
     # Rows ----------------------------------------------------------------------------------------------
 
-    def _rows(self, frame: OsiRawFrame, values: Floats, usable: Bools, lights: Ints) -> FrameRows:
-        """A frame with its numbers, without the rows that cannot be used."""
-        node = np.array(frame.nodes, np.int64)
-        if not usable.all():
-            for row in np.flatnonzero(~usable):
-                words = f"moving object {self._number(int(node[row]))} has no usable pose"
-                self._unusable.add(words, frame.log_time_ns)
-            node, values, lights = node[usable], values[usable], lights[usable]
-        ego = self._nodes.get(self._ego, -1) if self._ego is not None else -1
-        rows = FrameRows(
-            time_ns=frame.time_ns,
-            log_time_ns=frame.log_time_ns,
+    def _usable(self, frame: FrameRows, usable: Bools, ego: int) -> FrameRows:
+        """A frame without the rows that cannot be used."""
+        for node in frame.node[~usable].tolist():
+            words = f"moving object {self._number(node)} has no usable pose"
+            self._unusable.add(words, frame.log_time_ns)
+        node = frame.node[usable]
+        return replace(
+            frame,
             ego=ego if (node == ego).any() else -1,
             node=node,
-            values=values,
-            lights=lights,
-            light_state=np.full(len(node), -1, np.int64),
-            controls=frame.controls,
+            values=frame.values[usable],
+            lights=frame.lights[usable],
+            light_state=frame.light_state[usable],
         )
-        return rows.with_heads(frame.heads)
 
 
 def time_of(message: Any, ground: Any) -> int | None:
