@@ -8,6 +8,7 @@ from collections import Counter, defaultdict
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
+from threading import Lock
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -39,6 +40,12 @@ if TYPE_CHECKING:
 
 FARTHEST: Final = 200.0
 """How far along the lanes is looked from one entity to another; m. The view ``pairs`` has it too."""
+_CELL: Final = 32.0
+"""Side of the squares of a grid, which tells bodies that are far from all crosswalks; m."""
+_MOST_CELLS: Final = 1 << 16
+_PREPARED: Final = Lock()
+"""What is prepared of shapes is not made by two threads at once."""
+
 _MOST_AT_ONCE: Final = 1 << 22
 """Pairs of lanes whose distances are held at a time."""
 
@@ -409,9 +416,12 @@ class RoadMap:
 
         Boxes and heights as in :meth:`lanes_of`.
         """
-        columns, tree = self._crosswalks
+        columns, tree, cells = self._crosswalks
         boxes = np.asarray(boxes, np.float64)
         rows = np.flatnonzero(np.isfinite(boxes[:, :2]).all(axis=1))
+        if cells is not None:
+            long = (np.abs(boxes[rows, 3:5]) > _CELL).any(axis=1)
+            rows = rows[long | np.isin(_cells(boxes[rows, :2]), cells)]
         if not len(columns) or not len(rows):
             return np.zeros(0, np.int64), np.zeros(0, np.int64)
         row, place = tree.query(_rectangles(boxes[rows]), predicate="intersects")
@@ -440,8 +450,12 @@ class RoadMap:
         """(N, K): which nodes lie within ``radius`` of which places (N, 2)."""
         columns, tree = self._extents
         finite = np.flatnonzero(np.isfinite(places).all(axis=1))
+        low, high = places[finite] - radius, places[finite] + radius
+        row, place = tree.query(shapely.box(*low.T, *high.T))
         points: Any = shapely.points(places[finite])
-        row, place = tree.query(points, predicate="dwithin", distance=radius)
+        with _PREPARED:
+            near = shapely.dwithin(tree.geometries[place], points[row], radius)
+        row, place = row[near], place[near]
         present = np.zeros((len(places), len(self.nodes)), np.bool_)
         present[finite[row], columns[place]] = True
         for child, parent in self._containment:
@@ -599,7 +613,7 @@ class RoadMap:
         wholes += [self._on_roundabouts(), self._on_zones(), self._broad_lines]
         for column in self._stop_lines.tolist():
             what[column] = STOP_LINE
-        crosswalks, _ = self._crosswalks
+        crosswalks, *_ = self._crosswalks
         shapes, z = self._shapes[crosswalks], nodes.z[crosswalks]
         control = self.edges.relation == RELATION_CODE["controlsTrafficOf"]
         applies = -1 - self.edges.src[control], _FIRST_LANE - self.edges.dst[control]
@@ -659,15 +673,30 @@ class RoadMap:
         return shapes
 
     @cached_property
-    def _crosswalks(self) -> tuple[Ints, shapely.STRtree]:
+    def _crosswalks(self) -> tuple[Ints, shapely.STRtree, Ints | None]:
+        """Columns of the crosswalks, their shapes, and the cells where a body up to a cell long may touch one.
+
+        ``None``: there are too many cells.
+        """
         columns = np.flatnonzero(self.nodes.kind == KIND_CODE["crosswalk"])
-        return columns, shapely.STRtree(self._shapes[columns])
+        shapes = self._shapes[columns]
+        tree = shapely.STRtree(shapes)
+        low, high = np.split(shapely.bounds(shapes).reshape(-1, 4) / _CELL, 2, axis=1)
+        if not np.prod(high - low + 4, axis=1).sum() < _MOST_CELLS:
+            return columns, tree, None
+        around = [np.zeros((0, 2), np.int64)] + [
+            np.stack(np.meshgrid(*map(np.arange, a, b)), axis=-1).reshape(-1, 2)
+            for a, b in zip(_floor(low) - 1, _floor(high) + 2, strict=True)
+        ]
+        return columns, tree, np.unique(_numbered(np.concatenate(around)))
 
     @cached_property
     def _extents(self) -> tuple[Ints, shapely.STRtree]:
         outlines = self._outlines
         columns = np.flatnonzero(~shapely.is_missing(outlines))
-        return columns, shapely.STRtree(outlines[columns])
+        tree = shapely.STRtree(outlines[columns])
+        shapely.prepare(tree.geometries)  # then a distance does not go by all sides of an outline
+        return columns, tree
 
     @cached_property
     def _containment(self) -> tuple[tuple[Ints, Ints], ...]:
@@ -717,6 +746,20 @@ def merged_edges(edges: MapEdges, same: Ints) -> MapEdges:
     table = np.column_stack([edges.relation.astype(np.int64), src, dst])[src != dst]
     relation, src, dst = np.unique(table, axis=0).reshape(-1, 3).T
     return MapEdges(relation.astype(np.int8), src, dst)
+
+
+def _cells(places: Floats) -> Ints:
+    """Numbers of the squares of a grid in which places (N, 2) lie."""
+    return _numbered(_floor(places / _CELL))
+
+
+def _floor(places: Floats) -> Ints:
+    return np.floor(places).astype(np.int64)
+
+
+def _numbered(cells: Ints) -> Ints:
+    """One number for each square (N, 2); a few share one."""
+    return cells[:, 0] << 32 ^ cells[:, 1]
 
 
 def _rectangles(boxes: Floats) -> Geometries:
