@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from sgstore.store._publish import SHARED
-from sgstore.store._staging import FILE, Sealed, TableFile, texts_in
+from sgstore.store._staging import FILE, Sealed, TableFile
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -37,7 +37,7 @@ def split_segment(sealed: Path, to: Path, of_map: Path) -> str:
     try:
         for piece in tables.all():
             part = parts[piece.table in MAP_TABLES]
-            part.append(piece.table, tables.read(piece), texts_in(piece))
+            part.append(piece.table, tables.read(piece), tables.texts(piece))
     finally:
         for one in (tables, *parts):
             one.close()
@@ -60,7 +60,7 @@ def whole_segment(segment: Path, of_map: Path | None, to: Path) -> Sealed:
             tables = TableFile(folder / FILE, folder)
             try:
                 for piece in tables.all():
-                    fresh.append(piece.table, tables.read(piece), texts_in(piece))
+                    fresh.append(piece.table, tables.read(piece), tables.texts(piece))
             finally:
                 tables.close()
     finally:

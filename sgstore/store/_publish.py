@@ -209,7 +209,6 @@ def insert(
             f"INSERT INTO store.inside.{table} BY NAME SELECT {', '.join(listed)} FROM staged{limit}",
             given,
         )
-    connection.unregister("staged")
 
 
 def _buffers(tables: TableFile, table: str) -> Columns:

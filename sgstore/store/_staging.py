@@ -11,6 +11,7 @@ import json
 from collections import defaultdict
 from contextlib import suppress
 from dataclasses import asdict
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
@@ -65,7 +66,7 @@ class Piece(NamedTuple):
     rows : int
     columns : dict
         Column → its type and its place behind ``at``, or its value in all rows; what is added to each value;
-        its texts.
+        of its texts how long each is, where they stand behind ``at``, and their bytes.
     at : int
         Where the columns begin in the file.
     """
@@ -122,7 +123,10 @@ class TableFile:
                 body.append(array)
                 place += -(-array.nbytes // _ALIGNED) * _ALIGNED
             if texts and name in texts:
-                about[name]["texts"] = texts[name]
+                joined = np.frombuffer("".join(texts[name]).encode(), np.uint8)
+                about[name]["texts"] = [*map(len, texts[name])], place, len(joined)
+                body.append(joined)
+                place += -(-joined.nbytes // _ALIGNED) * _ALIGNED
         said = {"table": table, "rows": rows, "columns": about, "bytes": place}
         line = json.dumps(said, ensure_ascii=False).encode()
         line += b" " * (-len(line) % _ALIGNED)
@@ -203,7 +207,21 @@ class TableFile:
         values = self.column(piece, name, first, end)
         if "texts" not in piece.columns[name]:
             return values
-        return np.array([*piece.columns[name]["texts"], ""], object)[values]
+        return np.array([*self._texts(piece, name), ""], object)[values]
+
+    def texts(self, piece: Piece) -> dict[str, list[str]]:
+        """The texts that indices of a piece stand for, by column."""
+        return {
+            name: self._texts(piece, name)
+            for name in piece.columns
+            if "texts" in piece.columns[name]
+        }
+
+    def _texts(self, piece: Piece, name: str) -> list[str]:
+        lengths, at, size = piece.columns[name]["texts"]
+        joined = self._bytes(piece.at + at, size).decode()
+        ends = [*accumulate(lengths)]
+        return [joined[end - length : end] for length, end in zip(lengths, ends, strict=True)]
 
     def _bytes(self, at: int, count: int) -> bytes:
         try:
@@ -228,11 +246,6 @@ class TableFile:
             at += said["bytes"]
         if at != self._size:
             raise self._wrong("ends before its rows do")
-
-
-def texts_in(piece: Piece) -> dict[str, list[str]]:
-    """The texts that indices of a piece stand for, by column."""
-    return {name: about["texts"] for name, about in piece.columns.items() if "texts" in about}
 
 
 def _narrowed(values: NDArray[Any]) -> tuple[dict[str, Any], NDArray[Any] | None]:
