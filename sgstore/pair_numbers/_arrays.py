@@ -122,7 +122,7 @@ def _functions() -> Mapping[str, Callable[..., Any]]:
         "case": _case,
         **{
             name: getattr(np, name)
-            for name in ("abs", "sqrt", "cbrt", "exp", "sin", "cos", "degrees", "ceil")
+            for name in ("abs", "sqrt", "cbrt", "exp", "sign", "sin", "cos", "degrees", "ceil")
         },
         "acos": np.arccos,
         "atan2": np.arctan2,

@@ -32,6 +32,10 @@ BEYOND: Final = {
 """Distances of b's centre beyond edges of the octagon, and past their ends; squares of those from the edges."""
 
 
+_MEETS: Final = "meets1, meets2, meets3, meets4"
+_PARTS: Final = "parts1, parts2, parts3, parts4"
+
+
 def _turned(angle: str) -> str:
     """An angle in degrees, brought into (-180, 180]."""
     return f"{angle} - 360 * ceil(({angle} - 180) / 360)"
@@ -77,8 +81,9 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
     "ttc": PairFunction(
         "time until the footprints first touch if both keep their velocity and do not turn",
         "s",
-        "CASE WHEN meets <= parts AND parts >= 0 AND (rel_speed >= 1e-6 OR meets <= 0)"
-        " AND reach1 + reach2 IS NOT NULL THEN greatest(meets, 0) END",
+        "CASE WHEN meets1 <= parts2 AND meets2 <= parts1 AND parts1 >= 0 AND parts2 >= 0"
+        f" THEN CASE WHEN greatest({_MEETS}, 0) <= least({_PARTS})"
+        f" AND (rel_speed >= 1e-6 OR greatest({_MEETS}) <= 0) THEN greatest({_MEETS}, 0) END END",
         note="0 where they overlap, NULL where they never touch or their velocities differ by less than"
         " 1e-6 m/s",
         dear=True,
@@ -166,12 +171,12 @@ PARTS: Final[Mapping[str, str]] = {
     "drift3": "dvx * cb + dvy * sb",
     "drift4": "dvy * cb - dvx * sb",
     **{
-        f"place{i}": f"CASE WHEN drift{i} < 0 THEN -{at} ELSE {at} END"
+        f"place{i}": f"{at} * sign(drift{i} + 1e-200)"
         for i, at in enumerate(("lon", "lat", "back", "side"), 1)
     },
     **{f"rate{i}": f"abs(drift{i}) + 1e-200" for i in (1, 2, 3, 4)},
-    "meets": f"greatest({', '.join(f'(-reach{i} - place{i}) / rate{i}' for i in (1, 2, 3, 4))})",
-    "parts": f"least({', '.join(f'(reach{i} - place{i}) / rate{i}' for i in (1, 2, 3, 4))})",
+    **{f"meets{i}": f"(-reach{i} - place{i}) / rate{i}" for i in (1, 2, 3, 4)},
+    **{f"parts{i}": f"(reach{i} - place{i}) / rate{i}" for i in (1, 2, 3, 4)},
     # Bounds that are cheap: no two boxes are nearer than their circumscribed circles (a micrometre makes up for
     # rounding), and of two that move straight on the distance shrinks by no more than this in a second.
     "at_least": "planar - sqrt(la * la + wa * wa) - sqrt(lb * lb + wb * wb) - 1e-6",
