@@ -27,6 +27,7 @@ from sgstore.selection import (
     failed_in_order,
     failure_curve,
     fault_detection,
+    locked_order,
     prioritize,
     units_of,
 )
@@ -199,6 +200,10 @@ def test_it_is_said_how_many_have_no_gap(tmp_path: Path) -> None:
     assert "of 2 none of these is known" in order.said[0]
     assert order.said[1].startswith("2 pairs of the ego and others have no gap")
     known = "MATCH (e:Ego) WHERE frame.seq IN [0, 2] RETURN FRAMES"
+    failed = {f"run {n}": n == 1 for n in range(4)}
+    learned = prioritize(chosen, PrioritySpec(Priority.learned), failed)
+    lock = locked_order(learned, payloads=False)
+    assert "4 frames, of which 1 failed" in lock.selection["learned"]
     some = ChosenFrames("known", chosen.store, frames_of(chosen.store, known))
     assert len(prioritize(some, PrioritySpec()).said) == 1
 

@@ -338,12 +338,13 @@ def prioritize(
     if spec.budget is not None:
         tracker = BudgetTracker.of(units, spec.budget.measure, spec.budget.most)
         picked = tracker.fitting(order)
-    said = [_said(spec, units, picked, worst, code), *([lesson] if lesson else [])]
+    said = [_said(spec, units, picked, worst, code)]
     if blind := max((one.blind for one in worst), default=0):
         said.append(
             f"{blind:,} pairs of the ego and others have no gap: length, width or heading is missing;"
             " no measure that takes it counts them"
         )
+    said += [lesson] if lesson else []
     return Prioritized(spec, units, picked, risk, worst, code, said, chance, names)
 
 
