@@ -209,11 +209,9 @@ class StoreFile:
 
         ``plain``: none of them is an enumeration, so that the statement need not be planned to know that.
         """
-
-        def ask(connection: DuckDBPyConnection, _: ExitStack) -> dict[str, NDArray[np.generic]]:
-            return rows.arrays(connection, sql, parameters, plain=plain)
-
-        with self._answered(ask, sql, given) as found:
+        with self._answered(
+            lambda at, _: rows.arrays(at, sql, parameters, plain=plain), sql, given
+        ) as found:
             return found
 
     def table(

@@ -380,20 +380,16 @@ def _described(result: DuckDBPyConnection) -> tuple[tuple[str, ...], tuple[str, 
 def arrays(
     connection: DuckDBPyConnection, sql: str, parameters: Parameters | None, *, plain: bool = False
 ) -> dict[str, NDArray[np.generic]]:
-    """All columns of a statement of ours; masked arrays where something is NULL, enumerations as texts.
-
-    ``plain``: no column is an enumeration.
-    """
-    asked = f"DESCRIBE {sql}"
-    described = [] if plain else connection.execute(asked, parameters or None).fetchall()
-    # As enumerations they would come as categories of pandas.
+    """All columns of a statement, masked where something is NULL; enumerations, unless plain, as texts."""
+    given = parameters or None
+    described = [] if plain else connection.execute(f"DESCRIBE {sql}", given).fetchall()
     listed = [quoted(str(row[0])) for row in described if "ENUM" in str(row[1])]
-    if listed:
+    if listed:  # as enumerations they would come as categories of pandas
         texts = ", ".join(f"{name}::VARCHAR AS {name}" for name in listed)
         sql = f"SELECT * REPLACE ({texts}) FROM ({sql})"
 
     def fetched() -> dict[str, NDArray[np.generic]]:
-        return connection.execute(sql, parameters or None).fetchnumpy()
+        return connection.execute(sql, given).fetchnumpy()
 
     return interruptible(connection, fetched)
 
