@@ -18,8 +18,8 @@ effect(() => { open.value?.trace; zoom.value = { ...zoom.peek(), dx: 0, dy: 0 };
 
 /** Let a number be what it must be so that this frame may match, and ask again. @param {any} change */
 function relax(change) {
-  const query = text.value.trim(), now = open.value;
-  text.value = query.slice(0, change.start) + change.text + query.slice(change.end);
+  const query = [...text.value.trim()], now = open.value; // places count characters, strings of this page halves of some
+  text.value = [...query.slice(0, change.start), change.text, ...query.slice(change.end)].join("");
   find({ keep: true }).then(() => { if (now) { why.value = null; openFrame(now.trace, frame.value, null); } });
 }
 
@@ -229,7 +229,7 @@ function Transport() {
     ${live.value ? null : html`<button aria-label="Close" title="close (Esc)" onClick=${() => { playing.value = false; open.value = null; writeAddress(); }}>✕</button>`}
     ${told ? html`<span class="gap" role="status">${gap?.failed ? html`<span><b>fails</b> <code>${gap.failed}</code>${gap.found ? html` · found <code>${gap.found}</code>` : null}</span>`
       : told.error ? told.error.reason : "all of it holds in this frame"}
-      ${(told.relax || []).map((/** @type {any} */ change) => html`<button class="small" onClick=${() => relax(change)}>${asked.value.slice(change.start, change.end)} → ${change.text}</button>`)}</span>` : null}
+      ${(told.relax || []).map((/** @type {any} */ change) => html`<button class="small" onClick=${() => relax(change)}>${[...asked.value].slice(change.start, change.end).join("")} → ${change.text}</button>`)}</span>` : null}
   </div>`;
 }
 
