@@ -24,9 +24,10 @@ from __future__ import annotations
 import re
 import unicodedata
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
 
@@ -270,3 +271,30 @@ def _columns(text: str) -> int:
     """Width of a text in a terminal."""
     wide = sum(unicodedata.east_asian_width(character) in "WF" for character in text)
     return len(text) + wide - sum(map(bool, map(unicodedata.combining, text)))
+
+
+# Between processes -------------------------------------------------------------------------------
+
+_QUERY_ERRORS: Final = {kind.__name__: kind for kind in (QuerySyntaxError, QueryNameError)}
+_ERRORS: Final = {
+    kind.__name__: kind for kind in (SqlError, StoreError, AbstractionError, ConfigError)
+}
+
+
+def plain_error(error: SgstoreError) -> dict[str, Any]:
+    """An error as plain values, of which :func:`error_of` makes it again in another process."""
+    if isinstance(error, QueryError):
+        span = (error.span.start, error.span.end) if error.span else None
+        about = {"kind": type(error).__name__, "query": error.text, "reason": error.reason}
+        return {**about, "span": span, "hint": error.hint}
+    kind = next((k for k, of in _ERRORS.items() if isinstance(error, of)), "SqlError")
+    return {"kind": kind, "error": str(error)}
+
+
+def error_of(told: Mapping[str, Any]) -> SgstoreError:
+    """The error that :func:`plain_error` has told."""
+    if "query" in told:
+        span = TextSpan(*told["span"]) if told["span"] else None
+        kind = _QUERY_ERRORS.get(told["kind"], QueryError)
+        return kind(told["reason"], text=told["query"], span=span, hint=told["hint"])
+    return _ERRORS[told["kind"]](told["error"])

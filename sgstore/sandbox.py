@@ -30,15 +30,12 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, ClassVar, Final, Self
 
 from sgstore.errors import (
-    AbstractionError,
-    ConfigError,
     QueryError,
-    QueryNameError,
-    QuerySyntaxError,
     SgstoreError,
     SqlError,
     StoreError,
-    TextSpan,
+    error_of,
+    plain_error,
 )
 from sgstore.files import new_place
 from sgstore.processes import command
@@ -374,12 +371,6 @@ def _sent_and_read(
     replies.put(reply)
 
 
-_QUERY_ERRORS: Final = {kind.__name__: kind for kind in (QuerySyntaxError, QueryNameError)}
-_ERRORS: Final = {
-    kind.__name__: kind for kind in (SqlError, StoreError, AbstractionError, ConfigError)
-}
-
-
 def _line(question: Mapping[str, object], error: type[SgstoreError]) -> str:
     line = json.dumps(question)
     if len(line) > MAX_QUESTION:
@@ -389,12 +380,8 @@ def _line(question: Mapping[str, object], error: type[SgstoreError]) -> str:
 
 def _granted(reply: Any) -> dict[str, Any]:
     """A reply that is no refusal; that is raised."""
-    if "query" in reply:
-        span = TextSpan(*reply["span"]) if reply["span"] else None
-        kind = _QUERY_ERRORS.get(reply["kind"], QueryError)
-        raise kind(reply["reason"], text=reply["query"], span=span, hint=reply["hint"])
-    if "error" in reply:
-        raise _ERRORS[reply["kind"]](reply["error"])
+    if "query" in reply or "error" in reply:
+        raise error_of(reply)
     return reply
 
 
@@ -666,14 +653,9 @@ def plain(value: Any) -> Any:
 
 
 def _refusal(error: SgstoreError) -> dict[str, Any]:
-    if isinstance(error, QueryError):
-        span = (error.span.start, error.span.end) if error.span else None
-        about = {"kind": type(error).__name__, "query": error.text, "reason": error.reason}
-        return {**about, "span": span, "hint": error.hint}
-    if _spilled(error):
+    if not isinstance(error, QueryError) and _spilled(error):
         error = SqlError("stopped: it took more memory than is allowed")
-    kind = next((k for k, of in _ERRORS.items() if isinstance(error, of)), "SqlError")
-    return {"kind": kind, "error": str(error)}
+    return plain_error(error)
 
 
 def _spilled(error: SgstoreError) -> bool:

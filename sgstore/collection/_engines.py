@@ -14,7 +14,6 @@ import sys
 import threading
 from collections import deque
 from contextlib import suppress
-from dataclasses import astuple
 from functools import partial
 from importlib import import_module
 from queue import SimpleQueue
@@ -25,12 +24,11 @@ from sgstore.errors import (
     ConfigError,
     MissingExtraError,
     QueryError,
-    QueryNameError,
-    QuerySyntaxError,
     SgstoreError,
     SqlError,
     StoreError,
-    TextSpan,
+    error_of,
+    plain_error,
 )
 from sgstore.processes import command
 
@@ -92,39 +90,19 @@ def engine_named(name: str) -> Engine:
     )
 
 
-_OF_QUESTIONS: Final = (
-    QuerySyntaxError,
-    QueryNameError,
-    QueryError,
-    SqlError,
-    AbstractionError,
-    ConfigError,
-)
-"""Errors that are due to a question and not to a bundle; what another is derived from comes after it."""
+_OF_QUESTIONS: Final = (QueryError, SqlError, AbstractionError, ConfigError)
+"""Errors that are due to a question and not to a bundle."""
 
 
 def refusal(task: Task, error: SgstoreError) -> Outcome:
     """The outcome of a task that was refused: to do it again would not help."""
     outcome = {"bundle": task["bundle"], "error": str(error)}
-    kind = next((one for one in _OF_QUESTIONS if isinstance(error, one)), None)
-    if kind is None:
-        return outcome
-    about: dict[str, Any] = {}
-    if isinstance(error, QueryError):
-        about = {"text": error.text, "span": error.span and astuple(error.span), "hint": error.hint}
-    reason = getattr(error, "reason", str(error))
-    return outcome | {"wrong": {"kind": kind.__name__, "reason": reason, "about": about}}
+    return outcome | ({"wrong": plain_error(error)} if isinstance(error, _OF_QUESTIONS) else {})
 
 
 def fault_of_question(outcome: Outcome) -> SgstoreError | None:
     """The error that is due to the question itself; ``None``: its bundle cannot answer, or did."""
-    if (wrong := outcome.get("wrong")) is None:
-        return None
-    about = wrong["about"]
-    if about.get("span"):
-        about = about | {"span": TextSpan(*about["span"])}
-    kind = next(one for one in _OF_QUESTIONS if one.__name__ == wrong["kind"])
-    return kind(wrong["reason"], **about)
+    return error_of(outcome["wrong"]) if "wrong" in outcome else None
 
 
 class _Here:
