@@ -39,8 +39,9 @@ help:
 	@echo "make sample  record the bundled sample again (runs SUMO)"
 
 # uv installs in a fifth of the time. Where it cannot (an index that only pip is told of), pip does.
-install = $(BIN)/python -m uv pip install -q --python $(BIN)/python $(1) || \
-  $(BIN)/python -m pip install -q --disable-pip-version-check $(1)
+# Into that of the tests, or into another one, whose own pip may be too old to know of groups.
+install = $(BIN)/python -m uv pip install -q --python $(or $(2),$(BIN))/python $(1) || \
+  $(BIN)/python -m pip --python $(or $(2),$(BIN))/python install -q --disable-pip-version-check $(1)
 
 # One environment, and a stamp for each set of packages in it: made again when pyproject.toml changes.
 $(VENV)/.base: pyproject.toml
@@ -192,9 +193,10 @@ oracle: $(VENV)/.dev
 	SGSTORE_COVERAGE_RATE=2 $(BIN)/python -m pytest tests/test_coverage.py
 
 # In an environment of its own, because Ray and Spark are large, and bring older packages.
+ENGINES := cluster,ray,spark
 cluster: $(VENV)/.base
 	@test -x build/cluster/bin/python || $(BIN)/python -m venv build/cluster || $(BIN)/python -m virtualenv -q build/cluster
-	@build/cluster/bin/python -m pip install -q --disable-pip-version-check --group dev --group cluster -e '.[cluster,ray,spark]'
+	@$(call install,--group dev --group cluster -e '.[$(ENGINES)]',build/cluster/bin)
 	cd tests && ../build/cluster/bin/python oracle_collection.py 1000 'local+ray+spark:local[2,4]' 1 3 20
 	SGSTORE_LONG=1 build/cluster/bin/python -m pytest $(wildcard tests/test_collection*.py)
 
