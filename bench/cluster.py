@@ -155,27 +155,26 @@ def model(spent_on: Mapping[int, float], frames: int, asked: int) -> Iterator[Me
 
 
 def of_shares(folder: Path, frames: int) -> Iterator[Measure]:
-    """What it costs to read recordings in two shares: each is a process, which has to start."""
+    """What it costs to read recordings in two shares: each is a process, which starts. The least of three."""
     paths = [str(recording(folder / f"{n}.mcap", frames + n)) for n in range(RECORDINGS)]
-    took: dict[int, float] = {}
-    for shares in (1, 2):
-        before = spent()
-        for share in range(1, shares + 1):
-            words = [
-                sys.executable,
-                "-m",
-                "sgstore",
-                "ingest",
-                str(folder / f"in-{shares}"),
-                *paths,
-            ]
-            words += ["--shard", f"{share}/{shares}"]
-            subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
-        took[shares] = spent() - before
-    told = f"{took[2]:.3g} s, processor time; {frames} frames each; aim ≤ {SHARES}"
-    yield Measure(
-        f"{RECORDINGS} recordings in 2 shares, beside 1", took[2] / took[1], "times", told
-    )
+    landed(folder / "before", paths[:1], 1)  # loops are compiled once for a machine
+    took: dict[int, list[float]] = {1: [], 2: []}
+    for again in range(3):
+        for shares, some in took.items():
+            some.append(landed(folder / f"in-{shares}-{again}", paths, shares))
+    one, two = min(took[1]), min(took[2])
+    told = f"{two:.3g} s, processor time; {frames} frames each; aim ≤ {SHARES}"
+    yield Measure(f"{RECORDINGS} recordings in 2 shares, beside 1", two / one, "times", told)
+
+
+def landed(place: Path, paths: list[str], shares: int) -> float:
+    """Seconds of processor until recordings have landed, share by share."""
+    before = spent()
+    for share in range(1, shares + 1):
+        words = [sys.executable, "-m", "sgstore", "ingest", str(place), *paths]
+        words += ["--shard", f"{share}/{shares}"]
+        subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
+    return spent() - before
 
 
 def spent() -> float:
