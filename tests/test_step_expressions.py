@@ -89,6 +89,37 @@ def test_a_step_that_another_was_taken_for_has_no_time(store: Store) -> None:
     ]
 
 
+def test_of_two_ways_with_the_same_frames_the_one_that_is_written_first_counts(
+    store: Store, place: Path
+) -> None:
+    # That the ego goes on being slow is known a frame later than that it is slow.
+    lasting = f"{SLOW} FOR >= 0.2s INCLUSIVE AS lasting | {SLOW} AS short"
+    text = f"{FAST} THEN ({lasting}) RETURN t(lasting), t(short)"
+    expected = [(None, pytest.approx(0.2)), (pytest.approx(0.7), None)]
+
+    assert [tuple(row) for row in store.find(text)] == expected
+    events: list[Any] = []
+    with opened(str(place), Config()) as source:
+        Monitor(text, source.road_map, on_event=events.append).run(source.frames)
+    assert [tuple(e.values.values()) for e in events] == expected
+
+
+def test_a_way_that_ends_with_what_is_absent_counts_if_it_is_written_first(
+    store: Store, place: Path
+) -> None:
+    absent = f"{FAST} AS alone THEN WITHIN 0.3s NOT {SOME}"
+    for ways, expected in (
+        (f"{absent} | {FAST}", [None, 0.5, 0.5, 0.9]),
+        (f"{FAST} | {absent}", [None] * 4),
+    ):
+        text = f"{SLOW} THEN ({ways}) RETURN t(alone)"
+        assert [row[0] for row in store.find(text)] == pytest.approx(expected)
+        events: list[Any] = []
+        with opened(str(place), Config()) as source:
+            Monitor(text, source.road_map, on_event=events.append).run(source.frames)
+        assert [e.values["t(alone)"] for e in events] == pytest.approx(expected)
+
+
 def test_a_scenario_is_a_step_of_an_expression(store: Store) -> None:
     text = (
         f"DEFINE SCENARIO stops(top) AS MATCH (e:Ego) WHERE e.speed > $top THEN {SLOW};"

@@ -41,6 +41,7 @@ class ExpressionMonitor(SequenceMonitor):
         super().__init__(name, query, questions, pulse)
         self._best: dict[_Group, FoundMatch] = {}
         self._done: dict[tuple[int, Key], set[int]] = {}
+        self._written = {way: place for place, way in enumerate(self._asked)}
 
     def _certain(self) -> Iterator[FoundMatch]:
         for way in self._asked:
@@ -77,8 +78,10 @@ class ExpressionMonitor(SequenceMonitor):
                     self._best[group] = found
 
     def _better(self, one: FoundMatch, other: FoundMatch) -> bool:
-        """Tell whether a match counts rather than one of a sequence that is written before."""
+        """Tell whether a match counts rather than another: of the same frames, that written before."""
         (first, *rest), (begun, *known) = _frames(one), _frames(other)
+        if (first, rest) == (begun, known):
+            return self._written[one[0]] < self._written[other[0]]
         if first != begun or self.query.policy != "longest":
             return (first, *rest) < (begun, *known)
         return rest > known
@@ -97,27 +100,45 @@ class ExpressionMonitor(SequenceMonitor):
                 both = {**bound, **dict(zip(self._columns[first], key, strict=True))}
                 for place in one.places:
                     within = run in {_ANY, place.run.number} and place.number <= frames[0]
-                    if within and self._may_win(way, both, place, frames):
+                    before = self._written[way] < self._written[found[0]]
+                    if within and self._may_win(way, both, place, frames, before=before):
                         return False
         return True
 
     def _may_win(
-        self, way: StepWay, binding: Binding, place: StepFrame, frames: tuple[int, ...]
+        self,
+        way: StepWay,
+        binding: Binding,
+        place: StepFrame,
+        frames: tuple[int, ...],
+        *,
+        before: bool,
     ) -> bool:
-        """Tell whether a match that begins in a place may come, and count rather than one with these frames."""
-        if place.number < frames[0] or self.query.policy == "longest":
+        """Tell whether a match that begins in a place may come, and count rather than one with these frames.
+
+        It counts, too, with the same frames, if its sequence is written ``before``.
+        """
+        if self.query.policy == "longest":
             return self._alive(way, 0, binding, place)
-        return self._may_be_earlier(way, 0, binding, place, frames)
+        return self._overtakes(way, 0, binding, place, frames, before=before)
 
     def _may_be_earlier(
-        self, way: StepWay, at: int, binding: Binding, place: StepFrame, frames: tuple[int, ...]
+        self,
+        way: StepWay,
+        at: int,
+        binding: Binding,
+        place: StepFrame,
+        frames: tuple[int, ...],
+        *,
+        before: bool,
     ) -> bool:
         """Tell whether what follows a place may yet come earlier than frames, the first of which is its own."""
-        if len(frames) == 1 or at == len(way.links):
-            return False  # what goes on is later, and what has ended is known
+        if at == len(way.links):
+            return False  # what has ended is known
         following, link, open_ended = self._next_step(way, at, binding, place)
-        if following == len(way.steps):
-            return open_ended
+        if following == len(way.steps) or len(frames) == 1:  # what goes on is later
+            same = following == len(way.steps) and open_ended
+            return same and (before or len(frames) > 1)
         now, least = self._pulse.tick.number + 1, place.number + (link.kind != "while")
         if not self._closed(place, link, None, NEVER) and max(least, now) <= frames[1]:
             return True
@@ -130,16 +151,24 @@ class ExpressionMonitor(SequenceMonitor):
             for other in self._reached(place, link, held, NEVER):
                 if other.number > frames[1]:
                     break
-                if open_ended or self._overtakes(way, following, both, other, frames[1:]):
+                rest = way, following, both, other, frames[1:]
+                if open_ended or self._overtakes(*rest, before=before):
                     return True
         return False
 
     def _overtakes(
-        self, way: StepWay, at: int, binding: Binding, place: StepFrame, frames: tuple[int, ...]
+        self,
+        way: StepWay,
+        at: int,
+        binding: Binding,
+        place: StepFrame,
+        frames: tuple[int, ...],
+        *,
+        before: bool,
     ) -> bool:
         if place.number < frames[0]:
             return self._alive(way, at, binding, place)
-        return self._may_be_earlier(way, at, binding, place, frames)
+        return self._may_be_earlier(way, at, binding, place, frames, before=before)
 
     def _next_step(
         self, way: StepWay, at: int, binding: Binding, place: StepFrame
