@@ -57,8 +57,8 @@ MAX_BYTES: Final = 64 << 20
 MAX_QUESTION: Final = 1 << 20
 """Longest question with its values; characters."""
 
-START_S: Final = 30.0
-"""How long the process may take to start."""
+START_S: Final = 120.0
+"""How long the process may take to start; s. It needs one, of which a very busy machine makes a minute."""
 
 READ_S: Final = 60.0
 """How much longer for each table that it reads first; s."""
@@ -292,7 +292,10 @@ class Sandbox:
                 "may_write": self.may_write,
             }
             wait = START_S + READ_S * len(self._tables)
-            reply = self._exchange(self._child, json.dumps(settings), wait)
+            try:
+                reply = self._exchange(self._child, json.dumps(settings), wait)
+            except SqlError as error:
+                raise SqlError(f"the process that answers did not start: {error}") from None
             if "error" in reply:
                 self._kill()
             _granted(reply)

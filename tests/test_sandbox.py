@@ -181,3 +181,11 @@ def test_what_is_no_store_is_refused_at_once(tmp_path: Path) -> None:
         Sandbox(tmp_path / "none.sgstore")
     with pytest.raises(StoreError, match="not a store"):
         Sandbox(tmp_path / "notes.txt")
+
+
+def test_a_process_that_does_not_start_is_told_as_that(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sgstore.sandbox.START_S", 0.001)
+    with pytest.raises(SqlError, match=r"did not start: stopped after 0\.001 s"):
+        Sandbox(path)
