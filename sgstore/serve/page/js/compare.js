@@ -93,7 +93,7 @@ export function Compare() {
   const submit = (/** @type {any} */ event) => { event.preventDefault(); second.value = new FormData(event.target).get("second")?.toString() || ""; };
   return html`<section class="compare" aria-label="Compare"><form class="sheet row wrap" onSubmit=${submit}>
       <span><b>A</b> ${store.value.store}</span> <code class="cut" title=${a}>${a || "no query yet: type one under Find"}</code>
-      <span class="grow"></span><b>B</b>
+      <b>B</b>
       ${both ? html`<select aria-label="Store of B" value=${of} onChange=${(/** @type {any} */ e) => { side.value = e.target.value; }}><option value="b">${both.store}</option><option value="a">${store.value.store}</option></select>` : html`<span>${store.value.store}</span>`}
       <input name="second" class="query" aria-label="Query of B" value=${second.value} placeholder="the same query, or another one" /><button>Compare</button>
       <span role="group" aria-label="Form"><button type="button" aria-pressed=${shown.value === "tiles"} onClick=${() => { shown.value = "tiles"; }}>Tiles</button> <button type="button" aria-pressed=${shown.value === "tables"} onClick=${() => { shown.value = "tables"; }}>Tables</button></span></form>

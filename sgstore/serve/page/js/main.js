@@ -56,7 +56,7 @@ function Search() {
 
 function Rows() {
   const { columns, rows } = answer.value;
-  return html`<div class="sheet" tabindex="0"><table><thead><tr>${columns.map((/** @type {string} */ c) => html`<th>${c}</th>`)}</tr></thead>
+  return html`<div class="sheet" tabindex="0"><table><thead><tr>${columns.map((/** @type {string} */ c, /** @type {number} */ i) => html`<th class=${rows.some((/** @type {any[]} */ row) => typeof row[i] === "number") ? "number" : ""}>${c}</th>`)}</tr></thead>
     <tbody>${rows.slice(0, 2000).map((/** @type {any[]} */ row) => html`<tr>${row.map((v) => html`<td class=${typeof v === "number" ? "number" : ""}>${shown(v)}</td>`)}</tr>`)}</tbody></table>
     ${rows.length > 2000 ? html`<p class="note">2,000 of ${rows.length} rows are shown; add LIMIT or a condition</p>` : null}</div>`;
 }

@@ -78,10 +78,10 @@ export function Neighbours({ graph, states, north }) {
   const placeOf = (/** @type {number} */ node) => (about.has(node) ? spotOf(now.trace, states, node, near) : null);
   const heading = ego >= 0 ? states.columns.heading[ego] : NaN;
   const name = (/** @type {number} */ node) => (keys.get(node) || about.get(node)?.kind.replace(/_/g, " ") || String(node)).slice(0, 14);
-  // As large as the panel is, so that words are neither small nor cut; on a wide screen they are larger.
-  const box = document.querySelector(".panel.pattern")?.getBoundingClientRect(), scale = Math.max(1, (box?.width || 0) / 620);
+  // As large as the panel is, so that words are neither small nor cut; in a wide or high one they are larger.
+  const box = document.querySelector(".panel.pattern")?.getBoundingClientRect(), across = box?.width || 440, down = box?.height || 250, scale = Math.max(1, across / 620, Math.min(across / 400, down / 700));
   /** @type {[number, number]} */
-  const size = [Math.max((box?.width || 440) / scale - 18, 280), Math.max(((box?.height || 250) - 62) / scale, 110)];
+  const size = [Math.max(across / scale - 18, 280), Math.max((down - 62) / scale, 110)];
   const { shown, edges, left } = hopOf(graph, bound, placeOf, Math.min(MOST, size[0] * size[1] / ROOM));
   const at = layout(shown, placeOf, bound, north || !Number.isFinite(heading) ? 0 : Math.PI / 2 - heading, name, size);
   const drawn = edges.filter(({ src, dst }) => at.has(src) && at.has(dst));

@@ -155,7 +155,7 @@ export async function find(how = {}) {
       if (line.names) told.names = line.names;
       if (line.matches) for (const row of line.matches) told.matches.push(matchOf(row, told));
       for (const name of ["reasons", "columns", "rows", "notes", "count", "truncated", "error"]) {
-        if (line[name] !== undefined) told[name] = line[name];
+        if (line[name] !== undefined) told[name] = name === "error" ? here(line.error) : line[name];
       }
       if (performance.now() - last > 120) { last = performance.now(); answer.value = { ...told }; }
     }
@@ -168,6 +168,9 @@ export async function find(how = {}) {
   }
   if (under === mine) { under = null; answer.value = { ...told }; writeAddress(); }
 }
+
+/** An error with what helps on this page: its fields are the place for values. @param {any} error */
+const here = (error) => (/^the parameter \$/.test(error.reason) ? { ...error, hint: "write one into its field above" } : error);
 
 /** Matches among the lines of an answer. @param {AsyncIterable<any>} lines @returns {AsyncGenerator<Match>} */
 export async function* matchesIn(lines) {
@@ -194,10 +197,8 @@ function matchOf(row, told) {
 
 /** Violations of checks as matches. @param {any} told @param {any} found */
 function fromVerdicts(told, found) {
-  if (found.error) return { ...told, error: found.error };
-  told.verdicts = found.verdicts;
-  told.notes = found.notes || [];
-  told.truncated = found.truncated;
+  if (found.error) return { ...told, error: here(found.error) };
+  Object.assign(told, { verdicts: found.verdicts, notes: found.notes || [], truncated: found.truncated });
   for (const v of found.verdicts) {
     for (const [first, last, start, end, held] of v.spans) {
       /** @type {Match} */
