@@ -95,7 +95,7 @@ export function Compare() {
       <span><b>A</b> ${store.value.store}</span> <code class="cut" title=${a}>${a || "no query yet: type one under Find"}</code>
       <b>B</b>
       ${both ? html`<select aria-label="Store of B" value=${of} onChange=${(/** @type {any} */ e) => { side.value = e.target.value; }}><option value="b">${both.store}</option><option value="a">${store.value.store}</option></select>` : html`<span>${store.value.store}</span>`}
-      <input name="second" class="query" aria-label="Query of B" value=${second.value} placeholder="the same query, or another one" /><button>Compare</button>
+      <input name="second" class="query" aria-label="Query of B" defaultValue=${second.value} placeholder="the same query, or another one" /><button>Compare</button>
       <span role="group" aria-label="Form"><button type="button" aria-pressed=${shown.value === "tiles"} onClick=${() => { shown.value = "tiles"; }}>Tiles</button> <button type="button" aria-pressed=${shown.value === "tables"} onClick=${() => { shown.value = "tables"; }}>Tables</button></span></form>
     ${wrong ? html`<p class="sheet error" role="alert">${wrong}</p>` : null}
     ${both ? html`<${OfStores} found=${found} />` : same || !found ? html`<div class="sheet"><p class="faint" role="status">${!a ? "Type a query under Find; then another one for B here, or start sgstore serve with --compare OTHER." : same ? "Type another query for B, or start sgstore serve with --compare OTHER to see two stores side by side." : "working …"}</p></div>`

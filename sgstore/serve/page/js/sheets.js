@@ -11,13 +11,13 @@ const html = htm.bind(h);
 
 let counting = false;
 
-/** Count the matches of the library, one pattern after another, while nothing else is asked. */
+/** Count the matches of the library, one pattern after another, while it is looked at. */
 export async function countLibrary() {
   if (counting) return;
   counting = true;
   const left = library.value.filter((one) => one.kind !== "predicate" && one.kind !== "property" && !tally.value[one.name]);
   for (let one = left.shift(); one; one = left.shift()) {
-    while (answer.value.state === "busy" || view.value !== "find" || open.value) await new Promise((done) => setTimeout(done, 400));
+    while (answer.value.state !== "idle" || view.value !== "find" || open.value) await new Promise((done) => setTimeout(done, 400));
     /** @type {number[][]} */
     const spans = [], mine = new AbortController();
     let count = 0;
@@ -96,7 +96,7 @@ function Chart({ table, x, lines }) {
   const at = table.columns.indexOf(x), xs = table.rows.map((/** @type {any[]} */ r) => r[at]);
   const all = lines.map((name) => table.rows.map((/** @type {any[]} */ r) => r[table.columns.indexOf(name)]));
   const right = Math.max(...xs, 1), top = Math.max(...all.flat().filter(Number.isFinite), 1);
-  const colours = ["var(--accent)", "var(--ego)"], said = (/** @type {number} */ v) => v.toLocaleString("en", { maximumFractionDigits: 1 });
+  const colours = ["var(--accent)", "var(--ego)"], said = (/** @type {number} */ v) => v.toLocaleString("en", { maximumFractionDigits: v < 10 ? 1 : 0 });
   return html`<svg class="chart" viewBox="0 0 900 240" role="img" aria-label=${`${lines.join(" and ")} by ${x}`}>
     ${[0, 0.5, 1].map((s) => html`<line class="axis" x1="50" x2="890" y1=${206 - s * 170} y2=${206 - s * 170} /><text class="axis-text" x="44" y=${210 - s * 170} text-anchor="end">${said(top * s)}</text>
       <text class="axis-text" x=${50 + s * 840} y="221" text-anchor=${s === 1 ? "end" : "middle"}>${said(right * s)}</text>`)}
@@ -158,7 +158,7 @@ export function Selection() {
   return html`<div class="sheet" tabindex="0"><h2>${all.length} ${all.length === 1 ? "clip" : "clips"}</h2>
     <${Waiting} told=${told}>${(/** @type {any} */ found) => html`<p><b>${found.seconds.toFixed(1)} s</b>, ${found.frames.toLocaleString("en")} frames, ${size(found.bytes)} of sensor messages</p><${Table} table=${found.kept} />`}</${Waiting}>
     <h2>Keep them</h2>
-    ${store.value.writing ? html`<form class="row wrap" onSubmit=${write}><label>Name <input name="name" required pattern="[^\\/\\\\.][^\\/\\\\]*" value="tests" /></label>
+    ${store.value.writing ? html`<form class="row wrap" onSubmit=${write}><label>Name <input name="name" required pattern="[^\\/\\\\.][^\\/\\\\]*" defaultValue="tests" /></label>
       <button class="main" value="lock">Write a lock</button>
       <label>as <select name="format">${["mcap", "frames", "parquet", "nx", "pyg", "s3c"].map((f) => html`<option>${f}</option>`)}</select></label><button value="export">Export clips</button></form>`
       : html`<p class="note">Start <code>sgstore serve</code> with <code>--write-to DIR</code> to write locks and clips.</p>`}
