@@ -470,17 +470,16 @@ def run(quick: bool = False) -> Iterator[Measure]:
                 yield from of_sample(browser, server, seconds)
             yield from requests_of(server, folder / "town.sgstore", times)
             yield from bad_requests(server)
-        many = folder / "town.sgstore"
         if browser is not None:
-            ingest(folder / "300.sgstore", [crowd(folder / "crowd.mcap", many)])
+            crowded = crowd(folder / "crowd.mcap", folder / "town.sgstore")
+            ingest(folder / "300.sgstore", [crowded])
             yield from of_crowd(browser, folder / "300.sgstore", seconds, farther=3)
         if dense.exists():
-            many = folder / "crowd.sgstore"
-            ingest(many, [dense])
+            ingest(folder / "dense.sgstore", [dense])
             if browser is not None:
-                yield from of_crowd(browser, many, seconds, speed="4")
-        yield from of_report(many, folder / "report.html")
+                yield from of_crowd(browser, folder / "dense.sgstore", seconds, speed="4")
         large = Path(os.environ.get("SGSTORE_BENCH_REAL") or folder / "real.sgstore")
         if not large.exists():
             yield from made(large, QUICK if quick else TRACES)
         yield from of_large(browser, large)
+        yield from of_report(large, folder / "report.html")
