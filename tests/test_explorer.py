@@ -5,6 +5,7 @@ Needs Playwright and Chromium (``SGSTORE_CHROMIUM`` names its program); skipped,
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -189,6 +190,18 @@ def test_matches_are_those_of_the_store(page: Any, town_store: Path) -> None:
     seen(page, "gallery")
 
 
+def test_a_parameter_is_a_field(page: Any, town_store: Path) -> None:
+    query = f"{NEAR} WHERE e.speed > $least"
+    search(page, query)
+    expect(page.locator(".status .error")).to_contain_text("write one into its field above")
+    page.get_by_label("Value of $least").fill("3")
+    page.get_by_label("Value of $least").press("Enter")
+    many = len(list(Store(town_store).find(query, least=3).intervals()))
+    expect(page.locator(".status")).to_contain_text(f"{many} matches")
+    search(page, "SELECT 'a' AS word, 1 AS number")
+    assert page.locator("th.number").all_inner_texts() == ["number"]
+
+
 def test_lanes_are_the_parts_of_the_pattern(page: Any, town_store: Path) -> None:
     query = f"{NEAR} WHERE e.speed > 3"
     search(page, query)
@@ -360,6 +373,25 @@ def test_what_two_queries_differ_in_is_a_gallery(page: Any, town_store: Path) ->
     expect(page.locator(".cm-content")).to_have_text(other)
     seq = min(b - a)
     expect(time_shown(page)).to_contain_text(f"town#{seq} ")
+
+
+def test_what_is_cut_off_is_said(page: Any) -> None:
+    """An answer of 50,000 matches, of which there are more, is neither a count nor compared."""
+    lines = [
+        {"names": ["e", "e.name"], "matches": [["town", 3, 4, 0.3, 0.4, 0, "car 0"]]},
+        {"count": 1, "truncated": True, "notes": []},
+    ]
+    body = "\n".join(map(json.dumps, lines)) + "\n"
+
+    def answer(route: Any) -> None:
+        route.fulfill(content_type="application/x-ndjson", body=body)
+
+    page.route("**/api/find", answer)
+    page.locator(".card .badge", has_text="1+").first.wait_for()
+    search(page, NEAR)
+    expect(page.locator(".status")).to_contain_text("there are more: only the first 1 are shown")
+    page.get_by_role("button", name="Compare").click()
+    expect(page.get_by_role("alert")).to_contain_text("There are more than 1 matches")
 
 
 def test_a_monitor_is_seen_while_it_runs(visit: Callable[..., Any]) -> None:

@@ -23,8 +23,8 @@ const inB = computed(() => side.value || (store.value?.other ? "b" : "a"));
 /** Frames that a query finds, by trace. @param {string} query @param {string} of @param {AbortSignal} signal @returns {Promise<Found>} */
 async function framesOf(query, of, signal) {
   /** @type {Found} */
-  const by = new Map();
-  for await (const match of matchesIn(api.lines("api/find", { text: query, parameters: parametersOf(query), side: of }, { signal }))) {
+  const by = new Map(), more = (/** @type {number} */ many) => { throw new Error(`There are more than ${many.toLocaleString("en")} matches, and only whole answers can be compared: add a condition.`); };
+  for await (const match of matchesIn(api.lines("api/find", { text: query, parameters: parametersOf(query), side: of }, { signal }), more)) {
     const one = by.get(match.trace) || { frames: new Set(), matches: [] };
     by.set(match.trace, one);
     one.matches.push(match);

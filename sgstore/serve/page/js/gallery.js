@@ -64,7 +64,7 @@ function Tile({ match, x, y, wide, high, flies }) {
     <div class="about">
       ${offline.value || match.go ? null : html`<input type="checkbox" checked=${on} aria-label=${`Select ${match.trace} ${match.start.toFixed(1)} s`}
         onClick=${(/** @type {any} */ event) => { event.stopPropagation(); tick(match); }} />`}
-      <button class="quiet small" aria-label=${`Open ${match.trace}, ${match.start.toFixed(1)}–${match.end.toFixed(1)} s`}>${match.start === match.end ? "" : `${match.start.toFixed(1)}–`}${match.end.toFixed(1)} s</button>
+      <button class="quiet small" aria-label=${`Open ${match.trace}, ${match.start.toFixed(1)}–${match.end.toFixed(1)} s`}>${match.start.toFixed(1) === match.end.toFixed(1) ? "" : `${match.start.toFixed(1)}–`}${match.end.toFixed(1)} s</button>
       ${tags.map((n) => html`<span class="tag">${n[2]}</span>`)}<span class="who" title=${who}>${who}</span>
     </div></div>`;
 }

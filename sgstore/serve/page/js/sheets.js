@@ -20,15 +20,15 @@ export async function countLibrary() {
     while (answer.value.state !== "idle" || view.value !== "find" || open.value) await new Promise((done) => setTimeout(done, 400));
     /** @type {number[][]} */
     const spans = [], mine = new AbortController();
-    let count = 0;
+    let count = 0, more = "";
     idle.stop = () => mine.abort();
     try {
-      for await (const { trace, first, last } of matchesIn(api.lines("api/find", { text: one.text }, { signal: mine.signal }))) {
+      for await (const { trace, first, last } of matchesIn(api.lines("api/find", { text: one.text }, { signal: mine.signal }), () => { more = "+"; })) {
         if (count++ < 300) spans.push([placeOf(trace, first), placeOf(trace, last + 1)]);
       }
     } catch { count = -1; }
     if (mine.signal.aborted) left.unshift(one); // somebody asks: again later
-    else tally.value = { ...tally.value, [one.name]: { count, spans } };
+    else tally.value = { ...tally.value, [one.name]: { count, more, spans } };
   }
   counting = false;
 }
@@ -54,7 +54,7 @@ export function Start() {
       ${some.filter((one) => one.library === kind).sort((a, b) => Number(found(b) > 0) - Number(found(a) > 0)).map((one) => {
         const told = tally.value[one.name];
         return html`<button class="card" key=${one.name} onClick=${() => ask(one.text)}>
-          <h3>${one.name.replace(/_/g, " ")} <span class="grow"></span>${one.kind === "property" ? html`<span class="faint">check</span>` : told ? html`<span class=${told.count > 0 ? "badge" : "faint"}>${told.count < 0 ? "–" : told.count}</span>` : html`<span class="faint">…</span>`}</h3>
+          <h3>${one.name.replace(/_/g, " ")} <span class="grow"></span>${one.kind === "property" ? html`<span class="faint">check</span>` : told ? html`<span class=${told.count > 0 ? "badge" : "faint"}>${told.count < 0 ? "–" : told.count}${told.more}</span>` : html`<span class="faint">…</span>`}</h3>
           <p>${one.sentence}</p>
           ${told?.spans.length ? html`<svg viewBox="0 0 1000 18" preserveAspectRatio="none" aria-hidden="true"><rect class="bar-back" width="1000" height="18" />${told.spans.map(([a, z]) => html`<rect class="bar-match" x=${a} width=${Math.max((z || 0) - (a || 0), 4)} height="18" />`)}</svg>` : null}
           ${one.drawing ? html`<pre aria-hidden="true">${one.drawing}</pre>` : null}</button>`;

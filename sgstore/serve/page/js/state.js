@@ -14,7 +14,7 @@ export const store = signal(/** @type {any} */ (null));
 export const words = signal(/** @type {any} */ (null));
 export const library = signal(/** @type {any[]} */ ([]));
 /** How often each pattern of the library is found, and where. */
-export const tally = signal(/** @type {Record<string, {count: number, spans: number[][]}>} */ ({}));
+export const tally = signal(/** @type {Record<string, {count: number, more: string, spans: number[][]}>} */ ({}));
 export const view = signal("find");
 export const text = signal("");
 /** Values of $name. */
@@ -172,13 +172,14 @@ export async function find(how = {}) {
 /** An error with what helps on this page: its fields are the place for values. @param {any} error */
 const here = (error) => (/^the parameter \$/.test(error.reason) ? { ...error, hint: "write one into its field above" } : error);
 
-/** Matches among the lines of an answer. @param {AsyncIterable<any>} lines @returns {AsyncGenerator<Match>} */
-export async function* matchesIn(lines) {
+/** Matches among the lines of an answer; `more` hears of those that it lacks. @param {AsyncIterable<any>} lines @param {(many: number) => void} more @returns {AsyncGenerator<Match>} */
+export async function* matchesIn(lines, more) {
   const told = { names: [], matches: { length: 0 } };
   for await (const line of lines) {
     if (line.error) throw new Error(line.error.reason);
     if (line.names) told.names = line.names;
     for (const row of line.matches || []) { yield matchOf(row, told); told.matches.length++; }
+    if (line.truncated) more(told.matches.length);
   }
 }
 
