@@ -189,6 +189,10 @@ def test_all_that_is_done_in_a_folder_is_done_in_a_bucket(
     assert run_verb(["find", place, "MATCH (a:Car)", "--count"]) == 0
     assert int(capsys.readouterr().out) == Store(path).find("MATCH (a:Car)").count()
     assert run_verb(["info", place]) == 0
+    told = capsys.readouterr().out
+    assert all(f" {one[:12]} " in told for one in Collection(place).bundles())
+    assert run_verb(["collection", "gc", place]) == 0
+    assert "sgstore: s3://fleet/all: 0 files, 0 bytes removed;" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("answer", ["503", "500"])

@@ -20,6 +20,7 @@ from sgstore.cli._options import (
 )
 from sgstore.cli._output import count_bar, say
 from sgstore.cli._places import url_of
+from sgstore.errors import place_named
 
 if TYPE_CHECKING:
     from sgstore.collection import Commit
@@ -31,17 +32,27 @@ Place = Annotated[
 ]
 
 
+def _say(url: Path, told: str) -> None:
+    say(f"{place_named(url)}: {told}")
+
+
+def _many(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number != 1)}"
+
+
 def _statuses(done: Commit) -> list[tuple[str, str]]:
     """What became of traces."""
-    return [(name, "added") for name in done.added] + [(name, "present") for name in done.present]
+    from sgstore.vocabulary import natural
+
+    present = sorted(done.present, key=natural)
+    return [(name, "added") for name in done.added] + [(name, "present") for name in present]
 
 
 def _new_in(done: Commit) -> str:
     """What a commit has brought into a collection."""
     if not done.added:
         return f"nothing new; the last snapshot is {done.number}"
-    traces, bundles = len(done.added), len(done.bundles)
-    told = f"{traces} trace{'s' * (traces > 1)} in {bundles} bundle{'s' * (bundles > 1)}"
+    told = f"{_many(len(done.added), 'trace')} in {_many(len(done.bundles), 'bundle')}"
     return f"{told}, snapshot {done.number}"
 
 
@@ -75,7 +86,7 @@ def pack(
     out.write(("trace", "status"), _statuses(done))
     for old, new in done.renamed.items():
         say(f"{old}: the collection has another trace of this name, so it is {new!r} there")
-    say(f"{url}: {_new_in(done)}")
+    _say(url, _new_in(done))
     return 0
 
 
@@ -88,7 +99,7 @@ def commit(url: Place, *, out: PrintedRows) -> int:
     out.write(("trace", "status"), _statuses(done))
     for reason in done.refused:
         say(f"not committed: {reason}")
-    say(f"{url}: {_new_in(done)}")
+    _say(url, _new_in(done))
     return ERROR if done.refused else 0
 
 
@@ -101,7 +112,7 @@ def unpack(
     from sgstore.collection import unpack as unpack_all
 
     names = unpack_all(url_of(url) or url, store)
-    say(f"{store}: {len(names)} traces")
+    say(f"{store}: {_many(len(names), 'trace')}")
     return 0
 
 
@@ -112,8 +123,9 @@ def verify(url: Place, *, out: PrintedRows) -> int:
 
     found = verify_all(url_of(url) or url)
     out.write(("what", "check", "detail"), found.faults)
-    wrong = f"{len(found.faults)} faults" if found.faults else "no fault"
-    say(f"{url}: snapshot {found.number}, {found.bundles} bundles, {found.traces} traces: {wrong}")
+    wrong = _many(len(found.faults), "fault") if found.faults else "no fault"
+    held = f"{_many(found.bundles, 'bundle')}, {_many(found.traces, 'trace')}"
+    _say(url, f"snapshot {found.number}, {held}: {wrong}")
     return ERROR if found.faults else 0
 
 
@@ -140,7 +152,7 @@ def rebuild(
             on_bundle=on_bundle,
         )
     out.write(("bundle", "is now"), made.items())
-    say(f"{url}: {len(made)} bundles made anew")
+    _say(url, f"{_many(len(made), 'bundle')} made anew")
     return 0
 
 
@@ -163,5 +175,6 @@ def gc(
     found = collect(url_of(url) or url, keep=keep, older_s=seconds, dry_run=dry_run)
     out.write(("file",), [(name,) for name in found.names])
     verb = "would be removed" if dry_run else "removed"
-    say(f"{url}: {len(found.names)} files, {found.size} bytes {verb}; {found.young} are too young")
+    files = _many(len(found.names), "file")
+    _say(url, f"{files}, {found.size} bytes {verb}; {found.young} too young")
     return 0

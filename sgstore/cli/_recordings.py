@@ -240,10 +240,11 @@ def _tell_of_collection(url: str, names: list[str], out: PrintedRows) -> None:
         if name not in known:
             raise StoreError(f"{url}: no trace {name!r}")
     columns = ("trace", "frames", "seconds", "ego", "map", "trace_id", "bundle", "file")
+    digits = 12 if out.for_people else None
     rows = (
         (
             *(row["name"], row["frames"], round((row["end_ns"] - row["start_ns"]) / 1e9, 3)),
-            *(row["ego"], row["map"], row["trace_id"], row["bundle"], row["uri"]),
+            *(row["ego"], row["map"], row["trace_id"], row["bundle"][:digits], row["uri"]),
         )
         for row in found
         if not names or row["name"] in names
