@@ -181,6 +181,11 @@ def close(one: Any, other: Any) -> bool:
     return type(one) is type(other) and one == other
 
 
+def nested(values: Any) -> Any:
+    """An array as a list; so is what it holds, as the steps of a path."""
+    return [*map(nested, values)] if getattr(values, "ndim", 0) else values
+
+
 @pytest.mark.parametrize("text", some(QUESTIONS, 7))
 def test_rows_and_their_order_are_those_of_one_store(
     store: Store, whole: Collection, text: str
@@ -202,8 +207,8 @@ def test_other_forms_are_those_of_one_store(store: Store, whole: Collection, tex
     assert found.count() == expected.count()
     if not ("UNION" in text and "SUBGRAPHS" in text):  # these make no table
         arrays, others = found.numpy(), expected.numpy()
-        assert {n: a.tolist() for n, a in arrays.items()} == {
-            n: a.tolist() for n, a in others.items()
+        assert {n: nested(a) for n, a in arrays.items()} == {
+            n: nested(a) for n, a in others.items()
         }
     assert list(found.frames()) == list(expected.frames())
     assert list(found.intervals()) == list(expected.intervals())
