@@ -193,7 +193,7 @@ oracle: $(VENV)/.dev
 	SGSTORE_COVERAGE_RATE=2 $(BIN)/python -m pytest tests/test_coverage.py
 
 # In an environment of its own, because Ray and Spark are large, and bring older packages.
-ENGINES := cluster,ray,spark
+ENGINES := arrow,cluster,ray,spark,viz
 cluster: $(VENV)/.base
 	@test -x build/cluster/bin/python || $(BIN)/python -m venv build/cluster || $(BIN)/python -m virtualenv -q build/cluster
 	@$(call install,--group dev --group cluster -e '.[$(ENGINES)]',build/cluster/bin)
