@@ -407,6 +407,7 @@ def test_a_monitor_is_seen_while_it_runs(visit: Callable[..., Any]) -> None:
         assert page.locator("[data-statement]").count() == 2
         page.locator(".tile", has_text="pattern").first.click()
         page.locator(".timeline .lane[data-holds=true]").first.wait_for()
+        expect(page.locator(".scene .timeline .label").first).to_contain_text("events in this")
         page.get_by_role("tab", name="nodes").click()
         page.locator(".pattern tbody tr").first.click()
         drawn = page.locator(".timeline path.series")

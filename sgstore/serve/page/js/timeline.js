@@ -2,7 +2,7 @@
 // The whole trace in time: matches, a lane for each part of the pattern, tags, values; drag to go there.
 import { h, htm, useRef } from "../vendor/core.js";
 import { frame, goTo, holdsAt, lanes, range, series } from "./clock.js";
-import { keyOf, lit, live, matches, notes, open, playing, traces } from "./state.js";
+import { answer, keyOf, lit, live, matches, notes, open, playing, traces } from "./state.js";
 
 const html = htm.bind(h);
 
@@ -45,13 +45,13 @@ export function Timeline() {
   const now = open.value, about = traces.value.get(now?.trace || "");
   if (!now || !about) return null;
   const [from, to] = range.value, frames = to - from + 1, mine = matches.value.filter((m) => m.trace === now.trace);
-  const tags = notes.value.filter((n) => n[0] === now.trace), holds = holdsAt(frame.value);
+  const tags = notes.value.filter((n) => n[0] === now.trace), holds = holdsAt(frame.value), word = live.value ? "event" : answer.value.verdicts ? "violation" : "match";
   const all = lanes.value?.lanes || [], steps = new Set(all.map((/** @type {any} */ l) => l.step)).size > 1;
   const first = [...mine].sort((a, b) => Number(a.index === now.match?.index) - Number(b.index === now.match?.index));
   const end = about.seconds, every = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000].find((s) => (frames * about.period) / s < 9) || 5000;
   const ticks = [...Array(Math.floor(end / every) + 1).keys()].map((i) => i * every).filter((t) => t >= from * about.period);
   return html`<div class="timeline" role="group" aria-label="Timeline">
-    <div class="lane"><div class="label">${mine.length} ${mine.length === 1 ? "match" : "matches"} <span class="faint">in this trace</span></div>
+    <div class="lane"><div class="label">${mine.length} ${word}${mine.length === 1 ? "" : word === "match" ? "es" : "s"} <span class="faint">in this trace</span></div>
       <${Bars} spans=${first.map((m) => [m.first, m.last])}
         kind=${(/** @type {number} */ i) => (first[i] && now.match && keyOf(first[i]) === keyOf(now.match) ? "bar-match" : "bar-match other")} /></div>
     ${all.map((/** @type {any} */ lane, /** @type {number} */ i) => {
