@@ -12,12 +12,14 @@ from builders import PaperMap, Patch, Recording, graph_of, thing
 from graph_blocks import RandomTrace, map_stub, publish
 
 from sgstore.config import Config, RangeSettings
+from sgstore.errors import QueryError
 from sgstore.graph import LaneDistances
 from sgstore.lang import FrameView
 from sgstore.opendrive import read_map
 from sgstore.query import Store
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
+from sgstore.temporal import Monitor, MonitorEvent
 from sgstore.vocabulary import RELATION_CODE, SIGNALS
 
 if TYPE_CHECKING:
@@ -127,6 +129,34 @@ def test_the_view_the_language_the_graph_and_networkx_say_the_same_to_the_last_b
                 for edge in (drawn.get_edge_data(a, b) or {}).values():
                     assert edge.get("lane_dist") == far
     assert known > 40
+
+
+def test_the_time_to_collision_along_the_lanes_is_that_of_its_definition(open_town: Store) -> None:
+    parts = ("lane_dist(a, b)", "a.speed", "b.speed", "a.length", "b.length", "ttc_lane(a, b)")
+    query = f"MATCH (a:Entity), (b:Entity) RETURN frame.id, a.id, b.id, {', '.join(parts)}"
+    asked = {row[:3]: row[3:] for row in open_town.find(query).rows()}
+    known = {frame for (frame, *_), (*_, found) in asked.items() if found is not None}
+    assert len(known) > 100
+    for frame in sorted(known)[::20]:
+        events: list[MonitorEvent] = []
+        online = "MATCH (a:Entity), (b:Entity) RETURN FIRST(ttc_lane(a, b)) OVER match"
+        monitor = Monitor(online, period_s=0.1, on_event=events.append)
+        monitor.look([open_town.file.graph(frame)])
+        monitor.finish()
+        told = {(e.nodes["a"], e.nodes["b"]): next(iter(e.values.values())) for e in events}
+        for (at, a, b), (far, speed, other, length, others, found) in asked.items():
+            if at != frame:
+                continue
+            expected = None
+            if None not in {far, speed, other} and far > 0 and speed > other:
+                gap = None if None in {length, others} else max(far - (length + others) / 2, 0)
+                expected = None if gap is None else gap / (speed - other)
+            assert found == expected == told[a, b]
+
+
+def test_a_time_along_the_lanes_is_of_two_entities(store: Store) -> None:
+    with pytest.raises(QueryError, match=r"ttc_lane\(\) takes two entities, and this is a lane"):
+        store.find("MATCH (e:Car), (l:Lane) WHERE ttc_lane(e, l) < 3").rows()
 
 
 TOWN = PaperMap(

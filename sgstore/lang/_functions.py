@@ -15,6 +15,7 @@ from sgstore.lang._hints import said_of
 from sgstore.lang._kinds import on_lanes
 from sgstore.lang._needs import in_range
 from sgstore.lang._operators import EXTREMES, NUMERIC, OF_TEXT, OF_TWO
+from sgstore.lang._parse import parse
 from sgstore.lang._symbols import CLASSES, Symbol, SymbolTable, abstraction_named, class_count
 from sgstore.lang.library import pattern_named, patterns, predicates
 from sgstore.pair_numbers import COURSES, LANE_DIST, NEXT_PARTS, OF_ONE, PAIR_FUNCTIONS, PART_DIST
@@ -44,9 +45,14 @@ _COURSES: Final = (
     "robustness",
 )
 _TEMPORAL: Final = frozenset(map(normalize_name, _COURSES))
+TTC_LANE: Final = "ttc_lane"
+_ALONG_LANES: Final = """DEFINE PREDICATE ttc_lane(a, b) AS
+  CASE WHEN lane_dist(a, b) > 0 AND a.speed > b.speed
+  THEN max(lane_dist(a, b) - (a.length + b.length) / 2, 0) / (a.speed - b.speed) END"""
+"""It is no column, for it is made of what is looked up, and of attributes."""
 FUNCTIONS: Final = frozenset(
     {
-        *(*PAIR_FUNCTIONS, *RECORDED, *OF_ONE, *NUMERIC, *EXTREMES, *OF_TWO),
+        *(*PAIR_FUNCTIONS, *RECORDED, TTC_LANE, *OF_ONE, *NUMERIC, *EXTREMES, *OF_TWO),
         *(*_OTHERS, *AGGREGATES, *_COURSES),
     }
 )
@@ -171,6 +177,17 @@ def _pair(e: s.Call, names: SymbolTable) -> b.PairNumber:
         every = [names.scope.kinds(key).every for key in keys]
         function = LANE_DIST if all(kinds & entity_kinds() for kinds in every) else PART_DIST
     return b.PairNumber(function, keys[0], keys[1])
+
+
+def _ttc_lane(e: s.Call, names: SymbolTable) -> b.Bound:
+    _expect(e, 2, 2, names)
+    keys = [_entity(TTC_LANE, argument, names) for argument in e.arguments]
+    meanings = {name: Symbol(node=key) for name, key in zip("ab", keys, strict=True)}
+    match parse(_ALONG_LANES):
+        case (s.Define(body=s.Case() as body),):
+            return names.body(meanings).bind(body)
+        case other:
+            raise TypeError(other)
 
 
 def _refuse_sort(e: s.Call, names: SymbolTable) -> None:
@@ -442,5 +459,6 @@ _FUNCTIONS: Final[dict[str, Callable[[s.Call, SymbolTable], b.Bound]]] = {
     "known": _known,
     "length": _path_function,
     "nodes": _path_function,
+    "ttclane": _ttc_lane,
     "type": _type,
 }
