@@ -208,6 +208,20 @@ def test_it_is_said_how_many_have_no_gap(tmp_path: Path) -> None:
     assert len(prioritize(some, PrioritySpec()).said) == 1
 
 
+@pytest.mark.parametrize("by", ["risk", "diverse", "both"])
+def test_it_is_said_that_there_is_no_ego(tmp_path: Path, by: str) -> None:
+    nodes = [{"id": f"v{i}", "kind": "car", "x": 9.0 * i, "y": 0, "z": 0} for i in range(2)]
+    graphs = [{"graph": {"name": f"run {n}"}, "nodes": nodes, "edges": []} for n in range(3)]
+    (tmp_path / "runs.jsonl").write_text("".join(json.dumps(one) + "\n" for one in graphs))
+    import_graphs(tmp_path / "runs.sgstore", [tmp_path / "runs.jsonl"], "nodelink")
+    chosen = selection_of(str(tmp_path / "runs.sgstore"))
+
+    told = prioritize(chosen, PrioritySpec(Priority(by))).said[1]
+    assert told.startswith("3 of 3 frames have no ego")
+    by_speed = PrioritySpec(Priority(by), ("MIN {(v:Vehicle) | v.x}",), abstraction="E")
+    assert len(prioritize(chosen, by_speed).said) == 1
+
+
 def test_a_clip_of_which_one_measure_is_known_has_its_situation_from_there(tmp_path: Path) -> None:
     # Nobody closes in, so there is no closing_time: the second frame is the most critical one by ttc_mild.
     chosen = runs(tmp_path, [{"x": 60}, {"x": -9, "heading": 180}, {"x": 70}])

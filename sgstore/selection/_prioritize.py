@@ -338,12 +338,7 @@ def prioritize(
     if spec.budget is not None:
         tracker = BudgetTracker.of(units, spec.budget.measure, spec.budget.most)
         picked = tracker.fitting(order)
-    said = [_said(spec, units, picked, worst, code)]
-    if blind := max((one.blind for one in worst), default=0):
-        said.append(
-            f"{blind:,} pairs of the ego and others have no gap: length, width or heading is missing;"
-            " no measure that takes it counts them"
-        )
+    said = [_said(spec, units, picked, worst, code), *_lacking(spec, units, worst)]
     said += [lesson] if lesson else []
     return Prioritized(spec, units, picked, risk, worst, code, said, chance, names)
 
@@ -384,6 +379,27 @@ def _said(
         many, here = (len(np.unique(some[some != UNKNOWN])) for some in (code, code[picked]))
         kind = "situations" if spec.abstraction == SITUATION else f"classes in {spec.abstraction}"
         told += f"; {here:,} of {many:,} {kind}"
+    return told
+
+
+def _lacking(spec: PrioritySpec, units: Units, worst: Sequence[WorstValues]) -> list[str]:
+    """What frames and pairs lack so that nothing is known of whom the ego could meet."""
+    told: list[str] = []
+    of_pairs = spec.by is Priority.learned or {*spec.measures} & {*RANKED, *LATER}
+    if spec.abstraction == SITUATION if spec.by is Priority.diverse else of_pairs:
+        sql = "SELECT frame_id FROM frames WHERE ego IS NULL"
+        lonely = units.chosen.one_store.file.arrays(sql)["frame_id"]
+        here = units.frame_id[units.asked]
+        if many := int(np.isin(here, lonely).sum()):
+            told.append(
+                f"{many:,} of {len(here):,} frames have no ego: nothing is known of whom it could meet, and"
+                " their order is chance; ingest with --ego NAME says who it is"
+            )
+    if blind := max((one.blind for one in worst), default=0):
+        told.append(
+            f"{blind:,} pairs of the ego and others have no gap: length, width or heading is missing;"
+            " no measure that takes it counts them"
+        )
     return told
 
 
