@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     from sgstore.coverage import ChosenFrames
 
-Size = tuple[str, float, float]
+Size = tuple[str, float | None, float | None]
 STRATEGIES: Final = {"random": "random strategy", "rl_based": "reinforcement learning"}
 SIZES: Final = {
     "Ego": ("car", 4.7, 1.9),
@@ -57,6 +57,8 @@ ONE_SIZE: Final = {model: (kind, 4.5, 1.8) for model, (kind, *_) in SIZES.items(
 SPLITS: Final = 10
 TIES: Final = 20
 PERSON: Final = ("person", 0.5, 0.5)
+UNKNOWN: Final = ("vehicle", None, None)
+"""A model that is not known: its size is not, either, and the order says of how many pairs there is no gap."""
 BESIDE: Final = {"closing_time": ("closing_time",), "dce_3s": ("dce_3s",), "wttc": ("wttc",)}
 
 
@@ -66,12 +68,12 @@ def graph_of(number: int, run: dict[str, Any], sizes: Mapping[str, Size] = SIZES
     for name, (model, role) in run["o"].items():
         _, vx, vz, vy, x, z, y, turned = run["t"][name][0]
         ego = role == "Ego"
-        kind, length, width = (
-            sizes["Ego"] if ego else PERSON if role == "Pedestrian" else sizes[model]
-        )
+        of_others = PERSON if role == "Pedestrian" else sizes.get(model, UNKNOWN)
+        kind, length, width = sizes["Ego"] if ego else of_others
         about = {"id": "ego" if ego else f"{number} {name}", "kind": kind, "is_ego": ego}
         about |= {"x": x, "y": y, "z": z, "heading": 90 - turned, "vx": vx, "vy": vy, "vz": vz}
-        nodes.append(about | {"length": length, "width": width, "height": 1.7})
+        about |= {"length": length, "width": width, "height": 1.7}
+        nodes.append({name: one for name, one in about.items() if one is not None})
     return {"graph": {"name": f"run {number}"}, "nodes": nodes, "edges": []}
 
 
@@ -117,7 +119,8 @@ def by_risk(title: str, chosen: ChosenFrames, failed: dict[str, bool]) -> Iterat
         order = prioritize(chosen, PrioritySpec(measures=measures))
         took = time.perf_counter() - begun
         found = fault_detection(failed_in_order(order, failed))
-        yield Measure(f"{title}, {label}", found.apfd, "APFD", found.said)
+        told = "; ".join([found.said, *order.said[1:]])
+        yield Measure(f"{title}, {label}", found.apfd, "APFD", told)
         yield Measure("  for a million frames", took / len(order.units) * 1e6, "s")
     rng = np.random.default_rng(0)
     chance = fault_detection(rng.permutation(np.array(list(failed.values()))))
