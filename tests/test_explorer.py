@@ -6,6 +6,7 @@ Needs Playwright and Chromium (``SGSTORE_CHROMIUM`` names its program); skipped,
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shutil
@@ -20,6 +21,7 @@ import pytest
 
 from sgstore.demo import RECORDING
 from sgstore.ingest import ingest
+from sgstore.lang import patterns
 from sgstore.query import Store
 from sgstore.report import inline, report
 
@@ -168,11 +170,20 @@ def seen(page: Any, name: str) -> None:
         page.screenshot(path=str(Path(PICTURES) / f"{name}.png"))
 
 
-def test_the_library_is_there_before_anything_is_typed(page: Any) -> None:
+def test_the_library_is_there_before_anything_is_typed(page: Any, town_store: Path) -> None:
     page.locator(".card").first.wait_for()
 
     assert page.locator(".card").count() > 50
-    page.locator(".card .badge").first.wait_for()
+    card = page.locator(".card", has_text="jaywalking")
+    card.locator(".badge").wait_for()
+    # Where in time it is found, in 250 spots.
+    spans = list(Store(town_store).find(patterns()["jaywalking"].text).intervals())
+    frames = 750
+    ends = [(s.start_seq * 250 / frames, (s.end_seq + 1) * 250 / frames) for s in spans]
+    spots = {at for a, z in ends for at in range(math.floor(a), math.ceil(z))}
+    marks = card.locator(".bar-match").evaluate_all("all => all.map(one => one.getAttribute('x'))")
+    assert card.locator(".badge").inner_text() == str(len(spans))
+    assert {int(mark) for mark in marks} == spots
     seen(page, "start")
     search(page, NEAR)
     expect(page.locator(".card")).to_have_count(0)

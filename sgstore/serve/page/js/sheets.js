@@ -18,29 +18,27 @@ export async function countLibrary() {
   const left = library.value.filter((one) => one.kind !== "predicate" && one.kind !== "property" && !tally.value[one.name]);
   for (let one = left.shift(); one; one = left.shift()) {
     while (answer.value.state !== "idle" || view.value !== "find" || open.value) await new Promise((done) => setTimeout(done, 400));
-    /** @type {number[][]} */
-    const spans = [], mine = new AbortController();
+    const spots = new Set(), place = placed(), mine = new AbortController();
     let count = 0, more = "";
     idle.stop = () => mine.abort();
     try {
       for await (const { trace, first, last } of matchesIn(api.lines("api/find", { text: one.text }, { signal: mine.signal }), () => { more = "+"; })) {
-        if (count++ < 300) spans.push([placeOf(trace, first), placeOf(trace, last + 1)]);
+        count++;
+        for (let at = Math.floor(place(trace, first)); at < place(trace, last + 1); at++) spots.add(at);
       }
     } catch { count = -1; }
     if (mine.signal.aborted) left.unshift(one); // somebody asks: again later
-    else tally.value = { ...tally.value, [one.name]: { count, more, spans } };
+    else tally.value = { ...tally.value, [one.name]: { count, more, spots: [...spots] } };
   }
   counting = false;
 }
 
-/** Where a frame is in all traces, one behind the other: 0 to 1000. @param {string} trace @param {number} at */
-function placeOf(trace, at) {
-  let before = 0, whole = 0;
-  for (const one of store.value.traces) {
-    if (one.name === trace) before = whole + at;
-    whole += one.frames;
-  }
-  return (before / Math.max(whole, 1)) * 1000;
+/** What tells where a frame is in all traces, one behind the other: 0 to 250. */
+function placed() {
+  const before = new Map();
+  let whole = 0;
+  for (const { name, frames } of store.value.traces) { before.set(name, whole); whole += frames; }
+  return (/** @type {string} */ trace, /** @type {number} */ at) => ((before.get(trace) + at) / whole) * 250;
 }
 
 export function Start() {
@@ -56,7 +54,7 @@ export function Start() {
         return html`<button class="card" key=${one.name} onClick=${() => ask(one.text)}>
           <h3>${one.name.replace(/_/g, " ")} <span class="grow"></span>${one.kind === "property" ? html`<span class="faint">check</span>` : told ? html`<span class=${told.count > 0 ? "badge" : "faint"}>${told.count < 0 ? "–" : told.count}${told.more}</span>` : html`<span class="faint">…</span>`}</h3>
           <p>${one.sentence}</p>
-          ${told?.spans.length ? html`<svg viewBox="0 0 1000 18" preserveAspectRatio="none" aria-hidden="true"><rect class="bar-back" width="1000" height="18" />${told.spans.map(([a, z]) => html`<rect class="bar-match" x=${a} width=${Math.max((z || 0) - (a || 0), 4)} height="18" />`)}</svg>` : null}
+          ${told?.spots.length ? html`<svg viewBox="0 0 250 18" preserveAspectRatio="none" aria-hidden="true"><rect class="bar-back" width="250" height="18" />${told.spots.map((at) => html`<rect class="bar-match" x=${at} width="1.1" height="18" />`)}</svg>` : null}
           ${one.drawing ? html`<pre aria-hidden="true">${one.drawing}</pre>` : null}</button>`;
       })}</div>`)}</div>`;
 }
