@@ -6,11 +6,14 @@ import json
 import os
 import random
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+import duckdb
 import pytest
 from opendrive_maps import a_map, a_road, lane, line, section
 from recordings import Recorder, car
@@ -104,23 +107,35 @@ def test_shares_that_were_stopped_and_begun_again_are_the_whole(
     assert one.find(COUNTED).rows() == other.find(COUNTED).rows() != []
 
 
+def killed_at_work(words: list[str], place: Path, rng: random.Random) -> bool:
+    """Begin a share, and kill it when it has made some files, or a little later; whether it still ran."""
+
+    def files() -> int:
+        return sum(len(names) for _, _, names in os.walk(place))
+
+    enough = files() + rng.randrange(4)
+    with subprocess.Popen(words, stdout=subprocess.DEVNULL) as running:
+        while running.poll() is None and files() < enough:
+            time.sleep(0.001)
+        time.sleep(rng.uniform(0, 0.1))
+        running.kill()
+    return running.returncode == -signal.SIGKILL
+
+
 @pytest.mark.skipif(not LONG, reason="four shares are begun three times each: make cluster")
 @pytest.mark.parametrize("seed", range(3))
 def test_shares_that_are_killed_twice_and_begun_again_are_the_whole(
     drives: list[Path], unsharded: Path, tmp_path: Path, seed: int
 ) -> None:
-    rng, place = random.Random(seed), tmp_path / "c"
+    rng, place, killed = random.Random(seed), tmp_path / "c", list[bool]()
     for share in range(1, 5):
         words = [sys.executable, "-m", "sgstore", "ingest", str(place), *map(str, drives)]
         words += ["--shard", f"{share}/4"]
-        for _ in range(2):
-            with subprocess.Popen(words, stdout=subprocess.DEVNULL) as running:
-                with suppress(subprocess.TimeoutExpired):
-                    running.wait(rng.uniform(0.2, 1.5))
-                running.kill()
+        killed += [killed_at_work(words, place, rng) for _ in range(2)]
         assert subprocess.run(words, stdout=subprocess.DEVNULL, check=False).returncode == 0
     done = commit(place)
 
+    assert sum(killed) >= 4
     assert done.refused == []
     assert segments_of(place) == segments_of(unsharded)
     assert facts_of(place) == facts_of(unsharded)
@@ -136,6 +151,21 @@ def test_each_recording_is_in_one_share(drives: list[Path], tmp_path: Path) -> N
     ]
 
     assert sorted(found[0] + found[1]) == sorted(drives)
+
+
+def test_a_map_is_once_in_a_bundle(drives: list[Path], unsharded: Path, tmp_path: Path) -> None:
+    ingest(tmp_path / "s.sgstore", drives)
+    pack(tmp_path / "s.sgstore", tmp_path / "packed", bundle_traces=2)
+
+    of_traces: list[list[str]] = []
+    for place in (unsharded, tmp_path / "packed"):
+        for bundle in sorted((place / "bundles").iterdir()):
+            with duckdb.connect(str(bundle), read_only=True) as connection:
+                told = connection.sql("SELECT name FROM inside.map").fetchall()
+                asked = "SELECT DISTINCT map FROM frames WHERE map IS NOT NULL"
+                assert told == connection.sql(asked).fetchall()
+                of_traces.append([name for (name,) in told])
+    assert [len(names) for names in of_traces] == [1, 1, 1]  # of three traces, of one, of two
 
 
 def test_what_was_landed_is_what_ingest_reads(
