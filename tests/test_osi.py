@@ -6,8 +6,9 @@ import math
 import tracemalloc
 from functools import cache
 from itertools import pairwise
+from pathlib import Path
 from time import process_time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from mcap.reader import make_reader
 from mcap.records import Schema
 from recordings import OSI, Osi, Recorder, bulb, car, drive, ground_truth, house, ns, person, sign
 
+import sgstore
 import sgstore.readers._blocks as frames
 from sgstore.errors import TraceError
 from sgstore.readers import message_class, open_trace
@@ -27,9 +29,6 @@ from sgstore.readers.osi._objects import MovingObjects, light_bits, lit, shown
 from sgstore.readers.osi._schema import fields_of
 from sgstore.vocabulary import KINDS, LIGHT_STATES, VEHICLE_LIGHTS
 from sgstore.world import POSE, FrameBlock, States, TraceInfo, TraceReport
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 REAL = [
     *(
@@ -412,6 +411,15 @@ def test_kinds_roles_and_types_that_nobody_knows(tmp_path: Path) -> None:
     assert entity(blocks, "1", "special") == "emergency"
     assert report.unknown_types == {"TYPE_VEHICLE": 1, "TYPE_OTHER": 1, "TYPE_99": 1}
     assert len(column(blocks, "x")) == 10
+
+
+def test_a_type_that_has_two_names_is_called_by_the_first() -> None:
+    """``TYPE_MEDIUM_CAR`` was added to OSI later, as another name of the number of ``TYPE_CAR``."""
+    sample = Path(sgstore.__file__).parent / "sample" / "town.mcap"
+    with open_trace(sample) as trace:
+        names = {name for block in trace.blocks(60) for name in block.entities.type_name}
+    assert "TYPE_CAR" in names
+    assert "TYPE_MEDIUM_CAR" not in names
 
 
 def test_lights_of_vehicles_are_bits_and_unknown_where_there_are_none(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from functools import cache
+from functools import cache, lru_cache
 from importlib import resources
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
@@ -560,7 +560,7 @@ def parse(message: type[Any], data: bytes) -> tuple[Any, Any, list[bytes]]:
     return parsed, ground, objects
 
 
-@cache
+@lru_cache(maxsize=64)
 def _truth_in(message: type[Any]) -> int:
     """Number of the field that is the ground truth in messages of a class; 0: they are it."""
     truth = message.DESCRIPTOR.fields_by_name.get("global_ground_truth")
@@ -577,16 +577,24 @@ def enum_name(message: Any, field: str) -> str:
 
     A value that the file's own version of OSI does not know is kept by its number: ``TYPE_213``.
     """
-    descriptor = message.DESCRIPTOR.fields_by_name[field]
-    names = descriptor.enum_type.values_by_number
     number = getattr(message, field)
+    names, place = _values_of(type(message), field)
     if not message.HasField(field):
         for unknown in unknown_fields.UnknownFieldSet(message):
-            if unknown.field_number == descriptor.number and isinstance(unknown.data, int):
+            if unknown.field_number == place and isinstance(unknown.data, int):
                 number = unknown.data
     if number in names:
-        return str(names[number].name)
-    return f"{names[0].name.split('_')[0] if 0 in names else field.upper()}_{number}"
+        return names[number]
+    return f"{names[0].split('_')[0] if 0 in names else field.upper()}_{number}"
+
+
+@lru_cache(maxsize=256)
+def _values_of(message: type[Any], field: str) -> tuple[dict[int, str], int]:
+    """Names of the values that a field of a message class may have, by number; and the field's own number."""
+    descriptor = message.DESCRIPTOR.fields_by_name[field]
+    names = descriptor.enum_type.values_by_number
+    # Asked one by one: of several names of a number it is the first that counts.
+    return {number: str(names[number].name) for number in names}, descriptor.number
 
 
 def identifiers(thing: Any) -> list[tuple[str, str]]:

@@ -13,7 +13,7 @@ that says what the entity is to OpenSCENARIO (``Vehicle``, ``cutter``).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cache
+from functools import lru_cache
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -80,7 +80,7 @@ def hosts_of(message: Any) -> list[int]:
     return [part.host_vehicle_id.value for part in told if part.HasField("host_vehicle_id")]
 
 
-@cache
+@lru_cache(maxsize=64)
 def _telling(message: type[Any]) -> tuple[str, ...]:
     """Parts of messages of a class that may name the host vehicle; empty: the message itself."""
     inner = [
