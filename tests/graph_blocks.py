@@ -43,7 +43,7 @@ TRUTH, CAMERA, LIDAR, MAP = range(4)
 NO_MESSAGES = MessageRefs(*(np.zeros(0, np.int64) for _ in range(5)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MapStub:
     """All that a store wants to know of a map."""
 

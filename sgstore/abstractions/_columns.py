@@ -84,13 +84,15 @@ class MapColumns:
 
     @classmethod
     def of(cls, road_map: RoadMap) -> MapColumns:
-        """Columns of a road map's nodes and edges."""
+        """Columns of a road map's nodes and edges; the same ones again as long as the map is kept."""
+        if (known := _MAPS.get(road_map)) is not None:
+            return known
         nodes, edges = road_map.nodes, road_map.edges
         name, lane_type, road, junction = (
             np.array(column, object)
             for column in (nodes.name, nodes.lane_type, nodes.road, nodes.junction)
         )
-        return cls(
+        _MAPS[road_map] = columns = cls(
             nodes.kind,
             name,
             lane_type,
@@ -101,6 +103,7 @@ class MapColumns:
             edges.src,
             edges.dst,
         )
+        return columns
 
     @cached_property
     def strands(self) -> Strands:
@@ -111,6 +114,9 @@ class MapColumns:
     def driving(self) -> Bools:
         """(K,): whether it is a lane that is driven on."""
         return (self.kind == _LANE) & np.array([of in DRIVING for of in self.lane_type], np.bool_)
+
+
+_MAPS: Final[WeakKeyDictionary[RoadMap, MapColumns]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)

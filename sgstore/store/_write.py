@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Final, Self
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -46,19 +47,22 @@ class OnMap:
     def __init__(self, road_map: RoadMap | None) -> None:
         self.road_map = road_map
         self.classes = IngestedClasses(road_map)
-        self._rows: StagedRows | None = None
 
     def insert_into(self, staging: Staging, map_id: int) -> None:
         """Insert the tables of the map, as the first rows of a staging."""
         if self.road_map is None:
             return
-        if self._rows is not None:
-            staging.adopt(self._rows)
+        if (rows := _ROWS.get(self.road_map)) is not None:
+            staging.adopt(rows)
             return
         for table, columns in _map_tables(self.road_map).items():
             count = len(next(iter(columns.values())))
             staging.insert(table, columns | {"map_id": np.full(count, map_id)})
-        self._rows = staging.shared()
+        _ROWS[self.road_map] = staging.shared()
+
+
+_ROWS: Final[WeakKeyDictionary[RoadMap, StagedRows]] = WeakKeyDictionary()
+"""The rows of road maps that segments lay on, as long as the maps are kept: its number is that of its text."""
 
 
 class Segment:
