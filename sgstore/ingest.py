@@ -293,7 +293,7 @@ class Workers:
 # So the store is the same whatever the number of processes, and a run that was killed and begun again ends with
 # the same store as one that was not.
 
-BLOCK_FRAMES: Final = 3 * BUCKET_FRAMES
+BLOCK_FRAMES: Final = 4 * BUCKET_FRAMES
 """Frames that are worked on at once: whole buckets, so that a mask is one row."""
 
 
