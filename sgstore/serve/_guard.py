@@ -34,8 +34,6 @@ _ALWAYS: Final = {
     "cache-control": "no-store",
 }
 
-_DAY_S: Final = 86_400
-
 
 class Guard:
     """An application behind a token; see the module.
@@ -97,7 +95,7 @@ class Guard:
     def _let_in(self) -> Response:
         response = RedirectResponse("/", 303)
         response.set_cookie(
-            self._cookie, self._token, max_age=_DAY_S * 30, httponly=True, samesite="strict"
+            self._cookie, self._token, max_age=30 * 86_400, httponly=True, samesite="strict"
         )
         return response
 

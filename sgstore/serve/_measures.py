@@ -22,7 +22,7 @@ from sgstore.store import frame_ids, lengths_of_messages
 from sgstore.world import Clip
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from sgstore.coverage import ReportTable
 
@@ -62,12 +62,14 @@ def select(store: Store, clips: Clips, abstraction: str) -> dict[str, Any]:
         ``clips``, ``frames``, ``seconds``, ``bytes``; ``kept``: a table of shares.
     """
     with store.file.snapshot():
-        frame_id, seconds = _frames(store, clips)
+        parts = list(_frames(store, clips))
+        frame_id = np.sort(np.concatenate([np.zeros(0, np.int64), *(ids for _, ids, _ in parts)]))
         sizes = (lengths for _, lengths in lengths_of_messages(store.file, frame_id))
         size = sum(int(lengths.sum()) for lengths in sizes) if len(frame_id) else 0
         whole = classed(ChosenFrames("the store", store), abstraction)
         some = classed(ChosenFrames("the selection", store, frame_id), abstraction)
         kept = _table(covered(whole, some))
+    seconds = sum((lasts for *_, lasts in parts), 0.0)
     about = {"clips": len(clips), "frames": len(frame_id), "seconds": seconds}
     return {**about, "bytes": size, "kept": kept}
 
@@ -76,9 +78,8 @@ def lock(store: Store, clips: Clips, to: str, **_: str) -> dict[str, Any]:
     """Write a lock of clips."""
     path = Path(to if to.endswith(".lock") else f"{to}.lock")
     with store.file.snapshot():
-        parts = [
-            (_frames(store, [clip])[0], store.file.log_times(*clip), "") for clip in _apart(clips)
-        ]
+        found = _frames(store, clips)
+        parts = [(ids, store.file.log_times(*clip), "") for clip, ids, _ in found]
         made = lock_of(store, parts, {"chosen": "in the explorer"}, progress=_done)
     made.write(path)
     return {"result": {"file": str(path), "cases": len(made.cases)}}
@@ -106,16 +107,15 @@ def _done(done: int, whole: int) -> None:
     tell({"progress": [done, whole]})
 
 
-def _frames(store: Store, clips: Clips) -> tuple[Any, float]:
-    """Ids of the frames of clips, each once, ascending; how many seconds they last."""
-    ids, seconds = [np.zeros(0, np.int64)], 0.0
+def _frames(store: Store, clips: Clips) -> Iterator[tuple[tuple[str, int, int], Any, float]]:
+    """Clips that are apart, each with the ids of its frames and how many seconds it lasts."""
+    traces = {one.name: one for one in store.traces()}
     for trace, first, last in _apart(clips):
-        of = store.file.trace(trace)
+        of = traces.get(trace) or store.file.trace(trace)  # which says what there is
         if last >= of.frames:
             raise StoreError(f"no frame #{last} in {trace!r}; it has #0 … #{of.frames - 1}")
-        ids.append(frame_ids(of.trace_id, np.arange(first, last + 1)))
-        seconds += (last - first + 1) * of.period_ns / 1e9
-    return np.sort(np.concatenate(ids)), seconds
+        ids = frame_ids(of.trace_id, np.arange(first, last + 1))
+        yield (trace, first, last), ids, len(ids) * of.period_ns / 1e9
 
 
 def _apart(clips: Clips) -> list[tuple[str, int, int]]:

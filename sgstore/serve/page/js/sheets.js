@@ -54,7 +54,7 @@ export function Start() {
         return html`<button class="card" key=${one.name} onClick=${() => ask(one.text)}>
           <h3>${one.name.replace(/_/g, " ")} <span class="grow"></span>${one.kind === "property" ? html`<span class="faint">check</span>` : told ? html`<span class=${told.count > 0 ? "badge" : "faint"}>${told.count < 0 ? "–" : told.count}${told.more}</span>` : html`<span class="faint">…</span>`}</h3>
           <p>${one.sentence}</p>
-          ${told?.spots.length ? html`<svg viewBox="0 0 250 18" preserveAspectRatio="none" aria-hidden="true"><rect class="bar-back" width="250" height="18" />${told.spots.map((at) => html`<rect class="bar-match" x=${at} width="1.1" height="18" />`)}</svg>` : null}
+          ${told?.spots.length ? html`<svg viewBox="0 0 250 18" preserveAspectRatio="none" shape-rendering="crispEdges" aria-hidden="true"><rect class="bar-back" width="250" height="18" />${told.spots.map((at) => html`<rect class="bar-match" x=${at} width="1" height="18" />`)}</svg>` : null}
           ${one.drawing ? html`<pre aria-hidden="true">${one.drawing}</pre>` : null}</button>`;
       })}</div>`)}</div>`;
 }
