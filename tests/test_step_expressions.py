@@ -43,6 +43,14 @@ def store(place: Path) -> Store:
     return sgstore.open(place.parent / "s.sgstore")
 
 
+def watched(place: Path, text: str) -> list[Any]:
+    """The events of a monitor, frame by frame."""
+    events: list[Any] = []
+    with opened(str(place), Config()) as source:
+        Monitor(text, source.road_map, on_event=events.append).run(source.frames)
+    return events
+
+
 CASES: list[tuple[str, list[tuple[int, int]]]] = [
     (f"{FAST} THEN ({SLOW} | {SOME})", [(1, 2), (5, 7)]),
     (f"{FAST} THEN ({SOME} | {FAST} THEN {SLOW})", [(1, 3), (5, 7)]),
@@ -62,9 +70,7 @@ def test_expressions_stand_for_their_sequences(
     store: Store, place: Path, text: str, expected: list[tuple[int, int]]
 ) -> None:
     assert [(i.start_seq, i.end_seq) for i in store.find(text).intervals()] == expected
-    events: list[Any] = []
-    with opened(str(place), Config()) as source:
-        Monitor(text, source.road_map, on_event=events.append).run(source.frames)
+    events = watched(place, text)
     assert sorted((e.start.seq, e.end.seq) for e in events) == expected
 
 
@@ -98,9 +104,7 @@ def test_of_two_ways_with_the_same_frames_the_one_that_is_written_first_counts(
     expected = [(None, pytest.approx(0.2)), (pytest.approx(0.7), None)]
 
     assert [tuple(row) for row in store.find(text)] == expected
-    events: list[Any] = []
-    with opened(str(place), Config()) as source:
-        Monitor(text, source.road_map, on_event=events.append).run(source.frames)
+    events = watched(place, text)
     assert [tuple(e.values.values()) for e in events] == expected
 
 
@@ -114,9 +118,7 @@ def test_a_way_that_ends_with_what_is_absent_counts_if_it_is_written_first(
     ):
         text = f"{SLOW} THEN ({ways}) RETURN t(alone)"
         assert [row[0] for row in store.find(text)] == pytest.approx(expected)
-        events: list[Any] = []
-        with opened(str(place), Config()) as source:
-            Monitor(text, source.road_map, on_event=events.append).run(source.frames)
+        events = watched(place, text)
         assert [e.values["t(alone)"] for e in events] == pytest.approx(expected)
 
 

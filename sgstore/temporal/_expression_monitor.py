@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 _Group = tuple[int, "Key", int]
 """Step that a match begins with, nodes by name, and the run: of each one match counts."""
 
+_Standing = tuple["StepWay", int, "Binding", "StepFrame"]
+"""How far a match has come: its sequence, the number of the step there, nodes by name, and the frame."""
+
 _ANY = -1
 """In place of the step and of the run, where of all matches of a binding only the first one counts."""
 
@@ -79,12 +82,11 @@ class ExpressionMonitor(SequenceMonitor):
 
     def _better(self, one: FoundMatch, other: FoundMatch) -> bool:
         """Tell whether a match counts rather than another: of the same frames, that written before."""
-        (first, *rest), (begun, *known) = _frames(one), _frames(other)
-        if (first, rest) == (begun, known):
-            return self._written[one[0]] < self._written[other[0]]
-        if first != begun or self.query.policy != "longest":
-            return (first, *rest) < (begun, *known)
-        return rest > known
+        frames, known = _frames(one), _frames(other)
+        place, written = self._written[one[0]], self._written[other[0]]
+        if self.query.policy == "longest" and frames[0] == known[0]:
+            return (frames, -place) > (known, -written)
+        return (frames, place) < (known, written)
 
     def _decided(self, group: _Group, found: FoundMatch) -> bool:
         """Tell whether nothing can come that counts rather than a match."""
@@ -94,51 +96,44 @@ class ExpressionMonitor(SequenceMonitor):
             first = way.steps[0]
             if step not in {_ANY, first}:
                 continue
+            before = self._written[way] < self._written[found[0]]
             for key, one in self._agreeing(first, bound):
                 if one.undecided <= frames[0]:
                     return False
                 both = {**bound, **dict(zip(self._columns[first], key, strict=True))}
                 for place in one.places:
                     within = run in {_ANY, place.run.number} and place.number <= frames[0]
-                    before = self._written[way] < self._written[found[0]]
-                    if within and self._may_win(way, both, place, frames, before=before):
+                    standing = way, 0, both, place
+                    if within and self._may_win(standing, frames, before=before):
                         return False
         return True
 
-    def _may_win(
-        self,
-        way: StepWay,
-        binding: Binding,
-        place: StepFrame,
-        frames: tuple[int, ...],
-        *,
-        before: bool,
-    ) -> bool:
+    def _may_win(self, standing: _Standing, frames: tuple[int, ...], *, before: bool) -> bool:
         """Tell whether a match that begins in a place may come, and count rather than one with these frames.
 
         It counts, too, with the same frames, if its sequence is written ``before``.
         """
         if self.query.policy == "longest":
-            return self._alive(way, 0, binding, place)
-        return self._overtakes(way, 0, binding, place, frames, before=before)
+            return self._alive(*standing)
+        return self._overtakes(standing, frames, before=before)
+
+    def _overtakes(self, standing: _Standing, frames: tuple[int, ...], *, before: bool) -> bool:
+        *_, place = standing
+        if place.number < frames[0]:
+            return self._alive(*standing)
+        return self._may_be_earlier(standing, frames, before=before)
 
     def _may_be_earlier(
-        self,
-        way: StepWay,
-        at: int,
-        binding: Binding,
-        place: StepFrame,
-        frames: tuple[int, ...],
-        *,
-        before: bool,
+        self, standing: _Standing, frames: tuple[int, ...], *, before: bool
     ) -> bool:
         """Tell whether what follows a place may yet come earlier than frames, the first of which is its own."""
+        way, at, binding, place = standing
         if at == len(way.links):
             return False  # what has ended is known
         following, link, open_ended = self._next_step(way, at, binding, place)
-        if following == len(way.steps) or len(frames) == 1:  # what goes on is later
-            same = following == len(way.steps) and open_ended
-            return same and (before or len(frames) > 1)
+        ends = following == len(way.steps)
+        if ends or len(frames) == 1:  # what goes on is later
+            return ends and open_ended and (before or len(frames) > 1)
         now, least = self._pulse.tick.number + 1, place.number + (link.kind != "while")
         if not self._closed(place, link, None, NEVER) and max(least, now) <= frames[1]:
             return True
@@ -151,24 +146,10 @@ class ExpressionMonitor(SequenceMonitor):
             for other in self._reached(place, link, held, NEVER):
                 if other.number > frames[1]:
                     break
-                rest = way, following, both, other, frames[1:]
-                if open_ended or self._overtakes(*rest, before=before):
+                there = way, following, both, other
+                if open_ended or self._overtakes(there, frames[1:], before=before):
                     return True
         return False
-
-    def _overtakes(
-        self,
-        way: StepWay,
-        at: int,
-        binding: Binding,
-        place: StepFrame,
-        frames: tuple[int, ...],
-        *,
-        before: bool,
-    ) -> bool:
-        if place.number < frames[0]:
-            return self._alive(way, at, binding, place)
-        return self._may_be_earlier(way, at, binding, place, frames, before=before)
 
     def _next_step(
         self, way: StepWay, at: int, binding: Binding, place: StepFrame
