@@ -18,7 +18,7 @@ from sgstore.cli._options import (
     jobs_of,
     seconds_of,
 )
-from sgstore.cli._output import count_bar, say
+from sgstore.cli._output import count_bar, number_of, say
 from sgstore.cli._places import url_of
 from sgstore.errors import place_named
 
@@ -36,10 +36,6 @@ def _say(url: Path, told: str) -> None:
     say(f"{place_named(url)}: {told}")
 
 
-def _many(number: int, what: str) -> str:
-    return f"{number} {what}{'s' * (number != 1)}"
-
-
 def _statuses(done: Commit) -> list[tuple[str, str]]:
     """What became of traces."""
     from sgstore.vocabulary import natural
@@ -52,7 +48,7 @@ def _new_in(done: Commit) -> str:
     """What a commit has brought into a collection."""
     if not done.added:
         return f"nothing new; the last snapshot is {done.number}"
-    told = f"{_many(len(done.added), 'trace')} in {_many(len(done.bundles), 'bundle')}"
+    told = f"{number_of(len(done.added), 'trace')} in {number_of(len(done.bundles), 'bundle')}"
     return f"{told}, snapshot {done.number}"
 
 
@@ -112,7 +108,7 @@ def unpack(
     from sgstore.collection import unpack as unpack_all
 
     names = unpack_all(url_of(url) or url, store)
-    say(f"{store}: {_many(len(names), 'trace')}")
+    say(f"{store}: {number_of(len(names), 'trace')}")
     return 0
 
 
@@ -123,8 +119,8 @@ def verify(url: Place, *, out: PrintedRows) -> int:
 
     found = verify_all(url_of(url) or url)
     out.write(("what", "check", "detail"), found.faults)
-    wrong = _many(len(found.faults), "fault") if found.faults else "no fault"
-    held = f"{_many(found.bundles, 'bundle')}, {_many(found.traces, 'trace')}"
+    wrong = number_of(len(found.faults), "fault") if found.faults else "no fault"
+    held = f"{number_of(found.bundles, 'bundle')}, {number_of(found.traces, 'trace')}"
     _say(url, f"snapshot {found.number}, {held}: {wrong}")
     return ERROR if found.faults else 0
 
@@ -152,7 +148,7 @@ def rebuild(
             on_bundle=on_bundle,
         )
     out.write(("bundle", "is now"), made.items())
-    _say(url, f"{_many(len(made), 'bundle')} made anew")
+    _say(url, f"{number_of(len(made), 'bundle')} made anew")
     return 0
 
 
@@ -175,6 +171,6 @@ def gc(
     found = collect(url_of(url) or url, keep=keep, older_s=seconds, dry_run=dry_run)
     out.write(("file",), [(name,) for name in found.names])
     verb = "would be removed" if dry_run else "removed"
-    files = _many(len(found.names), "file")
+    files = number_of(len(found.names), "file")
     _say(url, f"{files}, {found.size} bytes {verb}; {found.young} too young")
     return 0

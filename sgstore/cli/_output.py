@@ -215,6 +215,11 @@ def talk_as_usual() -> None:
         logging.getLogger("sgstore").setLevel(logging.NOTSET)
 
 
+def number_of(number: int, what: str, more: str = "s") -> str:
+    """So many things, in words; ``more`` is what the word has behind it if they are several."""
+    return f"{number:,} {what}{'' if number == 1 else more}"
+
+
 def say(message: str) -> None:
     """Tell something that is neither a result nor an error, on stderr."""
     if not _manner.quiet:

@@ -36,7 +36,15 @@ from sgstore.cli._options import (
     tables_of,
     text_of,
 )
-from sgstore.cli._output import BINARY, Format, say, write_binary, write_document, write_text
+from sgstore.cli._output import (
+    BINARY,
+    Format,
+    number_of,
+    say,
+    write_binary,
+    write_document,
+    write_text,
+)
 from sgstore.cli._places import COLLECTIONS, CollectionOptions, url_of
 
 if TYPE_CHECKING:
@@ -142,13 +150,13 @@ def _write_stretches(intervals: Iterator[Interval], ask: AskOptions) -> int:
 
     number = _write_intervals(counted(), ask)
     if number:
-        parts = (_many(number, "stretch", "es"), _many(frames, "frame"), f"{seconds:,.1f} s")
-        say(f"{', '.join(parts)} in {_many(len(traces), 'trace')}; --rows shows each frame")
+        parts = (
+            number_of(number, "stretch", "es"),
+            number_of(frames, "frame"),
+            f"{seconds:,.1f} s",
+        )
+        say(f"{', '.join(parts)} in {number_of(len(traces), 'trace')}; --rows shows each frame")
     return number
-
-
-def _many(number: int, what: str, more: str = "s") -> str:
-    return f"{number:,} {what}{'' if number == 1 else more}"
 
 
 def _found_in(
