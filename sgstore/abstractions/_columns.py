@@ -117,6 +117,7 @@ class MapColumns:
 
 
 _MAPS: Final[WeakKeyDictionary[RoadMap, MapColumns]] = WeakKeyDictionary()
+"""Columns of road maps; forgotten with the map."""
 
 
 @dataclass(frozen=True, eq=False)

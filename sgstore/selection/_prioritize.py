@@ -385,8 +385,10 @@ def _said(
 def _lacking(spec: PrioritySpec, units: Units, worst: Sequence[WorstValues]) -> list[str]:
     """What frames and pairs lack so that nothing is known of whom the ego could meet."""
     told: list[str] = []
-    of_pairs = spec.by is Priority.learned or {*spec.measures} & {*RANKED, *LATER}
-    if spec.abstraction == SITUATION if spec.by is Priority.diverse else of_pairs:
+    of_pairs = bool({*spec.measures} & {*RANKED, *LATER}) or spec.by is Priority.learned
+    if spec.by is Priority.diverse:
+        of_pairs = spec.abstraction == SITUATION
+    if of_pairs:
         sql = "SELECT frame_id FROM frames WHERE ego IS NULL"
         lonely = units.chosen.one_store.file.arrays(sql)["frame_id"]
         here = units.frame_id[units.asked]

@@ -62,7 +62,7 @@ class OnMap:
 
 
 _ROWS: Final[WeakKeyDictionary[RoadMap, StagedRows]] = WeakKeyDictionary()
-"""The rows of road maps that segments lay on, as long as the maps are kept: its number is that of its text."""
+"""The rows of a road map, with its number, which is a digest of its text; forgotten with the map."""
 
 
 class Segment:
