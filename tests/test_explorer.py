@@ -502,7 +502,7 @@ def faults(page: Any) -> list[str]:
     if not page.evaluate("'axe' in window"):
         page.evaluate(AXE.read_text(encoding="utf-8"))
     found = page.evaluate(
-        "axe.run({resultTypes: ['violations'], preload: false}).then(({violations}) => violations)"
+        "axe.run({resultTypes: ['violations']}).then(({violations}) => violations)"
     )
     return [
         f"{one['id']}: {one['help']}: {node['html'][:120]}"
