@@ -734,7 +734,7 @@ def _check_result(result: b.Result, returns: s.Returns, session: Session) -> Non
     if result.aggregated and listed:
         hint = "a number for each row is COUNT {(a)-[:near]->(b)} AS n"
         if result.form in {"intervals", "clips"}:
-            hint = "how many frames each interval has is there anyhow, as frames"
+            hint = "frames says how many each has; a value over each is MIN(…) OVER match"
         session.refuse("matches are either counted or listed, not both", returns.span, hint)
 
 
