@@ -581,7 +581,7 @@ def _join_leader(sql: SqlBuilder, join: Join, scope: Scope, key: str) -> None:
     on = [f'{frame} >> 6 = {PATTERN}."bucket"', f'{alias}."node_id" = {join.nodes[key]}']
     on += _of_kinds(sql, scope, key, alias)
     join.select.join(f'"state" AS {alias}', [*on, in_mask(PATTERN, frame)])
-    join.select.where += sql.within(frame, 64)
+    join.select.where += sql.within(frame, 64, met=True)
     join.frame = frame
     # Said of the bucket, so that constants are looked up for the rows of masks, and not for all states.
     join.trace = f'{PATTERN}."bucket" >> 18'
@@ -646,7 +646,7 @@ def _bind_late(sql: SqlBuilder, join: Join, scope: Scope, key: str) -> None:
     on = [f'{alias}."frame_id" = {join.frame}'] if join.frame else []
     on += _of_kinds(sql, scope, key, alias)
     join.select.join(f'"state" AS {alias}', on)
-    join.select.where += sql.within(f'{alias}."frame_id"', 64)
+    join.select.where += sql.within(f'{alias}."frame_id"', 64, met=bool(join.frame))
     join.frame = join.frame or f'{alias}."frame_id"'
     join.nodes[key] = f'{alias}."node_id"'
     join.at[key] = Aliases(state=alias)
@@ -689,7 +689,7 @@ def _join_values(sql: SqlBuilder, join: Join, scope: Scope, key: str, homes: set
         on = [f'{state}."frame_id" = {join.frame}']
         if not scope.kinds(key).one_a_frame:  # one column filters the scan as it reads
             on.append(f'{state}."node_id" = {node}')
-        on += _of_kinds(sql, scope, key, state) + sql.within(f'{state}."frame_id"', 64)
+        on += _of_kinds(sql, scope, key, state) + sql.within(f'{state}."frame_id"', 64, met=True)
         alone = profile.places == 1
         join.select.join(f'"state" AS {state}', on, "JOIN" if alone else "LEFT JOIN")
     if homes & {Home.entity, Home.scenery}:

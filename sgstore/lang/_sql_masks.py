@@ -355,13 +355,16 @@ class SqlBuilder:
         """Matches of a scope, if they are known already."""
         return self.found if scope is self.query.scope else None
 
-    def within(self, column: str, per: int = 1) -> list[str]:
-        """Conditions that keep a column of buckets, or of frames (``per`` 64), in the window."""
+    def within(self, column: str, per: int = 1, *, met: bool = False) -> list[str]:
+        """Conditions that keep a column of buckets, or of frames (``per`` 64), in the window.
+
+        ``met``: rows meet others of its traces, so the range is enough, unless matches are given.
+        """
         if self.window is None:
             return []
         low, high = self.window.low * per, self.window.high * per
         found = [f"{column} >= {low}", f"{column} < {high}"]
-        if self.window.traces is not None:
+        if self.window.traces is not None and not (met and self.found is None):
             shift = TRACE_OF_FRAME if per > 1 else TRACE_OF_BUCKET
             found.append(among(f"{column} >> {shift}", list(self.window.traces)))
         return found
