@@ -525,8 +525,8 @@ class SceneGraph:
         From centre to centre along the centre lines of their own lanes (:attr:`LaneStates.own`) and of those
         that ``travelsTo`` leads through; positive where one drives from a to b, negative where one drives from
         b to a; of several ways the shortest. A lane, a road, a junction, a crosswalk lies on lanes from one
-        place to another, so that it is 0 within; a light or a sign where one waits. ``None`` if there is no way
-        of at most 200 m: lane changes are none.
+        place to another, so that it is 0 within; a light or a sign where one waits, on lanes of this graph
+        that it controls. ``None`` if there is no way of at most 200 m: lane changes are none.
         """
         if self.reach is None:
             return None

@@ -184,6 +184,7 @@ class Defined:
         own = graph.places()
         self.own = {node: [Around(ways, (-2 - n, at)) for n, at in own[node]] for node in own}
         self.idents = {node: about.get("ident", "") for node, about in graph.nodes.items()}
+        self.lanes = {-2 - node for node in graph.nodes}
         self.primary = {
             src: (-2 - dst, about["along"])
             for src, relation, dst, about in graph.edges
@@ -208,9 +209,14 @@ class Defined:
 
     def part(self, node: int, part: int) -> float | None:
         """From an entity to a part of the map: to where it begins, or back to where it ended."""
-        # A light that was recorded is that of the map after whose column it is called.
+        # A light that was recorded is that of the map after whose column it is called. Edges tie it to
+        # lanes, so that only those of the graph count.
         column = -1 - part if part < 0 else int(self.idents[part].split()[1])
-        there = stretches_of(self.name).get(column, [])
+        there = [
+            stretch
+            for stretch in stretches_of(self.name).get(column, [])
+            if part < 0 or stretch[0] in self.lanes
+        ]
         here = self.own.get(node, [])
         if any(o.lane == lane and a <= o.along <= b for o in here for lane, a, b in there):
             return 0.0
