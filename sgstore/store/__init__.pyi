@@ -36,6 +36,8 @@ from ._contents import marks as marks
 from ._contents import messages_of as messages_of
 from ._schema import SCHEMA_VERSION as SCHEMA_VERSION
 from ._file import StoreFile as StoreFile
+from ._given import Given as Given
+from ._given import GivenTable as GivenTable
 from ._joins import UserTables as UserTables
 from ._locking import Folder as Folder
 from ._packing import BUCKET_BITS as BUCKET_BITS
@@ -52,9 +54,7 @@ from ._rebuild import named_as as named_as
 from ._rebuild import remains_of as remains_of
 from ._rebuild import take_place as take_place
 from ._rows import Batches as Batches
-from ._rows import Given as Given
 from ._rows import IN_NOTEBOOK as IN_NOTEBOOK
-from ._rows import GivenTable as GivenTable
 from ._rows import ParquetTable as ParquetTable
 from ._rows import Rows as Rows
 from ._rows import Tabular as Tabular

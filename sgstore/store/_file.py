@@ -15,6 +15,7 @@ import sgstore.store._rows as rows
 from sgstore.arrays import np
 from sgstore.errors import SgstoreError, StoreError, TraceError
 from sgstore.store._encounters import recorded_measures
+from sgstore.store._given import Given, give
 from sgstore.store._locking import (
     WAIT_S,
     Access,
@@ -24,7 +25,7 @@ from sgstore.store._locking import (
     stamp_of,
     translated,
 )
-from sgstore.store._rows import BATCH, Batches, Given, Rows, give
+from sgstore.store._rows import BATCH, Batches, Rows
 from sgstore.store._traces import (
     FrameRef,
     Identity,
@@ -209,9 +210,8 @@ class StoreFile:
 
         ``plain``: none of them is an enumeration, so that the statement need not be planned to know that.
         """
-        with self._answered(
-            lambda at, _: rows.arrays(at, sql, parameters, plain=plain), sql, given
-        ) as found:
+        ask = partial(rows.arrays, sql=sql, parameters=parameters, plain=plain)
+        with self._answered(lambda at, _: ask(at), sql, given) as found:
             return found
 
     def table(

@@ -8,8 +8,6 @@ import re
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
-from functools import partial
 from importlib import import_module
 from itertools import chain, islice
 from pathlib import Path
@@ -21,7 +19,7 @@ from sgstore.arrays import np
 from sgstore.errors import ExportError, MissingExtraError, SqlError
 from sgstore.files import without_controls, working_folder, written_at, written_text
 from sgstore.quoting import literal, quoted
-from sgstore.store._encounters import show_recorded
+from sgstore.store._given import Given, give
 from sgstore.store._locking import EngineError, engine_fault, spill_fault
 from sgstore.store._schema import INSIDE
 from sgstore.store._steps import interrupt, interruptible
@@ -832,32 +830,7 @@ def count_parquet(file: Path) -> tuple[int, tuple[str, ...]]:
         raise ExportError(f"{file.name}: cannot be read back: {str(error).strip()}") from error
 
 
-# Rows that a statement of ours is given: a table that lasts as long as the statement is asked ----
-# They come a block at a time, and the database moves what does not fit into memory to temporary files.
-
-
-@dataclass(frozen=True, slots=True)
-class GivenTable:
-    """A table of rows that are not in the store.
-
-    Attributes
-    ----------
-    name : str
-        What the statement calls it; like no table of the store.
-    types : mapping of str to str
-        The type of each column in the database.
-    blocks : function
-        The columns of some rows, in the same order, and of the next ones; from the first whenever it is called.
-    """
-
-    name: str
-    types: Mapping[str, str]
-    blocks: Callable[[], Iterable[Sequence[list[Any]]]]
-
-
-Given = GivenTable | tuple[str, Mapping[str, object]]
-"""A table that a statement is given: its rows, or a statement of ours that makes it, and its values."""
-
+# Tables that a statement of a user's is given ------------------------------------------------------
 
 UserTablesGiven = Callable[[], Iterable[Given]]
 """The function of the tables that a statement of a user's speaks of: asked while the store is open."""
@@ -882,19 +855,3 @@ def give_to_user(
         connection.execute(f"USE {INSIDE}")
         give(connection, given())
         connection.execute("USE main")
-
-
-def give(connection: DuckDBPyConnection, given: Iterable[Given]) -> None:
-    """Make tables that nobody but this connection sees, until it is closed."""
-    for table in given:
-        if isinstance(table, tuple):
-            show_recorded(connection, table[0])
-            interruptible(connection, partial(connection.execute, table[0], table[1] or None))
-            continue
-        columns = ", ".join(f"{quoted(name)} {kind}" for name, kind in table.types.items())
-        name = quoted(table.name)
-        connection.execute(f"CREATE OR REPLACE TEMP TABLE {name} ({columns})")
-        values = ", ".join(f"unnest(CAST(? AS {kind}[]))" for kind in table.types.values())
-        for block in table.blocks():
-            if len(block[0]):
-                connection.execute(f"INSERT INTO {name} SELECT {values}", list(block))
