@@ -544,7 +544,7 @@ class Matches(Tabular):
         return {"sql": sql, "parameters": values, "given": [*matches, *before]}
 
     def _blocks(self, gathered: Gathered) -> Iterator[list[list[Any]]]:
-        steps = Windows(extents(self._ready.catalog), whole_traces=True)
+        steps = Windows(sorted(extents(self._ready.catalog)), first=LAST_WINDOW, whole_traces=True)
         for window in steps:
             for block in steps.parts(window, gathered.block):
                 steps.rows += len(block[0])
