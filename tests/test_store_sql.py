@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from contextlib import nullcontext
 from importlib.util import find_spec
@@ -279,3 +280,37 @@ def test_what_a_question_was_given_is_given_again(
     _Faulty(monkeypatch, times=1)
     given = GivenTable("mine", {"n": "INTEGER"}, lambda: iter([[[1, 2]], [[3]]]))
     assert alone.rows("SELECT sum(n) FROM mine", given=[given]).values == [(6,)]
+
+
+GIVEN = {
+    "whole": ("BIGINT", [1 << 62, None, -7]),
+    "real": ("DOUBLE", [0.1, None, math.inf]),
+    "whole as real": ("DOUBLE", [1, 2, 3]),
+    "not a number": ("DOUBLE", [1.5, math.nan, None]),
+    "truth": ("BOOLEAN", [True, None, False]),
+    "text": ("VARCHAR", [None, "é", "12"]),
+    "nothing is known": ("DOUBLE", [None, None, None]),
+    "texts": ("VARCHAR", [None, None, None]),
+    "short": ("INTEGER", [1, None, 3]),
+}
+
+
+@pytest.mark.parametrize(
+    "names", [*((name,) for name in GIVEN), ("whole", "real", "truth", "text")]
+)
+def test_a_table_that_is_given_holds_the_values_of_its_blocks(
+    store: StoreFile, names: tuple[str, ...]
+) -> None:
+    block = [GIVEN[name][1] for name in names]
+    given = GivenTable("mine", {n: GIVEN[n][0] for n in names}, lambda: iter([block, block]))
+    as_real = [GIVEN[name][0] == "DOUBLE" for name in names]
+    expected = [
+        tuple(
+            float(v) if real and v is not None else v for v, real in zip(row, as_real, strict=True)
+        )
+        for row in zip(*block, strict=True)
+    ]
+
+    found = store.rows("FROM mine", given=[given]).values
+
+    assert repr(found) == repr(expected * 2)  # NaN is not equal to itself
