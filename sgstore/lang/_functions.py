@@ -191,8 +191,10 @@ def _ttc_lane(e: s.Call, names: SymbolTable) -> b.Bound:
 
 
 def _refuse_sort(e: s.Call, names: SymbolTable) -> None:
-    """Refuse ``lane_dist(e, junction)``, which is what one would write before one has seen the page."""
+    """Refuse ``lane_dist(e, next junction)``, which is what one would write before one has seen the page."""
     one, other = e.arguments
+    if isinstance(other, s.Temporal) and other.word == "NEXT":
+        (other,) = other.operands
     sorts = {normalize_name(sort): function for function, sort in NEXT_PARTS.items()}
     if isinstance(other, s.Variable) and (sort := normalize_name(other.name)) in sorts:
         try:
