@@ -719,6 +719,7 @@ def test_graphs_to_learn_from_are_those_of_the_abstraction(
     export: Export, written: Callable[..., Path]
 ) -> None:
     data = GraphData(written("pyg"))
+    assert data.about["format"] == "sgstore.graphs"
     lanes = {"Left Lane": "lane", "Middle Lane": "lane", "Right Lane": "lane", "Root Road": "road"}
 
     assert data.about["node_types"] == list(ACTORS)

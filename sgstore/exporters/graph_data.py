@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 ABOUT: Final = "graphs.json"
 FOLDER: Final = "graphs"
 ENTITIES: Final = "entities.jsonl"
-FORMAT: Final = "sgstore.derive"
+FORMAT: Final = "sgstore.graphs"
 VERSION: Final = 1
 
 _COLUMNS: Final = (
