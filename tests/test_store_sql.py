@@ -282,6 +282,17 @@ def test_what_a_question_was_given_is_given_again(
     assert alone.rows("SELECT sum(n) FROM mine", given=[given]).values == [(6,)]
 
 
+@pytest.mark.parametrize("table", ["frame", "state", "edge"])
+def test_who_asks_for_a_table_beneath_the_views_is_told_of_the_views(
+    store: StoreFile, table: str
+) -> None:
+    with pytest.raises(
+        SqlError, match=r"does not exist!\nThe views are frames, nodes, edges, "
+    ) as told:
+        store.user_sql(f"SELECT * FROM {table}")
+    assert "inside" not in str(told.value)
+
+
 GIVEN = {
     "whole": ("BIGINT", [1 << 62, None, -7]),
     "real": ("DOUBLE", [0.1, None, math.inf]),

@@ -21,7 +21,7 @@ from sgstore.files import without_controls, working_folder, written_at, written_
 from sgstore.quoting import literal, quoted
 from sgstore.store._given import Given, give
 from sgstore.store._locking import EngineError, engine_fault, spill_fault
-from sgstore.store._schema import INSIDE
+from sgstore.store._schema import INSIDE, expected
 from sgstore.store._steps import interrupt, interruptible
 
 if TYPE_CHECKING:
@@ -47,6 +47,9 @@ IN_NOTEBOOK: Final = 20
 
 MAX_SQL: Final = 1 << 20
 """Longest statement of a user; characters."""
+
+_TO_A_TABLE: Final = re.compile(rf'Did you mean "{INSIDE}\.\w+"\?')
+"""What the database says of a name that it does not know: the tables beneath the views are nobody's to ask."""
 
 _READS: Final = {"SELECT", "EXPLAIN"}
 """Types of statements that only read: WITH, FROM, VALUES, TABLE, DESCRIBE, SHOW and SUMMARIZE are SELECT."""
@@ -439,7 +442,8 @@ def _refused(sql: str, timeout_s: float | None) -> Generator[None]:
         message = spill_fault(str(error)) or str(error).strip()
         if "pytz" in message:  # before DuckDB 2.0.1
             message = "times with a time zone cannot be shown; cast them: now()::TIMESTAMP"
-        raise SqlError(message) from error
+        views = f"The views are {', '.join(expected().views)}."
+        raise SqlError(_TO_A_TABLE.sub(views, message)) from error
 
 
 def _shown(sql: str) -> str:
