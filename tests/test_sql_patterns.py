@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from oracle_over_time import worlds
 
+import sgstore
 from sgstore.cli import run as run_verb
 from sgstore.errors import QueryError, SqlError
 from sgstore.lang import pattern_tables
@@ -90,6 +91,22 @@ def test_a_table_of_a_pattern_lasts_as_long_as_its_statement(store: Store) -> No
         store.sql("SELECT * FROM sgql")
     with pytest.raises(SqlError, match="edge does not exist"):
         store.sql("SELECT count(*) FROM edge, sgql('MATCH (e:Ego)')")
+
+
+@pytest.mark.parametrize("name", ["block", "given", "gathered", "found"])
+def test_a_table_of_ones_own_may_have_any_name_beside_a_pattern(
+    name: str, store: Store, tmp_path: Path
+) -> None:
+    file = tmp_path / "mine.csv"
+    file.write_text("trace,n\n" + "".join(f"{one.name},5\n" for one in store.traces()))
+    pattern = "sgql('MATCH (e:Ego) WHERE prev(e.speed) > 0.5 RETURN INTERVALS')"
+    own = sgstore.open(store.file.path, tables={name: file})
+    expected = store.sql(f"SELECT 5, count(*) FROM {pattern}").values
+
+    for _ in range(2):
+        found = own.sql(f"SELECT (SELECT max(n) FROM {name}), count(*) FROM {pattern}").values
+        assert found == expected
+    assert expected[0][1] > 0
 
 
 def test_the_same_pattern_is_asked_once() -> None:

@@ -50,19 +50,30 @@ def give(connection: DuckDBPyConnection, given: Iterable[Given]) -> None:
             interruptible(connection, partial(connection.execute, table[0], table[1] or None))
             continue
         columns = ", ".join(f"{quoted(name)} {kind}" for name, kind in table.types.items())
-        name, kinds = quoted(table.name), [*table.types.values()]
-        connection.execute(f"CREATE OR REPLACE TEMP TABLE {name} ({columns})")
-        values = ", ".join(f"unnest(CAST(? AS {kind}[]))" for kind in kinds)
+        connection.execute(f"CREATE OR REPLACE TEMP TABLE {quoted(table.name)} ({columns})")
         for block in table.blocks():
-            if not len(block[0]):
-                continue
-            arrays = _arrays_of(block, kinds)
-            if arrays is None:
-                connection.execute(f"INSERT INTO {name} SELECT {values}", list(block))
-            else:
-                connection.register("block", arrays)
-                connection.execute(f"INSERT INTO {name} FROM block")
-                connection.unregister("block")
+            if len(block[0]):
+                _insert(connection, quoted(table.name), block, [*table.types.values()])
+
+
+_BLOCK: Final = ":block"
+"""The name of the rows on their way; no table of a user's is called so."""
+
+
+def _insert(
+    connection: DuckDBPyConnection, name: str, block: Sequence[list[Any]], kinds: Sequence[str]
+) -> None:
+    """Insert the rows of a block, as arrays where these hold all of its values."""
+    arrays = _arrays_of(block, kinds)
+    if arrays is None:
+        values = ", ".join(f"unnest(CAST(? AS {kind}[]))" for kind in kinds)
+        connection.execute(f"INSERT INTO {name} SELECT {values}", list(block))
+        return
+    connection.register(_BLOCK, arrays)
+    try:
+        connection.execute(f"INSERT INTO {name} FROM {quoted(_BLOCK)}")
+    finally:
+        connection.unregister(_BLOCK)
 
 
 _NUMBERS: Final[Mapping[str, tuple[str, object]]] = {
