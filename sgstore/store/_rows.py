@@ -442,8 +442,11 @@ def _refused(sql: str, timeout_s: float | None) -> Generator[None]:
         message = spill_fault(str(error)) or str(error).strip()
         if "pytz" in message:  # before DuckDB 2.0.1
             message = "times with a time zone cannot be shown; cast them: now()::TIMESTAMP"
-        views = f"The views are {', '.join(expected().views)}."
-        raise SqlError(_TO_A_TABLE.sub(views, message)) from error
+        raise SqlError(_TO_A_TABLE.sub(_views, message)) from error
+
+
+def _views(_: re.Match[str]) -> str:
+    return f"The views are {', '.join(expected().views)}."
 
 
 def _shown(sql: str) -> str:
