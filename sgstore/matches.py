@@ -754,7 +754,7 @@ class Windows:
     """Ranges of buckets, trace after trace; ``None`` (all) for a small store.
 
     Each is longer than the one before, unless that had so many rows that it would have too many. A range is a
-    part of one trace, or several whole traces: these may have others between them, for ids follow no order.
+    part of one trace, or several whole ones: with others between them, unless all come by id, as is fastest.
 
     Parameters
     ----------

@@ -191,7 +191,7 @@ def _ttc_lane(e: s.Call, names: SymbolTable) -> b.Bound:
 
 
 def _refuse_sort(e: s.Call, names: SymbolTable) -> None:
-    """Refuse ``lane_dist(e, next junction)``, which is what one would write before one has seen the page."""
+    """Refuse ``lane_dist(e, junction)`` and ``next junction``, as one writes before one has seen the page."""
     one, other = e.arguments
     if isinstance(other, s.Temporal) and other.word == "NEXT":
         (other,) = other.operands

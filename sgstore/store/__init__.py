@@ -3,8 +3,7 @@
 Reading: ``_file`` is the face, :class:`StoreFile`. ``_locking`` lets readers and writers share the file,
 and ``_schema`` compares it with ``schema.sql`` before anything is read. ``_rows`` runs statements, users'
 too, and makes tables and files of their rows; ``_given`` has tables that they are given, and ``_steps``
-lets a signal end them. ``_traces`` finds traces
-and frames by their names, ``_graphs`` reads graphs,
+lets a signal end them. ``_traces`` finds traces and frames by their names, ``_graphs`` reads graphs,
 ``_catalog`` tells the compiler of queries what there is, ``_joins`` brings users' own tables beside
 the store, ``_encounters`` has measures of what was recorded later, and ``_contents`` makes digests
 of frames.
