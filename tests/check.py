@@ -38,7 +38,7 @@ TESTS = {
     "exporters": "exports exports_docs export_*",
     "files": "outputs folders moved",
     "geometry": "geometry",
-    "ingest": "ingest ingest_*",
+    "ingest": "ingest ingest_* cases",
     "lang": "lang_* cookbook textmate tck union second_match sql_patterns needs notes library library_data"
     " zones like tolerance",
     "map_files": "cli_map lanelet2 sumo",
@@ -55,7 +55,7 @@ TESTS = {
     "quoting": "user_tables",
     "readers": "osi osi_* carla carla_* carlasgg autoware foxglove commonroad sumo cdr flavours",
     "rebuild": "rebuilding",
-    "relations": "relations relations_*",
+    "relations": "relations relations_* motion",
     "roads": "roads roads_* lane_dist lane_places lane_courses roundabouts",
     "schema": "schema views views_page open_names",
     "segments": "ingest ingest_many",
