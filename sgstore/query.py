@@ -818,7 +818,8 @@ class Store:
                 graph.nodes[node].update(zip(constants.columns[1:], values, strict=True))
         events = events_in(query, frame.frame_id, lambda sql, at: self.file.rows(sql, at).values)
         later = partial(measured, self.file.rows, frame.trace_id)
-        return FrameView(graph, about, whole, classes, roles, events, later)
+        view = FrameView(graph, about, whole, classes, roles, events, later)
+        return view.in_world() if query.world else view
 
 
 def matches_of(

@@ -50,6 +50,8 @@ from ._formulas import recorded_events as recorded_events
 from ._formulas import told_events as told_events
 from ._sql_ways import told_lanes as told_lanes
 from ._functions import FUNCTIONS as FUNCTIONS
+from ._horizon import Horizon as Horizon
+from ._horizon import horizon as horizon
 from ._needs import MOTION as MOTION
 from ._needs import Need as Need
 from ._needs import of_check as of_check

@@ -5,6 +5,7 @@ Everything that can be the user's fault is found here or in the parser, before a
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -47,8 +48,22 @@ if TYPE_CHECKING:
     from sgstore.lang.syntax import QuantifierClause, Statement
 
 
-SETTINGS: Final = ("NODES", "EGO", "UNKNOWN", "ABSTRACTION", "DATASET", "MATCHES", "GAPS", "END")
+SETTINGS: Final = (
+    "NODES",
+    "EGO",
+    "UNKNOWN",
+    "ABSTRACTION",
+    "DATASET",
+    "MATCHES",
+    "GAPS",
+    "END",
+    "SCOPE",
+    "RANGE",
+)
 """What may stand after ``USING``."""
+
+SCOPES: Final = ("graph", "world")
+"""What a statement is about: the graphs alone, or all that is known around."""
 
 
 def bind_query(
@@ -82,6 +97,8 @@ def bind_query(
         session.refuse("USING END belongs to CHECK", match.settings[0].span)
     if settings.gaps == "unknown":
         session.refuse("USING GAPS unknown belongs to CHECK", match.settings[0].span)
+    if settings.range is not None:
+        session.refuse("USING RANGE belongs to CHECK", match.settings[0].span)
     query = _of_match(match, session)
     refuse_unused(session)
     refuse_strange(session, catalog)
@@ -93,6 +110,7 @@ def bind_query(
         unknown_is_false=settings.unknown_is_false,
         policy=settings.policy or "all",
         gaps=settings.gaps or "break",
+        world=settings.scope == "world",
     )
 
 
@@ -214,6 +232,8 @@ class UsingChoice:
     policy: str | None = None
     gaps: str | None = None
     end: str | None = None
+    scope: str | None = None
+    range: float | None = None
 
 
 def chosen(settings: Sequence[s.Setting], session: Session, catalog: Catalog) -> UsingChoice:
@@ -234,6 +254,8 @@ def chosen(settings: Sequence[s.Setting], session: Session, catalog: Catalog) ->
             if value not in egos and not catalog.part:
                 session.unknown("ego", value, setting.span, egos)
             found.ego = value
+        elif name == "range":
+            found.range = _metres(value, setting, session)
         elif name == "dataset":
             asked(value, setting.span, session)
         elif name == "abstraction":
@@ -251,6 +273,7 @@ _CHOICES: Final = {
     "matches": ("all", "first", "longest"),
     "gaps": ("break", "bridge", "unknown"),
     "end": ("strong", "weak", "pending"),
+    "scope": SCOPES,
 }
 
 
@@ -268,8 +291,23 @@ def _choose(found: UsingChoice, setting: s.Setting, value: str, session: Session
             found.policy = word
         case "gaps":
             found.gaps = word
+        case "scope":
+            found.scope = word
         case _:
             found.end = word
+
+
+def _metres(value: str, setting: s.Setting, session: Session) -> float:
+    """Return how far a check looks."""
+    try:
+        metres = float(value)
+    except ValueError:
+        metres = -1.0
+    if not 0 <= metres < math.inf:
+        session.refuse(
+            f"USING RANGE {value} is no distance", setting.span, "metres: USING RANGE 200"
+        )
+    return metres
 
 
 def _setting_value(setting: s.Setting, session: Session) -> str:
@@ -441,6 +479,7 @@ def _edge(edge: s.EdgePattern, left: str, right: str, names: SymbolTable) -> str
             high,
             edge.name is not None,
             edge.span,
+            known=names.scope.parent is not None,
         )
     )
     return key
@@ -828,6 +867,8 @@ def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog)
         settings.gaps or "break",
         written.robustness,
         returns,
+        world=settings.scope != "graph",
+        range=settings.range,
     )
 
 

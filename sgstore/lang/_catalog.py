@@ -11,6 +11,7 @@ its constants in ``entity``; a static entity has everything in ``entity``, a par
 
 from __future__ import annotations
 
+import math
 from dataclasses import field, replace
 from enum import StrEnum
 from functools import cache
@@ -611,6 +612,8 @@ class TraceFacts:
         Median time between two frames.
     extent : (int, int)
         Its first bucket, and how many follow from there on.
+    known : float
+        How far around the ego all is known that was recorded; m. Infinite where nothing was left out.
     """
 
     trace_id: int
@@ -620,6 +623,7 @@ class TraceFacts:
     reach: RelationScope | None = None
     period_ns: int = 0
     extent: tuple[int, int] = (0, 0)
+    known: float = math.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -674,6 +678,13 @@ class Catalog:
         Those that the abstraction has; ``None``: all.
     shadows : tuple of (str, str)
         Tables that are others under the abstraction, and what they are there.
+    beyond : tuple of (str, str)
+        Tables that are others in scope ``world``, and what they are there; none where nothing is known beyond
+        the graphs.
+    beyond_edges : mapping of Triple to int
+        Rows of table ``world_edge``, as ``edges``.
+    world : bool
+        Whether this is the catalog in scope ``world``.
     only : frozenset of int or None
         The traces that are asked; ``None``: all.
     tables : mapping of str to TableFacts
@@ -708,6 +719,9 @@ class Catalog:
     name: str = ""
     relations: frozenset[str] | None = None
     shadows: tuple[tuple[str, str], ...] = ()
+    beyond: tuple[tuple[str, str], ...] = ()
+    beyond_edges: Mapping[Triple, int] = field(default_factory=dict[Triple, int])
+    world: bool = False
     only: frozenset[int] | None = None
     tables: Mapping[str, TableFacts] = field(default_factory=dict[str, TableFacts])
     sets: Mapping[str, Callable[[Catalog], Catalog]] = field(
@@ -730,6 +744,16 @@ class Catalog:
         if not found and self.part:
             return replace(self, name=abstraction, only=frozenset())
         return found[-1](self) if found else None
+
+    def in_world(self) -> Catalog:
+        """Return the catalog in scope ``world``; the same where nothing is known beyond the graphs."""
+        if not self.beyond or self.world:
+            return self
+        edges = dict(self.edges)
+        for triple, many in self.beyond_edges.items():
+            edges[triple] = edges.get(triple, 0) + many
+        shadows = (*(dict(self.shadows) | dict(self.beyond)).items(),)
+        return replace(self, shadows=shadows, edges=edges, world=True)
 
 
 def attributes_of(catalog: Catalog) -> dict[str, list[Attribute]]:

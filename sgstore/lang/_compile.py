@@ -801,17 +801,19 @@ def compile_checks(
 
 
 def _seen(statements: Sequence[object], catalog: Catalog, parameters: Mapping[str, Any]) -> Catalog:
-    """The catalog of the abstraction that a query names and of its dataset, if they are known."""
-    seen = catalog
+    """The catalog of the abstraction, the dataset and the scope that a query names, if they are known."""
+    seen, world = catalog, any(isinstance(one, CheckClause) for one in statements)
     for statement in statements:
         for setting in (
             statement.settings if isinstance(statement, MatchClause | CheckClause) else ()
         ):
             value = setting.value
             name = value if isinstance(value, str) else str(parameters.get(value.name, ""))
-            if normalize_name(setting.name) == "abstraction":
+            if normalize_name(setting.name) == "scope":
+                world = name.lower() == "world"
+            elif normalize_name(setting.name) == "abstraction":
                 seen = replace(catalog.under(name) or catalog, only=seen.only)
             elif normalize_name(setting.name) == "dataset":
                 only = traces_in(name, catalog.traces, catalog.tables, part=catalog.part)
                 seen = replace(seen, only=only)
-    return seen
+    return seen.in_world() if world else seen

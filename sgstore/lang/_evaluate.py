@@ -10,7 +10,7 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field
+from dataclasses import field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -61,6 +61,9 @@ class FrameView:
         what the graph says.
     recorded : callable, optional
         Gives a measure of what was recorded later, of two nodes. Without it none is known.
+    drawn : SceneGraph, optional
+        The graph of the frame, if ``graph`` is all that is known of the world around it; edges of patterns are
+        those of the graph.
     """
 
     graph: SceneGraph
@@ -70,6 +73,23 @@ class FrameView:
     roles: Callable[[], Mapping[int, str]] | None = None
     events: Mapping[str, Sequence[NodePair]] | None = None
     recorded: Callable[[str, int, int], float | None] | None = None
+    drawn: SceneGraph | None = None
+
+    def in_world(self) -> FrameView:
+        """Return the same frame in scope ``world``: with all that is known beyond its graph."""
+        known = getattr(self.graph, "known", lambda: self.graph)()
+        if known is self.graph:
+            return self
+        return replace(self, graph=known, drawn=self.graph)
+
+    def linked(self, edge: b.Edge) -> FrameView:
+        """Return whose edges an edge is one of: the graph's, or, of one in braces, all that are known."""
+        return self if self.drawn is None or edge.known else self._drawn
+
+    @cached_property
+    def _drawn(self) -> FrameView:
+        assert self.drawn is not None  # noqa: S101 - it is asked only then
+        return FrameView(self.drawn)
 
     @cached_property
     def nodes(self) -> Mapping[int, Attributes]:

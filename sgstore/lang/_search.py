@@ -179,7 +179,7 @@ class ScopeSearch:
         """Tell whether so many edges lead from one node to another; nodes on the way differ, if nodes do."""
         if length == 0:
             return here == dst
-        for step in _steps(view, edge.relations, here, both=edge.both):
+        for step in _steps(view.linked(edge), edge.relations, here, both=edge.both):
             if self._injective and length > 1 and (step in seen or step == dst):
                 continue
             if self._walks(view, edge, step, dst, length - 1, (*seen, step)):
@@ -242,7 +242,8 @@ def _candidates(at: Binding, step: _SearchStep) -> Iterator[int]:
     if edge is not None:
         forward = edge.dst == step.key
         here = at.nodes[edge.src if forward else edge.dst]
-        yield from _steps(view, edge.relations, here, both=edge.both, forward=forward)
+        linked = view.linked(edge)
+        yield from _steps(linked, edge.relations, here, both=edge.both, forward=forward)
     elif not step.kinds.other:
         if view.graph.ego is not None and view.graph.ego in view.nodes:
             yield view.graph.ego
@@ -275,9 +276,10 @@ def _steps(
 def _between(at: Binding, edge: Edge) -> Iterator[tuple[str, Attributes]]:
     """Relation and attributes of the edges between two bound nodes, each relation once."""
     src, dst = at.nodes[edge.src], at.nodes[edge.dst]
-    found = dict(at.view.links.get((src, dst), {}))
+    links = at.view.linked(edge).links
+    found = dict(links.get((src, dst), {}))
     if edge.both:
-        found = {**at.view.links.get((dst, src), {}), **found}
+        found = {**links.get((dst, src), {}), **found}
     for relation, attributes in found.items():
         if relation in edge.relations:
             yield relation, attributes

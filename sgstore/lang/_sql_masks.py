@@ -269,8 +269,9 @@ class Base:
         Whether a binding may come in several rows whose masks overlap.
     knows_map : bool
         Whether the row of the bucket is joined, which knows the map.
-    stops : list of str
-        Columns of nodes on the way that must be present, too; NULL where a way has fewer.
+    stops : list of (str, str)
+        Columns of nodes on the way that must be present, too, and tables that say so; NULL where a way has
+        fewer.
     several : set of str
         Edges of several relations: without their relation, a binding may come in several rows.
     kinds : dict of str to str
@@ -285,7 +286,7 @@ class Base:
     present: set[str] = field(default_factory=set[str])
     repeats: bool = False
     knows_map: bool = False
-    stops: list[str] = field(default_factory=list[str])
+    stops: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
     several: set[str] = field(default_factory=set[str])
     kinds: dict[str, str] = field(default_factory=dict[str, str])
 
@@ -350,6 +351,14 @@ class SqlBuilder:
     def standing(self) -> frozenset[str]:
         """Kinds of what is present by masks: static entities and parts of the map."""
         return self.catalog.fixed | self.catalog.mapped
+
+    def edges_of(self, edge: Edge) -> str:
+        """Return the table of the edges of frames that an edge is looked up in: those known, or of graphs."""
+        return '"known_edge"' if self.catalog.world and edge.known else '"edge"'
+
+    def nodes_of(self, edge: Edge) -> str:
+        """Return the table of what stands, of which an edge of the map takes its ends."""
+        return '"graph_node"' if self.catalog.world and not edge.known else '"node"'
 
     def found_in(self, scope: Scope) -> SharedRelation | None:
         """Matches of a scope, if they are known already."""
@@ -536,7 +545,9 @@ def _join_edge(sql: SqlBuilder, base: Base, scope: Scope, edge: Edge) -> None:
         base.repeats = True
         on = [f'{alias}."map_id" = {BUCKET}."map_id"']
         base.tie(f"{quoted(sql.share(ways, 'ways'))} AS {alias}", ends, on)
-        base.stops += [f'{alias}."stop {number}"' for number in range(1, edge.high)]
+        _join_graph_nodes(sql, base, edge, ends)
+        nodes = sql.nodes_of(edge)
+        base.stops += [(f'{alias}."stop {number}"', nodes) for number in range(1, edge.high)]
     elif edge.high > 1:
         base.repeats = True
         base.join(nested(_paths(sql, scope, edge), alias[1:-1]), alias, ends)
@@ -552,8 +563,18 @@ def _join_edge(sql: SqlBuilder, base: Base, scope: Scope, edge: Edge) -> None:
             base.need_bucket()
             on.append(f'{alias}."map_id" = {BUCKET}."map_id"')
             base.tie(f'"map_edge" AS {alias}', ends, on)
+            _join_graph_nodes(sql, base, edge, ends)
         else:
-            base.join(f'"edge" AS {alias}', alias, ends, on)
+            base.join(f"{sql.edges_of(edge)} AS {alias}", alias, ends, on)
+
+
+def _join_graph_nodes(sql: SqlBuilder, base: Base, edge: Edge, ends: Mapping[str, str]) -> None:
+    """The frames in which both ends of an edge of a pattern are in the graph; without scope all are."""
+    if sql.nodes_of(edge) == '"node"':
+        return
+    for key in ends:
+        alias = quoted(f"{edge.key}:{key}")
+        base.join(f'"graph_node" AS {alias}', alias, {key: f'{alias}."node_id"'})
 
 
 def _join_happened(sql: SqlBuilder, base: Base, happened: Happened, name: str) -> None:
@@ -588,7 +609,7 @@ def _rows(sql: SqlBuilder, scope: Scope, edge: Edge, *, moving: bool, lasting: b
     for swapped in directions:
         if moving or not lasting:
             select = Select(_row_columns('"e"', '"e"."mask"', swapped=swapped))
-            select.join('"edge" AS "e"', [])
+            select.join(f'{sql.edges_of(edge)} AS "e"', [])
             select.where = edge_conditions(
                 sql.catalog, scope, edge, '"e"', moving=True, swapped=swapped
             )
@@ -608,7 +629,7 @@ def _lasting_rows(sql: SqlBuilder, scope: Scope, edge: Edge, *, swapped: bool) -
     select.join('"bucket" AS "b"', ['"b"."map_id" = "m"."map_id"'])
     for alias, end in (("p", "src"), ("q", "dst")):
         select.join(
-            f'"node" AS "{alias}"',
+            f'{sql.nodes_of(edge)} AS "{alias}"',
             [f'"{alias}"."bucket" = "b"."bucket"', f'"{alias}"."node_id" = "m"."{end}"'],
         )
     select.where = edge_conditions(sql.catalog, scope, edge, '"m"', moving=False, swapped=swapped)
@@ -876,17 +897,22 @@ def _masked(sql: SqlBuilder, base: Base, keep: Mapping[str, str]) -> str:
     return select.text()
 
 
-def _on_the_way(sql: SqlBuilder, join: Select, stops: list[str], keys: list[str]) -> str:
+def _on_the_way(
+    sql: SqlBuilder, join: Select, stops: list[tuple[str, str]], keys: list[str]
+) -> str:
     """The rows of a join, in those frames in which the nodes on the way are present; each key once."""
     names = [f"stop {number}" for number in range(1, len(stops) + 1)]
-    join.columns += [f"{stop} AS {quoted(name)}" for stop, name in zip(stops, names, strict=True)]
+    tables = {name: table for name, (_, table) in zip(names, stops, strict=True)}
+    join.columns += [
+        f"{stop} AS {quoted(name)}" for name, (stop, _) in zip(names, stops, strict=True)
+    ]
     found = Select(['":way"."bucket"', *(f'":way".{key}' for key in keys)])
     found.join(f'{quoted(sql.share(join.text(), "way"))} AS ":way"', [])
     mask = '":way"."mask"'
     for name in names:
         alias, node = quoted(f":{name}"), f'":way".{quoted(name)}'
         on = [f'{alias}."bucket" = ":way"."bucket"', f'{alias}."node_id" = {node}']
-        found.join(f'"node" AS {alias}', on, "LEFT JOIN")
+        found.join(f"{tables[name]} AS {alias}", on, "LEFT JOIN")
         mask += f' & CASE WHEN {node} IS NULL THEN -1 ELSE coalesce({alias}."mask", 0) END'
     found.where.append(f"({mask}) <> 0")
     found.group = list(found.columns)

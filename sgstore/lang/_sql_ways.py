@@ -152,7 +152,8 @@ def _stretches(frame: str, end: WayEnd, catalog: Catalog, *, parts: bool) -> str
             f' WHERE ":s"."frame_id" = {frame} AND ":s"."node_id" = {end.node} AND ":s"."is_own"{more}'
         )
     if kinds & _SIGNALS & held:
-        found.append(_controlled(frame, end.node, kinds & _SIGNALS & held))
+        edges = "known_edge" if catalog.world else "edge"
+        found.append(_controlled(frame, end.node, kinds & _SIGNALS & held, edges))
     if parts or kinds & _SIGNALS & catalog.mapped:
         signs = ", ".join(map(literal, (*SIGNALS, "stop_line")))
         more = "" if parts else f' AND ":p"."what" IN ({signs})'
@@ -166,12 +167,12 @@ def _stretches(frame: str, end: WayEnd, catalog: Catalog, *, parts: bool) -> str
     return "\n        UNION ALL ".join(found or [nowhere])
 
 
-def _controlled(frame: str, node: str, kinds: frozenset[str]) -> str:
+def _controlled(frame: str, node: str, kinds: frozenset[str], edges: str) -> str:
     """Places to wait on lanes that a light or a sign controls: as the map says, else at a junction."""
     at = """coalesce(":p"."start", CASE WHEN ":m"."junction" IS NOT NULL THEN 0 ELSE ":m"."length" END)"""
     signals = ", ".join(literal(kind) for kind in SIGNALS if kind in kinds)
     return f"""SELECT ":c"."dst" AS "lane", {at} AS "first", {at} AS "last"
-        FROM "edge" AS ":c" JOIN "bucket" AS ":g" ON ":g"."bucket" = ":c"."bucket"
+        FROM "{edges}" AS ":c" JOIN "bucket" AS ":g" ON ":g"."bucket" = ":c"."bucket"
           JOIN "map_node" AS ":m" ON ":m"."map_id" = ":g"."map_id" AND ":m"."node_id" = ":c"."dst"
           LEFT JOIN "map_place" AS ":p" ON ":p"."map_id" = ":g"."map_id" AND ":p"."lane" = ":c"."dst"
             AND ":p"."what" = CAST(":c"."src_kind" AS VARCHAR)

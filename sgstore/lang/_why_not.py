@@ -643,7 +643,7 @@ def _between(edge: b.Edge, at: Binding, writer: Writer) -> str:
     called = {src: writer.name(edge.src), dst: writer.name(edge.dst)}
     ways = []
     for one, other in ((src, dst), (dst, src)):
-        there = at.view.links.get((one, other), {})
+        there = at.view.linked(edge).links.get((one, other), {})
         if there:
             relations = "|".join(relation for relation in RELATIONS if relation in there)
             ways.append(f"({called[one]})-[:{relations}]->({called[other]})")

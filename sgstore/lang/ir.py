@@ -80,6 +80,9 @@ class Edge:
     named : bool
         Whether its relation is part of a match.
     span : TextSpan
+    known : bool
+        Whether it is asked of all that is known in the scope: it stands in braces. One of a pattern is an
+        edge of the graph in every scope.
     """
 
     key: str
@@ -91,6 +94,7 @@ class Edge:
     high: int
     named: bool
     span: TextSpan
+    known: bool = False
 
 
 # Expressions --------------------------------------------------------------------------------------
@@ -590,6 +594,8 @@ class Query:
         Whether a gap in the recording ends a run (``break``) or not (``bridge``).
     stages : tuple of MatchStage and WithStage
         Of a query with ``OPTIONAL MATCH``, ``WITH`` or a path with a name: its parts; the first is a pattern.
+    world : bool
+        Whether it is about all that is known of the world around, beyond the graphs, too.
     """
 
     scope: Scope
@@ -604,6 +610,7 @@ class Query:
     policy: str = "all"
     gaps: str = "break"
     stages: tuple[Stage, ...] = ()
+    world: bool = False
 
     @property
     def ways(self) -> tuple[StepWay, ...]:
@@ -845,6 +852,10 @@ class BoundCheck:
         Whether it is asked by how much the formula is true, or false.
     returns : tuple of ReturnColumn
         Values of each violation.
+    world : bool
+        As in :class:`Query`.
+    range : float or None
+        How far from the ego it looks, as it says; m. ``None``: as its formula says.
     """
 
     name: str
@@ -860,3 +871,5 @@ class BoundCheck:
     gaps: str = "break"
     robustness: bool = False
     returns: tuple[ReturnColumn, ...] = ()
+    world: bool = True
+    range: float | None = None

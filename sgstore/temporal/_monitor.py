@@ -261,13 +261,14 @@ class Monitor:
         checks, queries = _bound(text, catalog, parameters or {})
         self._egos: list[str] = []
         self._questions: list[QueryCache] = []
+        self._scopes: list[tuple[int, bool]] = []
         self._pulse = StreamClock(None if period_s is None else round(period_s * 1e9))
         self._last: FrameTime | None = None
         self._watches: list[tuple[int, CheckMonitor, _PendingEvents]] = []
         self._unknown: dict[str, str] = {}
         for check in checks:
             if check.relations <= answers or check.unknown_is_false:
-                ego, questions = self._of_ego(check.ego)
+                ego, questions = self._of_scope(check.ego, world=check.world)
                 watch = CheckMonitor(check, questions, self._pulse, compat=sgsm_compat)
                 self._watches.append((ego, watch, _PendingEvents(of_check(check))))
             else:
@@ -276,7 +277,7 @@ class Monitor:
         self._follows: list[tuple[int, SequenceMonitor, _PendingEvents]] = []
         for name, query in zip(_names(called, len(queries)), queries, strict=True):
             if query.relations <= answers or query.unknown_is_false:
-                ego, questions = self._of_ego(query.ego)
+                ego, questions = self._of_scope(query.ego, world=query.world)
                 waiting = _PendingEvents(of_query(query) if query.steps else ())
                 follow = sequence_monitor(name, query, questions, self._pulse)
                 self._follows.append((ego, follow, waiting))
@@ -287,12 +288,15 @@ class Monitor:
         seen = 0 if self._last is None else self._last.seq + 1
         return f"<Monitor of {', '.join(self.names)} after {seen} frames>"
 
-    def _of_ego(self, ego: str | None) -> tuple[int, QueryCache]:
-        """The number of an ego, and what is asked of its graphs."""
+    def _of_scope(self, ego: str | None, *, world: bool) -> tuple[int, QueryCache]:
+        """The number of an ego's graphs, alone or with the world around, and what is asked of them."""
         if (ego or "") not in self._egos:
             self._egos.append(ego or "")
+        scope = self._egos.index(ego or ""), world
+        if scope not in self._scopes:
+            self._scopes.append(scope)
             self._questions.append(QueryCache())
-        number = self._egos.index(ego or "")
+        number = self._scopes.index(scope)
         return number, self._questions[number]
 
     def step(self, frame: Frame) -> tuple[MonitorEvent, ...]:
@@ -336,8 +340,9 @@ class Monitor:
         tick, start = self._pulse.tick, self._pulse.start
         here = FrameTime(tick.number, tick.time, (tick.time - start) / 1e9)
         people: list[NodeNames] = []
-        for number, (graph, questions) in enumerate(zip(graphs, self._questions, strict=False)):
-            view = self._view(graph, here, number if classed else None)
+        for (number, world), questions in zip(self._scopes, self._questions, strict=True):
+            view = self._view(graphs[number], here, number if classed else None)
+            view = view.in_world() if world else view
             people.append(NodeNames(view))
             questions.ask(view, people[-1])
         return here, people

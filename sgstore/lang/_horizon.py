@@ -1,0 +1,374 @@
+"""The horizon of a check: how far around the ego a trace must know the world, so that its verdict is certain.
+
+Who is not known is in no binding. Of ``FORALL (v:Vehicle) ALWAYS dist(ego, v) > 5`` only vehicles up to 5 m
+count, so a trace that knows 50 m around the ego can answer. ``FORALL (v:Vehicle) ALWAYS v.speed < 50`` is about
+all vehicles: if one was left out, it may not be true, but it is false if one that is known is too fast.
+
+A condition bounds the place of an entity where it cannot hold farther away: a comparison of a distance, of a
+time to meet (by the greatest speed in the trace), of a safe distance; a relation that ends at some distance.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+from sgstore.lang import ir as b
+from sgstore.records import dataclass
+from sgstore.vocabulary import PROXIMITY, entity_kinds
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+
+    from sgstore.lang.ir import Bound, BoundCheck, Scope
+
+Interval = tuple[float, float]
+
+BODY: Final = 10.0
+"""Half lengths of two bodies, by which their centres are farther apart than their edges; m."""
+FASTEST: Final = 150.0
+"""What is said to be faster is not known; m/s."""
+_FAR: Final = 200.0 + BODY
+"""How far distances along the lanes are known; m."""
+_LINKS: Final = dict.fromkeys(PROXIMITY, 25.0 + BODY) | {
+    **dict.fromkeys(("leads", "follows"), 100.0 + BODY),
+    "overlaps": 2 * BODY,
+}
+"""Relations that end at some distance, by the usual settings; m."""
+
+
+@dataclass(frozen=True, slots=True)
+class Horizon:
+    """How far the world must be known; m.
+
+    Attributes
+    ----------
+    true, false : float
+        So that a check that is true, or false, of what is known is so of the whole world.
+    """
+
+    true: float = 0.0
+    false: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where an entity can be if something holds.
+
+    Attributes
+    ----------
+    away : float
+        The greatest distance from the ego; m.
+    along : float
+        The same along the axis of the ego, which is one for who is in its lane, or in one beside it.
+    lanes : bool
+        Whether lanes join it to the ego.
+    """
+
+    away: float = math.inf
+    along: float = math.inf
+    lanes: bool = False
+
+    @property
+    def reach(self) -> float:
+        """The greatest distance from the ego; m."""
+        return min(self.away, self.along) if self.lanes else self.away
+
+    def both(self, other: _Place) -> _Place:
+        """Where it can be if the one holds and the other, too."""
+        lanes = self.lanes or other.lanes
+        return _Place(min(self.away, other.away), min(self.along, other.along), lanes)
+
+    def either(self, other: _Place) -> _Place:
+        """Where it can be if one of the two holds."""
+        lanes = self.lanes and other.lanes
+        away = max(self.reach, other.reach)
+        return _Place(away, max(self.along, other.along), lanes)
+
+
+def horizon(check: BoundCheck, speed: float = FASTEST) -> Horizon:
+    """How far a check looks around the ego.
+
+    Parameters
+    ----------
+    check : BoundCheck
+    speed : float
+        That nothing in the trace exceeds; m/s.
+    """
+    egos = {key: 0.0 for key, node in check.scope.nodes.items() if not node.kinds.other}
+    asked = _Looking(egos, speed)
+    formulas = [check.formula, *(q.where for q in check.quantifiers if q.where is not None)]
+    found = Horizon()
+    for quantifier in check.quantifiers:
+        every = quantifier.word == "FORALL"
+        for key in quantifier.nodes:
+            if not check.scope.nodes[key].kinds.every & entity_kinds():
+                continue
+            where = asked.place(check.formula, key, wanted=not every)
+            if quantifier.where is not None:
+                where = where.both(asked.place(quantifier.where, key, wanted=True))
+            found = _farther(found, where.reach, true=every, false=not every)
+            asked.known[key] = where.reach
+    for formula in formulas:
+        for reach, true, false in asked.blocks(formula):
+            found = _farther(found, reach, true=true, false=false)
+    if check.range is not None:
+        found = Horizon(min(found.true, check.range), min(found.false, check.range))
+    return found
+
+
+def _farther(found: Horizon, reach: float, *, true: bool, false: bool) -> Horizon:
+    if true:
+        found = replace(found, true=max(found.true, reach))
+    return replace(found, false=max(found.false, reach)) if false else found
+
+
+@dataclass(slots=True)
+class _Looking:
+    """How far variables can be from the ego, and how fast things are, while a check is looked at."""
+
+    known: dict[str, float]
+    speed: float
+
+    # Which entities matter: those of blocks ------------------------------------------------------
+
+    def blocks(  # noqa: C901, PLR0912 - a case each
+        self, formula: Bound, *, up: bool = True
+    ) -> Iterable[tuple[float, bool, bool]]:
+        """Return how far one in braces can be, and whether the formula may be true, or false, for want of it.
+
+        ``up``: whether the formula makes the whole true where it is.
+        """
+        match formula:
+            case b.Operation("NOT", (one,)):
+                yield from self.blocks(one, up=not up)
+            case b.Operation("IMPLIES", (one, other)):
+                yield from self.blocks(one, up=not up)
+                yield from self.blocks(other, up=up)
+            case b.Operation("AND" | "OR", operands) | b.Tense(operands=operands):
+                for one in operands:
+                    yield from self.blocks(one, up=up)
+            case b.Operation(">" | ">=", (b.BlockValue(word="COUNT" | "EXISTS") as block, _)):
+                yield from self.of_block(block, up=up)
+            case b.Operation("<" | "<=", (b.BlockValue(word="COUNT" | "EXISTS") as block, _)):
+                yield from self.of_block(block, up=not up)
+            case b.Operation(">" | ">=", (b.SignalCall(word="run_length", operand=one), _)):
+                yield from self.blocks(one, up=up)
+            case b.BlockValue(word="EXISTS"):
+                yield from self.of_block(formula, up=up)
+            case _:
+                for part in b.walk(formula):
+                    if isinstance(part, b.BlockValue):
+                        for reach, _, _ in self.of_block(part, up=up):
+                            yield reach, True, True
+                    elif isinstance(part, b.SignalCall) and part is not formula:
+                        for reach, _, _ in self.blocks(part.operand, up=up):
+                            yield reach, True, True
+
+    def of_block(self, block: b.BlockValue, *, up: bool) -> Iterable[tuple[float, bool, bool]]:
+        """Return the same of a block; who is missed makes ``EXISTS`` false and ``COUNT`` less."""
+        scope = block.scope
+        for key, node in scope.nodes.items():
+            if node.kinds.every & entity_kinds() and node.kinds.other:
+                yield self.in_scope(scope, key).reach, not up, up
+        inner = _Looking(
+            self.known | {key: self.in_scope(scope, key).reach for key in scope.nodes}, self.speed
+        )
+        for part in block.inside:
+            yield from inner.blocks(part, up=up)
+
+    # Where an entity can be ----------------------------------------------------------------------
+
+    def in_scope(self, scope: Scope, key: str) -> _Place:
+        """Where a node of a pattern can be, or one that a block speaks of, if there is a match."""
+        found = _Place()
+        for part in scope.where:
+            found = found.both(self.place(part, key, wanted=True))
+        for edge in scope.edges:
+            ends = {edge.src, edge.dst}
+            if key in ends and edge.relations <= _LINKS.keys():
+                other = next(iter(ends - {key}), key)
+                reach = max(_LINKS[name] for name in edge.relations)
+                found = found.both(_Place(reach + self.known.get(other, math.inf)))
+        if _joined(scope, key, self.known):
+            found = found.both(_Place(lanes=True))
+        return found
+
+    def place(  # noqa: PLR0911 - a case each
+        self, formula: Bound, key: str, *, wanted: bool
+    ) -> _Place:
+        """Where a variable can be if a formula is true, or false, in some frame."""
+        match formula:
+            case b.Operation("NOT", (one,)):
+                return self.place(one, key, wanted=not wanted)
+            case b.Operation("IMPLIES", (one, other)):
+                parts = [
+                    self.place(one, key, wanted=not wanted),
+                    self.place(other, key, wanted=wanted),
+                ]
+                return _any(parts) if wanted else _all(parts)
+            case b.Operation("AND" | "OR" as word, operands):
+                parts = [self.place(one, key, wanted=wanted) for one in operands]
+                return _all(parts) if (word == "AND") == wanted else _any(parts)
+            case b.Tense(operands=operands):
+                return _any([self.place(one, key, wanted=wanted) for one in operands])
+            case b.Operation(">" | ">=", (b.SignalCall(word="run_length", operand=one), _)):
+                return self.place(one, key, wanted=wanted)
+            case b.Operation("<" | "<=", (b.SignalCall(word="run_length", operand=one), _)):
+                return self.place(one, key, wanted=not wanted)
+            case b.Operation(word, (one, other)) if word in _MIRRORED:
+                return self._compared(word if wanted else _COMPLEMENT[word], one, other, key)
+            case b.BlockValue(word="EXISTS", scope=scope) if wanted and key in scope.outer:
+                return self.in_scope(scope, key)
+            case b.Value(value=value) if value is not wanted and value is not None:
+                return _Place(0.0, 0.0)  # which never is
+            case _:
+                return _Place()
+
+    def _compared(self, word: str, one: Bound, other: Bound, key: str) -> _Place:
+        found = self._measured(word, one, other, key)
+        return found.both(self._measured(_MIRRORED[word], other, one, key))
+
+    def _measured(self, word: str, one: Bound, other: Bound, key: str) -> _Place:
+        """Where a variable can be if a number of it and the ego compares so with another."""
+        whole = isinstance(one, b.Operation) and one.word == "abs"
+        pair = one.operands[0] if isinstance(one, b.Operation) and whole else one
+        if not isinstance(pair, b.PairNumber) or key not in {pair.a, pair.b}:
+            return _Place()
+        from_ = self.known.get(pair.b if pair.a == key else pair.a, math.inf)
+        low, high = bounds(other, self.speed)
+        along = pair.function == "lon_gap" or (pair.function == "lon" and whole)
+        if along and word in {"<", "<=", "="}:
+            return _Place(along=from_ + high + BODY)
+        if pair.function == "lane_dist":
+            return _Place(from_ + _FAR)
+        reach = _SMALL.get(pair.function)
+        if reach is not None and word in {"<", "<=", "="}:
+            return _Place(from_ + reach(max(high, 0.0), self.speed))
+        braking = _BRAKING.get(pair.function)
+        least = low if braking is not None and braking > 0 else -high
+        wanted = {">", ">="} if braking is not None and braking > 0 else {"<", "<="}
+        if braking is None or word not in wanted or least <= 0:
+            return _Place()
+        return _Place(from_ + (2 * self.speed) ** 2 / (2 * least * abs(braking)) + BODY)
+
+
+def _all(places: list[_Place]) -> _Place:
+    found = _Place()
+    for one in places:
+        found = found.both(one)
+    return found
+
+
+def _any(places: list[_Place]) -> _Place:
+    found = places[0]
+    for one in places[1:]:
+        found = found.either(one)
+    return found
+
+
+def _joined(scope: Scope, key: str, known: Mapping[str, float]) -> bool:
+    """Tell whether edges of a pattern join a node with one that is near the ego, by way of lanes."""
+    reached, grown = {key}, True
+    while grown:
+        fresh = {
+            end
+            for edge in scope.edges
+            if {edge.src, edge.dst} & reached
+            for end in (edge.src, edge.dst)
+        } - reached
+        reached |= fresh
+        grown = bool(fresh)
+    return any(known.get(other, math.inf) < math.inf for other in reached - {key})
+
+
+_MIRRORED: Final = {"<": ">", "<=": ">=", ">": "<", ">=": "<=", "=": "=", "<>": "<>"}
+_COMPLEMENT: Final = {"<": ">=", "<=": ">", ">": "<=", ">=": "<", "=": "<>", "<>": "="}
+
+
+def _safe(margin: float, speed: float) -> float:
+    """The greatest safe distance of RSS, of two who come towards one another; m."""
+    fast = speed + 3.5
+    return margin + 2 * (speed + 1.75) + fast * fast / 6 + fast * fast / 8 + BODY
+
+
+_SMALL: Final[Mapping[str, Callable[[float, float], float]]] = {
+    "dist": lambda value, _: value,
+    "gap": lambda value, _: value + BODY,
+    "ttc": lambda value, speed: 2 * speed * value + BODY,
+    "closing_time": lambda value, speed: 2 * speed * value + BODY,
+    "headway": lambda value, speed: speed * value + BODY,
+    "wttc": lambda value, speed: 2 * speed * value + 11.5 * value * value + BODY,
+    "ttc_mild": lambda value, speed: 2 * speed * value + 4 * value * value + BODY,
+    "rss_margin": _safe,
+}
+"""Numbers that are small of who is near alone: how far one can be whose number is at most so large."""
+
+_BRAKING: Final = {"a_long_req": -1.0, "drac": 1.0, "btn": 11.5}
+"""Numbers that are large only of who is near: the deceleration that 1 of them is; m/s²."""
+
+
+# What values can be ------------------------------------------------------------------------------
+
+
+def bounds(value: Bound, speed: float) -> Interval:
+    """The least and the greatest that a number can be, given what nothing in the trace is faster than.
+
+    Parameters
+    ----------
+    value : Bound
+    speed : float
+        m/s.
+    """
+    match value:
+        case b.Value(value=int() | float() as number):
+            return float(number), float(number)
+        case b.NodeAttribute(attribute=attribute):
+            return _OF_NODE.get(attribute.name, lambda _: _ANY)(speed)
+        case b.PairNumber(function="closing_speed" | "rel_speed"):
+            return -2 * speed, 2 * speed
+        case b.Operation(word, operands) if word in _COMPUTED:
+            return _COMPUTED[word]([bounds(one, speed) for one in operands])
+        case _:
+            return _ANY
+
+
+_ANY: Final = (-math.inf, math.inf)
+_OF_NODE: Final[Mapping[str, Callable[[float], Interval]]] = {
+    "speed": lambda speed: (0.0, speed),
+    **dict.fromkeys(("vx", "vy"), lambda speed: (-speed, speed)),
+    **dict.fromkeys(("length", "width", "height"), lambda _: (0.0, 2 * BODY)),
+}
+
+
+def _product(parts: list[Interval]) -> Interval:
+    (a, b_), (c, d) = parts
+    found = [0.0 if 0 in (x, y) else x * y for x in (a, b_) for y in (c, d)]
+    return min(found), max(found)
+
+
+def _quotient(parts: list[Interval]) -> Interval:
+    (_, _), (low, high) = parts
+    if low <= 0 <= high:
+        return _ANY
+    return _product([parts[0], (1 / high, 1 / low)])
+
+
+def _absolute(parts: list[Interval]) -> Interval:
+    ((low, high),) = parts
+    least = 0.0 if low <= 0 <= high else min(abs(low), abs(high))
+    return least, max(abs(low), abs(high))
+
+
+_COMPUTED: Final[Mapping[str, Callable[[list[Interval]], Interval]]] = {
+    "+": lambda parts: (parts[0][0] + parts[1][0], parts[0][1] + parts[1][1]),
+    "-": lambda parts: (parts[0][0] - parts[1][1], parts[0][1] - parts[1][0]),
+    "*": _product,
+    "/": _quotient,
+    "negative": lambda parts: (-parts[0][1], -parts[0][0]),
+    "abs": _absolute,
+    "min": lambda parts: (min(low for low, _ in parts), min(high for _, high in parts)),
+    "max": lambda parts: (max(low for low, _ in parts), max(high for _, high in parts)),
+    "coalesce": lambda parts: (min(low for low, _ in parts), max(high for _, high in parts)),
+}

@@ -1,0 +1,83 @@
+"""What a trace knows around its ego, against what a check needs to know."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+from sgstore.lang import Horizon, horizon
+from sgstore.records import dataclass
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from sgstore.lang import Catalog
+    from sgstore.lang.ir import BoundCheck
+    from sgstore.store import StoreFile
+
+
+_SPEEDS: Final = """
+SELECT frame_id >> 24 AS trace_id, max(speed) AS speed FROM known_state GROUP BY ALL
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class ShortRange:
+    """Why a trace that knows too little cannot tell that a check is true, or false; empty: it can.
+
+    Attributes
+    ----------
+    true, false : str
+    """
+
+    true: str = ""
+    false: str = ""
+
+    def of(self, *, holds: bool) -> str:
+        """The reason why a verdict is unknown that were true, or false, of what is known."""
+        return self.true if holds else self.false
+
+
+def short_ranges(file: StoreFile, catalog: Catalog, check: BoundCheck) -> Mapping[int, ShortRange]:
+    """The traces that know less of the world around than a check needs, by id.
+
+    Parameters
+    ----------
+    file : StoreFile
+    catalog : Catalog
+        That the check was bound to.
+    check : BoundCheck
+    """
+    limited = [trace for trace in catalog.traces if trace.known < math.inf]
+    if check.unknown_is_false or not _any_short(horizon(check), [t.known for t in limited]):
+        return {}
+    fastest = dict(file.rows(_SPEEDS).values)
+    found: dict[int, ShortRange] = {}
+    for trace in limited:
+        needed = horizon(check, fastest.get(trace.trace_id) or 0.0)
+        if _any_short(needed, [trace.known]):
+            found[trace.trace_id] = short_range(needed, trace.known)
+    return found
+
+
+def _any_short(needed: Horizon, known: list[float]) -> bool:
+    return bool(known) and max(needed.true, needed.false) > min(known)
+
+
+def short_range(needed: Horizon, known: float) -> ShortRange:
+    """Return what a trace that knows so much around its ego cannot tell.
+
+    Parameters
+    ----------
+    needed : Horizon
+    known : float
+        m.
+    """
+
+    def reason(metres: float) -> str:
+        if metres <= known:
+            return ""
+        far = "everything" if metres == math.inf else f"{math.ceil(metres)} m"
+        return f"it depends on {far} around the ego, and the trace knows {known:g} m"
+
+    return ShortRange(reason(needed.true), reason(needed.false))

@@ -1,0 +1,116 @@
+"""How far a check looks around the ego, told from its text."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from sgstore.errors import QueryError
+from sgstore.lang import Catalog, Horizon, compile_checks, compile_query, horizon, ir
+from sgstore.temporal._known_range import short_range
+
+
+def looked(text: str, speed: float = 30.0) -> Horizon:
+    (found,) = compile_checks(text, Catalog())
+    return horizon(found.check, speed)
+
+
+@pytest.mark.parametrize(
+    ("formula", "metres"),
+    [
+        ("ALWAYS NOT dist(ego, v) < 5", 5),
+        ("ALWAYS dist(ego, v) >= 7", 7),
+        ("ALWAYS 7 <= dist(ego, v)", 7),
+        ("ALWAYS (dist(ego, v) > 4 OR dist(ego, v) > 9)", 4),
+        ("ALWAYS (dist(ego, v) > 4 AND dist(ego, v) > 9)", 9),
+        ("ALWAYS (dist(ego, v) < 20 IMPLIES v.speed < 8)", 20),
+        ("ALWAYS NOT (v.speed > 8 AND dist(ego, v) < 12)", 12),
+        ("ALWAYS NOT dist(ego, v) < 2 * ego.speed", 60),
+        ("ALWAYS NOT dist(ego, v) < max(3, ego.speed / 2 + 1)", 16),
+        ("ALWAYS NOT gap(ego, v) <= 0", 10),
+        ("ALWAYS NOT ttc(ego, v) < 2", 2 * 2 * 30 + 10),
+        ("ALWAYS NOT headway(ego, v) < 1", 30 + 10),
+        ("ALWAYS NOT EXISTS {(ego)-[:near]->(v)}", 35),
+        ("ALWAYS (lead(ego, v) IMPLIES v.speed > 3)", 110),
+        ("ALWAYS (same_lane(ego, v) IMPLIES lon_gap(ego, v) > 3 * ego.speed)", 3 * 30 + 10),
+        ("ALWAYS (lon_gap(ego, v) > 3 * ego.speed)", math.inf),
+        ("ALWAYS NOT run_length(dist(ego, v) < 6) >= 3frames", 6),
+        ("ALWAYS v.speed < 50", math.inf),
+        ("ALWAYS NOT same_lane(ego, v)", math.inf),
+    ],
+)
+def test_who_is_asked_for_by_every_is_looked_for_so_far(formula: str, metres: float) -> None:
+    assert looked(f"CHECK FORALL (v:Vehicle) {formula}") == Horizon(metres, 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "true", "false"),
+    [
+        ("CHECK ALWAYS ego.speed < 20", 0, 0),
+        ("CHECK FORSOME (v:Vehicle) EVENTUALLY dist(ego, v) < 5", 0, 5),
+        ("CHECK ALWAYS EXISTS {(v:Vehicle) WHERE dist(ego, v) < 30}", 0, 30),
+        ("CHECK ALWAYS NOT EXISTS {(v:Vehicle) WHERE dist(ego, v) < 30}", 30, 0),
+        (
+            "CHECK ALWAYS (stopped(ego) IMPLIES EXISTS {(v:Vehicle) WHERE same_lane(ego, v)})",
+            0,
+            math.inf,
+        ),
+        ("CHECK ALWAYS COUNT {(v:Vehicle) WHERE dist(ego, v) < 30} >= 2", 0, 30),
+        ("CHECK ALWAYS COUNT {(v:Vehicle) WHERE dist(ego, v) < 30} < 2", 30, 0),
+        ("CHECK ALWAYS MIN {(v:Vehicle) WHERE dist(ego, v) < 30 | v.speed} < 2", 30, 30),
+        ("USING RANGE 80 CHECK FORALL (v:Vehicle) ALWAYS v.speed < 50", 80, 0),
+        ("USING RANGE 80 CHECK FORALL (v:Vehicle) ALWAYS dist(ego, v) > 5", 5, 0),
+    ],
+)
+def test_who_is_missed_matters_for_one_verdict(text: str, true: float, false: float) -> None:
+    assert looked(text) == Horizon(true, false)
+
+
+def test_safe_distances_grow_with_the_greatest_speed() -> None:
+    text = "CHECK FORALL (v:Vehicle) ALWAYS NOT rss_margin(ego, v) < 0"
+    slow, fast = looked(text, 10.0).true, looked(text, 33.0).true
+    assert 50 < slow < 133 < fast < 500
+
+
+def test_reasons_name_what_is_needed_and_what_is_known() -> None:
+    assert short_range(Horizon(120, 0), 50).of(holds=False) == ""
+    reason = short_range(Horizon(119.2, 0), 50).of(holds=True)
+    assert reason == "it depends on 120 m around the ego, and the trace knows 50 m"
+    reason = short_range(Horizon(0, math.inf), 50).of(holds=False)
+    assert reason == "it depends on everything around the ego, and the trace knows 50 m"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("USING SCOPE roads MATCH (e:Ego)", "unknown value of SCOPE 'roads'"),
+        ("USING RANGE 50 MATCH (e:Ego)", "USING RANGE belongs to CHECK"),
+    ],
+)
+def test_settings_that_are_none_are_refused(text: str, said: str) -> None:
+    with pytest.raises(QueryError, match=said):
+        compile_query(text, Catalog())
+
+
+@pytest.mark.parametrize("said", ["far", "-3"])
+def test_a_range_is_a_distance(said: str) -> None:
+    with pytest.raises(QueryError, match="is no distance"):
+        looked(f"USING RANGE '{said}' CHECK ALWAYS ego.speed < 3")
+
+
+def test_a_pattern_is_about_graphs_and_a_check_about_the_world() -> None:
+    assert not compile_query("MATCH (e:Ego)", Catalog()).bound.world
+    assert compile_query("USING SCOPE world MATCH (e:Ego)", Catalog()).bound.world
+    for setting, world in (("", True), ("USING SCOPE world", True), ("USING SCOPE graph", False)):
+        (found,) = compile_checks(f"{setting} CHECK ALWAYS ego.speed < 3", Catalog())
+        assert found.check.world is world
+
+
+def test_edges_in_braces_are_asked_of_all_that_is_known() -> None:
+    text = "MATCH (e:Ego)-[:near]->(v:Car) WHERE EXISTS {(v)-[:isIn]->(:Lane)} AND lead(e, v)"
+    scope = compile_query(text, Catalog()).bound.scope
+    blocks = [block.scope.edges for one in scope.where for block in ir.blocks_of(one)]
+    edges = (*scope.edges, *(edge for found in blocks for edge in found))
+    known = {next(iter(edge.relations)): edge.known for edge in edges}
+    assert known == {"near": False, "isIn": True, "leads": True}
