@@ -17,7 +17,7 @@ import heapq
 import struct
 import zlib
 from collections import Counter
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from typing import TYPE_CHECKING, Final
@@ -34,8 +34,8 @@ from sgstore.errors import ExportError
 from sgstore.exporters._clips import ChannelCount, WrittenClip, clip_name, tool
 from sgstore.exporters._mcap_graphs import LAYOUT, Added, is_added, layout
 from sgstore.files import working_folder
-from sgstore.mcap import CLIP, HEAD, READ_ERRORS, Loss, digest_of, near
-from sgstore.readers import open_recording
+from sgstore.mcap import CLIP, HEAD, READ_ERRORS, Loss, OutOfOrder, digest_of, near
+from sgstore.readers import channel_rank, open_recording
 from sgstore.world import Clip, TraceReport, tolerance_ns
 
 if TYPE_CHECKING:
@@ -43,9 +43,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mcap.records import Channel
+    from numpy.typing import NDArray
 
     from sgstore.exporters._labels import Export
     from sgstore.exporters._mcap_graphs import ClipMessage
+    from sgstore.mcap import Messages
     from sgstore.readers import RecordingFile
     from sgstore.store import StoredTrace
     from sgstore.world import MessageRefs
@@ -125,12 +127,19 @@ def _survey(recording: RecordingFile, trace: StoredTrace, context: MessageRefs) 
     if trace.digest and digest != trace.digest:
         raise ExportError(f"{trace.path}: the file has changed since it was ingested")
     found = _Surveyed(trace, context, digest)
-    report = TraceReport()
-    for run in recording.walk(report):
-        first, last = int(run.log_time_ns.min()), int(run.log_time_ns.max())
-        known = found.spans.get(run.chunk_offset, (first, last))
-        found.spans[run.chunk_offset] = (min(first, known[0]), max(last, known[1]))
-    found.losses = report.losses
+    for rank in (
+        channel_rank(recording),
+        None,
+    ):  # the second where messages are not in order of time
+        report = TraceReport()
+        found.spans.clear()
+        with suppress(OutOfOrder):
+            for run in recording.walk(report, rank=rank):
+                first, last = int(run.log_time_ns.min()), int(run.log_time_ns.max())
+                known = found.spans.get(run.chunk_offset, (first, last))
+                found.spans[run.chunk_offset] = (min(first, known[0]), max(last, known[1]))
+            found.losses = report.losses
+            break
     return found
 
 
@@ -328,20 +337,25 @@ class _Cutting:
             self._counts[channel] += 1
 
     def _messages(self, reach: Clip) -> Iterator[ClipMessage]:
-        """The messages of the source that belong to the clip; counts those that are context."""
+        """The messages of the source that belong to the clip, in order of time; counts those that are context.
+
+        A source without log times keeps the order of its file: while its clock is behind, log times stand
+        still.
+        """
         context, late = _context_of(self._source.context, reach)
         chunks = set(context) | {
             chunk
             for chunk, (first, last) in self._source.spans.items()
             if first <= reach.end_ns and last >= reach.start_ns
         }
-        for run in self._recording.walk(TraceReport(), chunks.__contains__):
+        rank, latest = channel_rank(self._recording), -1
+        for run in self._recording.walk(TraceReport(), chunks.__contains__, rank=rank):
             time = run.log_time_ns
             inside = (time >= reach.start_ns) & (time <= reach.end_ns)
-            carried = np.isin(run.offset, context.get(run.chunk_offset, ())) & ~inside
+            carried = _among(run, context) & ~inside
             for row in np.flatnonzero(inside | carried).tolist():
                 channel = int(run.channel[row])
-                behind = (run.chunk_offset, int(run.offset[row])) in late
+                behind = (run.chunk_of(row), int(run.offset[row])) in late
                 if channel not in self._kept or (behind and self._counts[channel]):
                     continue
                 self._carried += bool(carried[row])
@@ -349,8 +363,18 @@ class _Cutting:
                 if carried[row] and self._rebased:
                     # A nanosecond beside the clip: so whoever reads it still takes it for context.
                     log_time = reach.end_ns + 1 if behind else reach.start_ns - 1
+                elif inside[row]:
+                    log_time = latest = max(log_time, latest)
                 times = log_time, int(run.publish_time_ns[row])
                 yield (channel, int(run.sequence[row]), *times, run.data(row))
+
+
+def _among(run: Messages, places: dict[int, list[int]]) -> NDArray[np.bool_]:
+    """Which messages of a run stand at some places: offsets by their chunk."""
+    chunks, found = run.chunks, np.zeros(len(run), np.bool_)
+    for chunk in np.unique(chunks).tolist():
+        found |= (chunks == chunk) & np.isin(run.offset, places.get(chunk, ()))
+    return found
 
 
 def _validate(file: Path, expected: Counter[int]) -> None:

@@ -29,6 +29,7 @@ from ._fetch import remote_names as remote_names
 from ._findings import MAX_LOSSES as MAX_LOSSES
 from ._findings import Findings as Findings
 from ._findings import Loss as Loss
+from ._order import OutOfOrder as OutOfOrder
 from ._read_ahead import MAGIC as MAGIC
 from ._read_ahead import read_summary as read_summary
 from ._reader import CLIP as CLIP
@@ -52,6 +53,7 @@ __all__ = [
     "METADATA",
     "McapFile",
     "Messages",
+    "OutOfOrder",
     "READ_ERRORS",
     "RUN_MESSAGES",
     "RecordPlace",

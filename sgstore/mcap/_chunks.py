@@ -78,12 +78,24 @@ class Recording(Protocol):
         report: Findings,
         wanted: Callable[[int], bool] | None = None,
         keep: Callable[[int], bool] | None = None,
+        rank: Callable[[int], int] | None = None,
     ) -> Iterator[Messages]:
-        """All messages in file order; what cannot be read goes to ``report``.
+        """All messages; what cannot be read goes to ``report``.
 
         ``wanted``: whether the chunk at an offset is wanted. ``keep``: whether the messages of a channel will
-        be asked for again, so that a later walk finds them sooner.
+        be asked for again, so that a later walk finds them sooner. ``rank``: if it is given, messages come in
+        order of time, and in that of these numbers of their channels at one time; else in file order.
+        A file without log times has its own order.
+
+        Raises
+        ------
+        OutOfOrder
+            With ``rank``: the messages that were handed out are not in order. The next walk sorts them.
         """
+        ...
+
+    def settle_order(self, rank: Callable[[int], int]) -> None:
+        """Find out whether messages are in order of time: then a walk does not raise :class:`OutOfOrder`."""
         ...
 
     def close(self) -> None:
@@ -238,6 +250,16 @@ class Messages:
 
     def __len__(self) -> int:
         return len(self.channel)
+
+    @property
+    def chunks(self) -> Ints:
+        """Byte offset of the chunk of each message, -1 outside chunks."""
+        return np.full(len(self), self.chunk_offset)
+
+    def chunk_of(self, row: int) -> int:
+        """Byte offset of the chunk of one message."""
+        del row
+        return self.chunk_offset
 
     def data(self, row: int) -> memoryview:
         """The data of one message."""

@@ -1,9 +1,11 @@
 """The guarded reader of MCAP files: everything that can be had, and the name of what cannot.
 
 A file is walked record by record in the order in which it was written, one chunk in memory at a
-time. The summary at its end, where there is one, is a help and not an authority: it gives the
-definitions of channels early, and the places of chunks, so that the walk finds its way again behind
-a record that is damaged. Without a summary the walk is all there is, and enough.
+time. Where messages are asked for in order of time and are not, an index of them is sorted
+(:mod:`sgstore.mcap._order`). The summary at its end, where there is one, is a help and not an
+authority: it gives the definitions of channels early, and the places of chunks, so that the walk
+finds its way again behind a record that is damaged. Without a summary the walk is all there is, and
+enough.
 
 What can be wrong, and what comes of it:
 
@@ -50,6 +52,7 @@ from sgstore.mcap._chunks import (
     name_of,
     parse_records,
     read_chunk_head,
+    read_records,
 )
 from sgstore.mcap._fetch import (
     METADATA,
@@ -62,11 +65,16 @@ from sgstore.mcap._fetch import (
     parts_of,
 )
 from sgstore.mcap._findings import MAX_LOSSES, Findings, Loss
+from sgstore.mcap._order import ChannelRanks, OrderCheck, OutOfOrder, TimeOrder
 from sgstore.mcap._read_ahead import MAGIC, ReadAhead, Spool, chunks_in, read_summary
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    Ints = NDArray[np.int64]
 
 
 CLIP: Final = "sgstore.clip"
@@ -79,6 +87,8 @@ SMALL: Final = 4 << 20
 """Files up to this size are read chunk by chunk, without threads; bytes."""
 RUN_MESSAGES: Final = 1024
 """Messages outside chunks that are handed on together."""
+MOST_OPEN: Final = 32
+"""Files of a bag that are open at once."""
 
 _PIECE: Final = 1 << 20
 _HOLDS_CONTENT: Final = frozenset(
@@ -159,6 +169,8 @@ class McapFile:
     def __init__(self, path: Path, spool: Spool | None = None) -> None:
         self.path = path
         self._spool, self._own_spool = spool or Spool(), spool is None
+        self._in_order = self._unordered = False
+        self._order: TimeOrder | None = None
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.metadata: dict[RecordPlace, Metadata] = {}
@@ -229,8 +241,9 @@ class McapFile:
         report: Findings,
         wanted: Callable[[int], bool] | None = None,
         keep: Callable[[int], bool] | None = None,
+        rank: Callable[[int], int] | None = None,
     ) -> Iterator[Messages]:
-        """All messages in file order, chunk by chunk; what cannot be read goes to ``report``.
+        """All messages, chunk by chunk; what cannot be read goes to ``report``.
 
         Parameters
         ----------
@@ -240,12 +253,78 @@ class McapFile:
         keep : callable, optional
             Whether the messages of the channel with an id will be asked for again: then a later walk need not
             decompress them. It is asked after the messages were handed out.
+        rank : callable, optional
+            Rank of the channel with an id among channels at one time. With it messages come in order of time,
+            else in that of the file.
 
         Raises
         ------
+        OutOfOrder
+            The messages that were handed out are not in order of time. The next walk sorts them.
         TraceError
             The definitions of channels exceed all measure, or the file cannot be read any more.
         """
+        if rank is None or self._in_order:
+            yield from self._in_file_order(report, wanted, keep)
+            return
+        ranks = ChannelRanks(rank, self.schemas, self.channels)
+        if not self._unordered:
+            check = OrderCheck(ranks)
+            for run in self._in_file_order(report, wanted, keep):
+                if not check.follows(run):
+                    self._unordered = True
+                    raise OutOfOrder
+                yield run
+            self._in_order = wanted is None
+            return
+        if self._order is None:
+            self._order = self._time_order(ranks, keep)
+        yield from self._order.walk(report, wanted)
+
+    def settle_order(self, rank: Callable[[int], int]) -> None:
+        """Find out whether messages are in order of time, so that a walk will not raise :class:`OutOfOrder`."""
+        if not self._in_order and not self._unordered:
+            with suppress(OutOfOrder):
+                for _ in self.walk(Findings(), rank=rank):
+                    pass
+
+    def _time_order(self, ranks: ChannelRanks, keep: Callable[[int], bool] | None) -> TimeOrder:
+        """Sort an index of all messages; once more if channels became known behind their messages."""
+        while True:
+            findings, known = Findings(), len(self.channels)
+            runs = self._in_file_order(findings, None, keep)
+            found = TimeOrder(runs, ranks, keep or _all, self._again, findings)
+            if known == len(self.channels):
+                return found
+
+    def _again(self, place: int, offsets: Ints | None) -> Messages:
+        """Read once more the messages of the chunk at a place, or those outside chunks at some offsets."""
+        if offsets is not None:
+            messages = self._outside(offsets)
+        else:
+            messages = self._spool.get(self.path, place, lambda: self._anew(place).read)
+            messages = self._anew(place) if messages is None else messages
+        known = self._known_channels[messages.channel]
+        return messages if known.all() else messages.take(known)
+
+    def _anew(self, place: int) -> Messages:
+        """The messages of a chunk, from the file; of one whose end is missing, those that are whole."""
+        try:
+            head = read_chunk_head(self._file, place)
+            return parse_records(read_records(self._file, head, verify=False), place)[0]
+        except TraceError:
+            kept = self._of_cut(place)[1]
+            if kept is None:
+                raise
+            return kept
+
+    def _in_file_order(
+        self,
+        report: Findings,
+        wanted: Callable[[int], bool] | None,
+        keep: Callable[[int], bool] | None,
+    ) -> Iterator[Messages]:
+        """All messages in file order."""
         walk = _FileWalk(report, self._read_ahead(wanted), wanted, keep)
         self._aheads.append(walk.ahead)
         try:
@@ -359,14 +438,18 @@ class McapFile:
         offsets = np.frombuffer(walk.run, np.int64)
         walk.run = array("q")
         walk.messages += len(offsets)
-        heads = b"".join(self._at(int(at), MESSAGE_HEAD.itemsize) for at in offsets)
         try:
-            messages = message_columns(np.frombuffer(heads, MESSAGE_HEAD), offsets, -1, self._at)
+            messages = self._outside(offsets)
         except TraceError as error:
             loss = Loss(error.reason, len(offsets), offset=int(offsets[0]))
             walk.report.lose(loss)
             return
         yield from self._known(walk, messages)
+
+    def _outside(self, offsets: Ints) -> Messages:
+        """The messages outside chunks at some offsets."""
+        heads = b"".join(self._at(int(at), MESSAGE_HEAD.itemsize) for at in offsets)
+        return message_columns(np.frombuffer(heads, MESSAGE_HEAD), offsets, -1, self._at)
 
     def _end(self, walk: _FileWalk, start: int) -> Iterator[Messages]:
         """The end of the data; not believed where the summary names chunks behind it."""
@@ -479,24 +562,29 @@ class McapFile:
 
     def _cut_chunk(self, walk: _FileWalk, start: int) -> Iterator[Messages]:
         """The whole messages of a chunk whose end is missing."""
-        kept = None
-        found = head_of_cut_chunk(bytes(self._at(start, min(self.size - start, MAX_CHUNK))), start)
-        if found is not None:
-            head, stored = found
-            records = decompress_head(stored, head.compression, min(head.size, MAX_CHUNK))
-            try:
-                kept, definitions = parse_records(records, start, whole=False)
-                for opcode, content in definitions:
-                    self._define(walk, opcode, content, start)
-            except TraceError:
-                kept = None
+        head, kept, definitions = self._of_cut(start)
+        for opcode, content in definitions:
+            self._define(walk, opcode, content, start)
         count = 0 if kept is None else len(kept)
         walk.messages += count
         reason = f"the file ends inside a chunk; its first {count} messages were kept"
-        place = RecordPlace(start, self.size - start)
-        walk.report.lose(loss_of_chunk(reason, place, found[0] if found else None))
+        walk.report.lose(loss_of_chunk(reason, RecordPlace(start, self.size - start), head))
         if kept is not None:
             yield from self._known(walk, kept)
+
+    def _of_cut(
+        self, start: int
+    ) -> tuple[ChunkHead | None, Messages | None, list[tuple[int, memoryview]]]:
+        """Head, whole messages and definitions of a chunk whose end is missing."""
+        found = head_of_cut_chunk(bytes(self._at(start, min(self.size - start, MAX_CHUNK))), start)
+        if found is None:
+            return None, None, []
+        head, stored = found
+        records = decompress_head(stored, head.compression, min(head.size, MAX_CHUNK))
+        try:
+            return head, *parse_records(records, start, whole=False)
+        except TraceError:
+            return head, None, []
 
     def _count(self, walk: _FileWalk, length: int) -> None:
         """Add the messages that a message index names to those that were lost with its chunk."""
@@ -630,6 +718,8 @@ class McapBag(McapFile):
 
     def __init__(self, path: Path, spool: Spool | None = None) -> None:
         self._spool, self._own_spool = spool or Spool(), spool is None
+        self._in_order = self._unordered = False
+        self._order = None
         self.path = path.parent if path.name == METADATA else path
         self.size, self.mtime_ns = mark_of(self.path)
         self.schemas = {}
@@ -639,6 +729,7 @@ class McapBag(McapFile):
         self.counts = {}
         self._parts = parts_of(self.path)
         self._files: dict[int, McapFile] = {}
+        self._open_files: list[McapFile] = []
         self._faults: list[Loss] = []
         self._ids: dict[tuple[Any, ...], int] = {}
         self._own: dict[tuple[Path, int], int] = {}
@@ -683,13 +774,13 @@ class McapBag(McapFile):
         """That of the first chunk; ``zstd`` before a chunk was met."""
         return next(iter(self._files.values())).compression
 
-    def walk(
+    def _in_file_order(
         self,
         report: Findings,
-        wanted: Callable[[int], bool] | None = None,
-        keep: Callable[[int], bool] | None = None,
+        wanted: Callable[[int], bool] | None,
+        keep: Callable[[int], bool] | None,
     ) -> Iterator[Messages]:
-        """All messages, file by file; what cannot be read goes to ``report``."""
+        """All messages, file by file."""
         report.losses += self._faults
         for base, file in self._files.items():
             found = Findings()
@@ -704,6 +795,33 @@ class McapBag(McapFile):
             finally:
                 file.close()
                 _take_up(found, report, file.path.name, base)
+
+    def _again(self, place: int, offsets: Ints | None) -> Messages:
+        """Read once more the messages of a chunk, or those outside chunks, of one file."""
+        at = place if offsets is None else int(offsets[0])
+        part = part_at(self._parts, at)
+        if part is None or part.base not in self._files:
+            raise TraceError("no file of the bag is there", path=self.path, offset=at)
+        file, base = self._files[part.base], part.base
+        self._use(file)
+        inside = None if offsets is None else offsets - base
+        messages = self._placed(file, file._again(place - base, inside), base)  # noqa: SLF001  (its own class)
+
+        def read(position: int, length: int) -> memoryview:
+            self._use(file)
+            return messages.read(position, length)
+
+        return replace(messages, read=read)
+
+    def _use(self, file: McapFile) -> None:
+        """Open a file, and close those that were not used for long."""
+        if file in self._open_files:
+            self._open_files.remove(file)
+        self._open_files.append(file)
+        file.reopen()
+        for other in self._open_files[:-MOST_OPEN]:
+            other.close()
+        del self._open_files[:-MOST_OPEN]
 
     def pieces(self, place: RecordPlace) -> Iterator[memoryview]:
         """The bytes of a record, with its head, piece by piece."""
@@ -771,6 +889,10 @@ class McapBag(McapFile):
             return run.read(place - base, length)
 
         return replace(run, channel=own[index], offset=run.offset + base, read=read)
+
+
+def _all(_channel: int) -> bool:
+    return True
 
 
 def _moved(wanted: Callable[[int], bool], base: int) -> Callable[[int], bool]:

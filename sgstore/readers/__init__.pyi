@@ -28,6 +28,7 @@ from ._registry import open_trace as open_trace
 from ._registry import read_message as read_message
 from ._registry import read_messages as read_messages
 from ._registry import readers as readers
+from ._roles import channel_rank as channel_rank
 from ._ros2 import decode as decode
 from ._ros2 import parse_definition as parse_definition
 from .carla._live import LiveWorld as LiveWorld
@@ -72,6 +73,7 @@ __all__ = [
     "Sensors",
     "TraceMessage",
     "add_fields",
+    "channel_rank",
     "channels_of",
     "connect",
     "decode",

@@ -14,14 +14,17 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, Sel
 import numpy as np
 
 from sgstore.errors import TraceError
-from sgstore.mcap import IDS, Findings, digest_of, read_and_digest
+from sgstore.mcap import IDS, Findings, OutOfOrder, digest_of, read_and_digest
 from sgstore.readers._blocks import FrameRows, LossTally, MessageDecoder, assemble, counted
+from sgstore.readers._roles import channel_rank
 from sgstore.step import Frame, check_entities
 from sgstore.vocabulary import KINDS, TypeMeaning
 from sgstore.world import POSE, Channel, MessageRefs, TraceInfo, TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
+
+    from numpy.typing import NDArray
 
     from sgstore.mcap import Messages, Recording
     from sgstore.step import Entity
@@ -39,7 +42,7 @@ def ref_of(run: Messages, row: int) -> Ref:
     return (
         int(run.channel[row]),
         int(run.log_time_ns[row]),
-        run.chunk_offset,
+        run.chunk_of(row),
         int(run.offset[row]),
         int(run.length[row]),
     )
@@ -95,10 +98,8 @@ def frame_refs(
     def refs(run: Messages) -> MessageRefs:
         channel = index[run.channel]
         kept = (channel >= 0) & (run.log_time_ns >= start) & (run.log_time_ns <= end)
-        chunk = np.full(int(kept.sum()), run.chunk_offset, np.int64)
-        return MessageRefs(
-            channel[kept], run.log_time_ns[kept], chunk, run.offset[kept], run.length[kept]
-        )
+        log_time, chunk = run.log_time_ns[kept], run.chunks[kept]
+        return MessageRefs(channel[kept], log_time, chunk, run.offset[kept], run.length[kept])
 
     return refs
 
@@ -178,17 +179,21 @@ class Survey(Generic[AnyLead]):
         self.about_ego: list[str] = []
         self.lost = LossTally()
         self._others: dict[int, tuple[int, Ref]] = {}
+        self._met: dict[int, bool] = {}
         self._window = recording.window
 
     def meet(self, channel: int) -> bool:
         """Return whether a channel leads or lasts, so that its only message is no context of its own.
 
-        It is asked for each channel of each run of messages.
+        It is asked once for each channel, before its first message is looked at.
         """
         raise NotImplementedError
 
     def watches(self, channel: int, *, met: bool) -> bool:
-        """Return whether the messages of a channel are to be looked at; ``met``: what :meth:`meet` said."""
+        """Return whether the messages of a channel are to be looked at; ``met``: what :meth:`meet` said.
+
+        It is asked for each run of messages. From ``False`` the answer does not change.
+        """
         del channel
         return met
 
@@ -209,21 +214,40 @@ class Survey(Generic[AnyLead]):
 
         Raises
         ------
+        OutOfOrder
+            Its messages are not in order of time: a new survey reads them sorted.
         TraceError
             The file cannot be read, or a schema is malformed.
         """
-        for run in self.recording.walk(Findings(), keep=self.keeps):
+        rank = channel_rank(self.recording)
+        for run in self.recording.walk(Findings(), keep=self.keeps, rank=rank):
             self._window = self.recording.window
             found = np.unique(run.channel, return_index=True, return_counts=True)
             watched = np.zeros(IDS, np.bool_)
+            firsts: list[tuple[int, int]] = []
+            for channel, row in zip(found[0].tolist(), found[1].tolist(), strict=True):
+                if channel in self._met:
+                    watched[channel] = self.watches(channel, met=self._met[channel])
+                else:
+                    firsts.append((row, channel))
+            self._look_through(run, watched, sorted(firsts))
             for channel, row, count in zip(*(column.tolist() for column in found), strict=True):
-                met = self.meet(channel)
-                if not met:
+                if not self._met[channel]:
                     count_ref(self._others, channel, ref_of(run, row), count)
-                watched[channel] = self.watches(channel, met=met)
-            for row in np.flatnonzero(watched[run.channel]).tolist():
-                self.look(run, row)
         return self
+
+    def _look_through(
+        self, run: Messages, watched: NDArray[np.bool_], firsts: list[tuple[int, int]]
+    ) -> None:
+        """Look at the watched messages of a run; meet each new channel with its first message, not before."""
+        start = 0
+        for stop, channel in [*firsts, (len(run), -1)]:
+            for row in np.flatnonzero(watched[run.channel[start:stop]]).tolist():
+                self.look(run, start + row)
+            start = stop
+            if channel >= 0:
+                self._met[channel] = met = self.meet(channel)
+                watched[channel] = self.watches(channel, met=met)
 
     def count(self, run: Messages, row: int, weight: int) -> None:
         """Count a frame of a channel that may lead; what a clip carries in from outside of it is none."""
@@ -339,6 +363,8 @@ class MessageTrace:
     ) -> None:
         self.recording = recording
         self.report = TraceReport()
+        self._rank = channel_rank(recording, {channel.id: channel.role for channel in channels})
+        recording.settle_order(self._rank)
         self.info = TraceInfo(
             path=recording.path,
             size=recording.size,
@@ -389,7 +415,7 @@ class MessageTrace:
         report = self.report = TraceReport()
         decoder = self.decoder(report)
         refs = frame_refs(self.info.channels, self.recording.window)
-        runs = self.recording.walk(report)
+        runs = self.recording.walk(report, rank=self._rank)
         yield from counted(assemble(runs, size, decoder, refs), report)
         decoder.settle()
         if not report.frames:
@@ -406,8 +432,8 @@ class SurveyedTrace(MessageTrace, Generic[AnySurvey]):
 
     Parameters
     ----------
-    survey : Survey
-        That first reading, not begun yet.
+    make : callable
+        Makes that first reading, not begun yet. It is called again if messages are not in order of time.
     digest : str
         SHA-256 of the file, if it is known; else the file is hashed.
     **more
@@ -419,10 +445,18 @@ class SurveyedTrace(MessageTrace, Generic[AnySurvey]):
         A schema is malformed, no frame can be read, or nothing bears the name given for the ego.
     """
 
-    def __init__(self, survey: AnySurvey, digest: str, **more: Any) -> None:
+    def __init__(self, make: Callable[[], AnySurvey], digest: str, **more: Any) -> None:
+        first = make()
+        recording = first.recording
+
+        def read() -> AnySurvey:
+            try:
+                return first.read()
+            except OutOfOrder:
+                return make().read()
+
+        survey, digest = read_and_digest(recording.path, digest, read)
         self._survey = survey
-        recording = survey.recording
-        _, digest = read_and_digest(recording.path, digest, survey.read)
         survey.leading = survey.first_lead()
         if survey.leading < 0:
             raise TraceError(survey.no_frames(), path=recording.path)
@@ -505,6 +539,8 @@ class FramesTrace(MessageTrace):
         self.recording = recording
         channels = _channels(self, recording)
         self._channels = {channel.id: channel for channel in channels}
+        self._rank = channel_rank(recording, {channel.id: channel.role for channel in channels})
+        recording.settle_order(self._rank)
         self._map_losses = LossTally()
         self._ego = ""
         first, refs, map_text = self._beginning()
@@ -546,7 +582,7 @@ class FramesTrace(MessageTrace):
         Parameters
         ----------
         message : TraceMessage
-            Of a channel whose role is ``ground_truth``; they come in the order of the file.
+            Of a channel whose role is ``ground_truth``; they come in order of their log times.
 
         Returns
         -------
@@ -590,7 +626,7 @@ class FramesTrace(MessageTrace):
         refs: list[Ref] = []
         text = ""
         wanted = [*maps, *decoder.channels]
-        for run in self.recording.walk(TraceReport()):
+        for run in self.recording.walk(TraceReport(), rank=self._rank):
             for row in np.flatnonzero(np.isin(run.channel, wanted)).tolist():
                 channel = int(run.channel[row])
                 if channel in maps and not text:

@@ -6,7 +6,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Self
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from mcap.records import Metadata
 
@@ -38,6 +38,10 @@ class MessageFile:
 
     def close(self) -> None:
         """Close what is open; here nothing is."""
+
+    def settle_order(self, rank: Callable[[int], int]) -> None:
+        """Do nothing: the order of such a file is its own."""
+        del rank
 
     def pieces(self, place: RecordPlace) -> Iterator[memoryview]:
         """The bytes of an attachment; there are none."""

@@ -645,7 +645,7 @@ class AutowareTrace(SurveyedTrace[AutowareSurvey]):
         self._types = told.types if told is not None else {}
         self._places: dict[str, tuple[float, float, float]] = {}
         known_by = sha256(repr(told).encode("utf-8", "replace")).hexdigest() if told else ""
-        super().__init__(AutowareSurvey(recording, ego), digest, mapping=known_by)
+        super().__init__(lambda: AutowareSurvey(recording, ego), digest, mapping=known_by)
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:

@@ -476,6 +476,8 @@ class CarlaSurvey(Survey[Lead]):
     def look(self, run: Messages, row: int) -> None:
         """Look at one message; what cannot be read is counted."""
         channel = int(run.channel[row])
+        if self.contents[channel] in {TEXT, ODOMETRY} and not self.watches(channel, met=False):
+            return
         if self.contents[channel] == OBJECTS:
             self.count(run, row, int(run.length[row]))
             with suppress(TraceError):  # reported when frames are read

@@ -530,7 +530,7 @@ class CarlaTrace(SurveyedTrace[CarlaSurvey]):
     name: ClassVar[str] = "carla"
 
     def __init__(self, recording: Recording, *, ego: str = "", digest: str = "") -> None:
-        super().__init__(CarlaSurvey(recording, ego), digest)
+        super().__init__(lambda: CarlaSurvey(recording, ego), digest)
         self._signals: dict[int, str] = {}
         self._road_map: RoadMap | None = None
         self.on_map(self._own_map())

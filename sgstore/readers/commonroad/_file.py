@@ -119,12 +119,13 @@ class CommonRoadFile(MessageFile):
         report: Findings,
         wanted: Callable[[int], bool] | None = None,
         keep: Callable[[int], bool] | None = None,
+        rank: Callable[[int], int] | None = None,
     ) -> Iterator[Messages]:
         """All messages: the map, then step after step; what was left out goes to ``report``.
 
         ``offset`` of a message is its number. Nothing is read again, so ``keep`` changes nothing.
         """
-        del keep
+        del keep, rank
         for reason in self._scenario.lost:
             report.lose(Loss(reason, bytes=0))
         if self._scenario.more_lost:

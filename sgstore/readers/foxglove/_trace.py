@@ -228,6 +228,7 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
         self._idents: list[str] = []
         self._ego = -1
         self._standing: dict[int, dict[str, tuple[int, Box]]] = {}
+        self._open: FoxgloveRawFrame | None = None
         self._left_out = LossTally()
         self._bodiless = self._odd_axes = 0
         self._last = (0, 0)
@@ -248,9 +249,22 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
             return None
         time_ns = self._time_of(scene, log_time)
         self._take_scene(channel, scene, time_ns, log_time)
-        if channel != self._leading or not self.is_inside(log_time):
+        last = self._open
+        if channel != self._leading:
+            if last is not None and last.log_time_ns == log_time:  # it tells of the same instant
+                self._fill(last)
             return None
-        frame = FoxgloveRawFrame(time_ns, log_time)
+        if not self.is_inside(log_time):
+            return None
+        frame = self._open = FoxgloveRawFrame(time_ns, log_time)
+        self._fill(frame)
+        if self._ego < 0 and self._ego_axes and self._pose_of_ego(time_ns) is not None:
+            self._ego = self._enter_ego()
+        return frame
+
+    def _fill(self, frame: FoxgloveRawFrame) -> None:
+        """Give a frame all that stands at its time."""
+        time_ns, frame.boxes = frame.time_ns, []
         for source, standing in self._standing.items():
             ended = [
                 ident
@@ -262,9 +276,6 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
             frame.boxes += [
                 (self._nodes[source, ident], box) for ident, (_, box) in standing.items()
             ]
-        if self._ego < 0 and self._ego_axes and self._pose_of_ego(time_ns) is not None:
-            self._ego = self._enter_ego()
-        return frame
 
     def complete(self, frames: list[FoxgloveRawFrame]) -> list[FrameRows]:
         """Frames with the poses of their boxes in the axes that stand still."""
@@ -469,7 +480,7 @@ class FoxgloveTrace(SurveyedTrace[FoxgloveSurvey]):
         topics = [record.topic for record in recording.channels.values()]
         found = mapping_for(mapping, topics)
         known_by = sha256(repr(found).encode("utf-8", "replace")).hexdigest()
-        super().__init__(FoxgloveSurvey(recording, ego, found), digest, mapping=known_by)
+        super().__init__(lambda: FoxgloveSurvey(recording, ego, found), digest, mapping=known_by)
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:

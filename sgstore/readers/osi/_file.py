@@ -270,6 +270,7 @@ class OsiFile(MessageFile):
         report: Findings,
         wanted: Callable[[int], bool] | None = None,
         keep: Callable[[int], bool] | None = None,
+        rank: Callable[[int], int] | None = None,
     ) -> Iterator[Messages]:
         """All messages in file order; what cannot be read goes to ``report``.
 
@@ -281,7 +282,7 @@ class OsiFile(MessageFile):
         TraceError
             The file cannot be read any more.
         """
-        del keep
+        del keep, rank
         run = _MessageRun()
         try:
             for place, offset, data in self._messages(report):

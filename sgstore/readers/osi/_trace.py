@@ -167,6 +167,8 @@ class OsiRawFrame:
         Rows of the traffic lights: node ids, columns, states.
     controls : tuple of float
         As :class:`~sgstore.readers._blocks.FrameRows` has them.
+    own : tuple of float
+        Those that its own messages tell.
     nodes : list of int
         Node id of each moving object; none comes twice.
     objects : list of bytes
@@ -177,6 +179,7 @@ class OsiRawFrame:
     log_time_ns: int
     heads: tuple[Ints, Floats, Ints]
     controls: tuple[float, ...] = NO_INPUTS
+    own: tuple[float, ...] = NO_INPUTS
     nodes: list[int] = field(default_factory=list[int])
     objects: list[bytes] = field(default_factory=list[bytes])
 
@@ -222,7 +225,7 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
         try:
             data = bytes(run.data(row))
             if channel in self._survey.hosts:
-                self._controls = controls_of(self._survey.hosts[channel].FromString(data))
+                self._take_controls(self._survey.hosts[channel].FromString(data), log_time)
                 return None
             told = parse(self._survey.leads[channel].message, data)
             message, ground, _ = told
@@ -334,10 +337,15 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
         if self._controls is NO_INPUTS and not self._has_controls:
             return
         data = getattr(message, "host_vehicle_data", None)
-        known = zip(frame.controls, controls_of(data), self._controls, strict=True)
-        frame.controls = tuple(
-            next((value for value in three if not math.isnan(value)), NAN) for three in known
-        )
+        frame.own = _first_told(frame.own, controls_of(data))
+        frame.controls = _first_told(frame.own, frame.controls, self._controls)
+
+    def _take_controls(self, data: Any, log_time: int) -> None:
+        """Take the controls of the host: they are of the last frame if they were logged with it."""
+        self._controls = told = controls_of(data)
+        last = self._open
+        if last is not None and log_time == last.log_time_ns:
+            last.controls = _first_told(last.own, told)
 
     def _take_aside(self, told: tuple[Any, Any, list[bytes]], time_ns: int) -> None:
         """Take a message of another channel: it tells of the last frame, of one to come, or of none."""
@@ -479,6 +487,14 @@ def controls_of(data: Any) -> tuple[float, ...]:
     )
 
 
+def _first_told(*controls: tuple[float, ...]) -> tuple[float, ...]:
+    """The first known value of each control."""
+    return tuple(
+        next((value for value in values if not math.isnan(value)), NAN)
+        for values in zip(*controls, strict=True)
+    )
+
+
 def _number(message: Any, part: str, name: str) -> float:
     inner = getattr(message, part, None)
     told = inner is not None and name in inner.DESCRIPTOR.fields_by_name and inner.HasField(name)
@@ -515,7 +531,7 @@ class OsiTrace(SurveyedTrace[OsiSurvey]):
     name: ClassVar[str] = "osi"
 
     def __init__(self, recording: Recording, *, ego: str = "", digest: str = "") -> None:
-        super().__init__(OsiSurvey(recording, ego), digest)
+        super().__init__(lambda: OsiSurvey(recording, ego), digest)
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:

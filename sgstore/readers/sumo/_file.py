@@ -156,12 +156,13 @@ class SumoFile(MessageFile):
         report: Findings,
         wanted: Callable[[int], bool] | None = None,
         keep: Callable[[int], bool] | None = None,
+        rank: Callable[[int], int] | None = None,
     ) -> Iterator[Messages]:
         """All time steps, in order; what cannot be used goes to ``report``.
 
         ``offset`` of a message is its place in the file.
         """
-        del keep
+        del keep, rank
         if wanted is not None and not wanted(-1):
             return
         held: list[tuple[int, int, bytes]] = []

@@ -1,0 +1,79 @@
+"""The order of channels whose messages have one log time and one publish time.
+
+A frame must know the map, static things, transforms and signals of its own instant. What belongs to a frame but
+refers to it, such as the controls of the ego, comes behind it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from sgstore.readers._ros2 import short_name
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from sgstore.mcap import Recording
+
+MAP, STATIC, TRANSFORMS, LIGHTS, STATES, EGO, CONTROLS, PAYLOAD = range(8)
+
+_SCHEMAS: Final = {
+    "osi3.MapAsamOpenDrive": MAP,
+    "osi3.GroundTruth": STATES,
+    "osi3.SensorView": STATES,
+    "osi3.HostVehicleData": CONTROLS,
+    "carla_msgs/CarlaWorldInfo": MAP,
+    "std_msgs/String": MAP,
+    "carla_msgs/CarlaActorList": STATIC,
+    "carla_msgs/CarlaTrafficLightInfoList": STATIC,
+    "carla_msgs/CarlaEgoVehicleInfo": STATIC,
+    "carla_msgs/CarlaTrafficLightStatusList": LIGHTS,
+    "derived_object_msgs/ObjectArray": STATES,
+    "carla_msgs/CarlaEgoVehicleStatus": CONTROLS,
+    "carla_msgs/CarlaEgoVehicleControl": CONTROLS,
+    "carla_msgs/CarlaCollisionEvent": CONTROLS,
+    "carla_msgs/CarlaLaneInvasionEvent": CONTROLS,
+    "nav_msgs/Odometry": EGO,
+    "tf2_msgs/TFMessage": TRANSFORMS,
+    "foxglove.FrameTransform": TRANSFORMS,
+    "foxglove.FrameTransforms": TRANSFORMS,
+    "foxglove.SceneUpdate": STATES,
+    "commonroad.Map": MAP,
+    "commonroad.Step": STATES,
+    "sumo.Timestep": STATES,
+    **{
+        f"{package}_{name}": rank
+        for package in ("autoware", "autoware_auto")
+        for name, rank in {
+            "perception_msgs/TrafficLightGroupArray": LIGHTS,
+            "perception_msgs/TrafficSignalArray": LIGHTS,
+            "perception_msgs/TrackedObjects": STATES,
+            "perception_msgs/PredictedObjects": STATES,
+            "perception_msgs/DetectedObjects": STATES,
+            "localization_msgs/KinematicState": EGO,
+            "vehicle_msgs/GearReport": CONTROLS,
+            "vehicle_msgs/TurnIndicatorsReport": CONTROLS,
+            "vehicle_msgs/HazardLightsReport": CONTROLS,
+        }.items()
+    },
+}
+"""Schema → rank of a channel."""
+_ROLES: Final = {"map": MAP, "ground_truth": STATES}
+"""Role that a flavour of another package gives a channel → its rank."""
+
+
+def channel_rank(
+    recording: Recording, roles: Mapping[int, str] | None = None
+) -> Callable[[int], int]:
+    """Return the function from the id of a channel to its rank.
+
+    ``roles``: id of a channel → its role, for channels whose schema has no rank.
+    """
+    known = roles or {}
+
+    def rank(channel: int) -> int:
+        schema = recording.schemas.get(recording.channels[channel].schema_id)
+        named = _SCHEMAS.get(short_name(schema.name)) if schema is not None else None
+        return _ROLES.get(known.get(channel, ""), PAYLOAD) if named is None else named
+
+    return rank
