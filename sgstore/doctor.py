@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sgstore.config import Config
-from sgstore.errors import SgstoreError
+from sgstore.errors import failure
 from sgstore.files import working_folder
 from sgstore.map_files import Maps, lost_lanes
 from sgstore.mcap import Loss, near
@@ -108,8 +108,8 @@ def examine(
     try:
         with working_folder("recording") as held, near(found.path, held):
             _read(found, config, maps, _channels(found, report))
-    except SgstoreError as error:
-        found.error = str(error)
+    except Exception as error:  # noqa: BLE001  the other recordings are examined all the same
+        found.error = str(failure(error, found.path))
         found.warnings = found.warnings or report.warnings
         found.losses = found.losses or report.losses
     return found

@@ -103,6 +103,22 @@ class TraceError(SgstoreError):
         super().__init__(f"{', '.join(where)}: {reason}" if where else reason)
 
 
+def failure(error: Exception, path: str | Path) -> SgstoreError:
+    """The error for which one recording of a batch fails.
+
+    Parameters
+    ----------
+    error : Exception
+        Any exception that reading the recording raised; an :class:`SgstoreError` is returned as it is.
+    path : str or Path
+        The recording.
+    """
+    if isinstance(error, SgstoreError):
+        return error
+    words = f"unexpected {type(error).__name__}: {error}; report it to the developers of sgstore"
+    return TraceError(words, path=path)
+
+
 class MapError(SgstoreError):
     """A road map cannot be read, in whole or in part.
 

@@ -20,7 +20,7 @@ from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from sgstore.config import Config
-from sgstore.errors import SgstoreError, StoreError, TraceError, url_named
+from sgstore.errors import SgstoreError, StoreError, TraceError, failure, url_named
 from sgstore.logs import logger
 from sgstore.map_files import Maps
 from sgstore.mcap import METADATA, bag_folder, mark_of, parts_of, remote_names
@@ -419,7 +419,14 @@ def _published(
             ready[number] = sealed
         except SgstoreError as error:
             outcome.error = error
-    told = file.publish_each([*ready.values()], replace=job.force) if file and ready else []
+    told: Sequence[str | SgstoreError] = []
+    if file and ready:
+        try:
+            told = file.publish_each([*ready.values()], replace=job.force)
+        except Exception as error:
+            if isinstance(error, SgstoreError):
+                raise
+            told = [failure(error, outcomes[0].path)] * len(ready)
     for number, name in zip(ready, told, strict=True):
         outcome = outcomes[number]
         if isinstance(name, str):

@@ -14,6 +14,7 @@ import os
 import sys
 import threading
 import time
+import traceback
 from array import array
 from collections import Counter
 from contextlib import ExitStack, suppress
@@ -26,7 +27,7 @@ import numpy as np
 
 from sgstore import errors
 from sgstore.config import ALL_EGOS, Config, from_dict
-from sgstore.errors import SgstoreError, TraceError, place_named
+from sgstore.errors import SgstoreError, TraceError, failure, place_named
 from sgstore.logs import logger
 from sgstore.map_files import Maps, lost_lanes
 from sgstore.mcap import Loss, check_name, near
@@ -332,8 +333,10 @@ class SegmentReader:
             check_name(path)
             with near(path, folder / "copy"):
                 self._read(path, folder, views)
-        except SgstoreError as error:
-            failed = error
+        except Exception as error:  # noqa: BLE001  the other recordings are read all the same
+            failed = failure(error, path)
+            if failed is not error:
+                _log.debug("%s: %s", path, traceback.format_exc())
         found = [(view.outcome, view.sealed) for view in views] or [(TraceOutcome(path), None)]
         for outcome, _ in found:
             if outcome.status == "failed" and outcome.error is None:

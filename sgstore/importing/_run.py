@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.config import Config
-from sgstore.errors import SgstoreError, TraceError
+from sgstore.errors import SgstoreError, TraceError, failure
 from sgstore.graph import Edges, GraphBlock, LaneGaps, LaneStates, StaticPresence
 from sgstore.importing._formats import read_csv, read_nodelink, read_s3c, stem_of
 from sgstore.importing._openlabel import metadata_of, read_openlabel
@@ -176,8 +176,8 @@ class _ImportRun:
         done = Imported(path)
         try:
             self._import(path, done)
-        except SgstoreError as error:
-            done.error = error
+        except Exception as error:  # noqa: BLE001  the other files are imported all the same
+            done.error = failure(error, path)
         return done
 
     def _import(self, path: Path, done: Imported) -> None:
