@@ -45,10 +45,13 @@ from sgstore.world import (
     MessageRefs,
     Origin,
     States,
+    is_leap,
+    is_plausible,
     nearest_frames,
     number,
     origin_of,
     quantize,
+    without_implausible,
 )
 
 if TYPE_CHECKING:
@@ -66,6 +69,7 @@ __all__ = ["REMEMBERED", "Entity", "Frame", "Replay", "Stepper", "check_entities
 
 
 _NAN: Final = math.nan
+_LIGHT: Final = 1
 NUMBERS: Final = (*POSE, *INPUTS)
 WHOLE: Final = ("lights", "light_state", "derived")
 """Columns of :attr:`Entity.numbers` and of :attr:`Entity.whole`, as :class:`sgstore.world.States` has them."""
@@ -119,9 +123,11 @@ class Frame:
         What has happened: its kind, to whom, and with whom; empty: nobody, or not known.
     recorded : frozenset of str
         Kinds of events that would be among them if they had happened. Of others nothing is known.
+    losses : list of (str, str)
+        Id and fault of each number that no body has, which is therefore missing: ``("7", "length is -4.5 m")``.
     """
 
-    __slots__ = ("ego", "entities", "events", "recorded", "time_ns")
+    __slots__ = ("ego", "entities", "events", "losses", "recorded", "time_ns")
 
     def __init__(self, time_ns: int, ego: str | int | None = None) -> None:
         self.time_ns = int(time_ns)
@@ -129,6 +135,7 @@ class Frame:
         self.entities: list[Entity] = []
         self.events: list[tuple[str, str, str]] = []
         self.recorded = frozenset(EVENT_KINDS)
+        self.losses: list[tuple[str, str]] = []
 
     def __len__(self) -> int:
         return len(self.entities)
@@ -138,7 +145,7 @@ class Frame:
         if not types:
             return self
         frame = Frame(self.time_ns, self.ego)
-        frame.events, frame.recorded = self.events, self.recorded
+        frame.events, frame.recorded, frame.losses = self.events, self.recorded, self.losses
         frame.entities = [
             entity.meant(types.get(entity.type_name.lower())) for entity in self.entities
         ]
@@ -244,14 +251,13 @@ class Frame:
         Notes
         -----
         Whatever is left out or not finite is not known, which is not 0: an entity without a size is a
-        point, one without a heading has no front.
+        point, one without a heading has no front. A size below 0 or above 1 km and a speed above 150 m/s are
+        not known, either; :attr:`losses` has them.
         """
-        numbers = (
-            *(x, y, z, heading, pitch, roll, vx, vy, vz, ax, ay, az, yaw_rate),
-            *(length, width, height, steer, throttle, brake),
-            _NAN if gear is None else gear,
-            _NAN if hand_brake is None else float(hand_brake),
-        )
+        pose = (x, y, z, heading, pitch, roll, vx, vy, vz, ax, ay, az, yaw_rate)
+        pose = self._plausible(str(ident), (*pose, length, width, height))
+        gears = _NAN if gear is None else gear, _NAN if hand_brake is None else float(hand_brake)
+        numbers = (*pose, steer, throttle, brake, *gears)
         self.entities.append(
             Entity(
                 ident=str(ident),
@@ -265,6 +271,14 @@ class Frame:
                 whole=(_mask_of(lights), _light_code(light_state), 0),
             )
         )
+
+    def _plausible(self, ident: str, pose: tuple[float, ...]) -> tuple[float, ...]:
+        """The numbers :data:`POSE` of an entity without those that no body has, which are losses."""
+        if is_plausible(*pose[6:9], *pose[13:]):
+            return pose
+        kept, faults = without_implausible(np.array([pose], np.float64))
+        self.losses += [(ident, words) for _, words in faults]
+        return tuple(kept[0].tolist())
 
 
 def _inside(name: str, value: float) -> float:
@@ -408,6 +422,7 @@ class EntityConstants(NamedTuple):
     special: str
     subkind: str
     type_name: str = ""
+    lifetime: int = 1
 
     def attributes(self, *, is_ego: bool, is_static: bool) -> Attributes:
         """As they stand in a graph."""
@@ -422,8 +437,36 @@ class EntityConstants(NamedTuple):
             "ident": self.ident,
             "is_ego": is_ego,
             "is_static": is_static,
+            **({"lifetime": self.lifetime} if self.lifetime > 1 else {}),
             **{name: text for name, text in texts.items() if text},
         }
+
+
+class _Life(NamedTuple):
+    """An entity that moves: its constants, and when and where it was last; ``run``: of the clock."""
+
+    constants: EntityConstants
+    run: int
+    time_ns: int
+    place: tuple[float, ...]
+
+    def is_of(self, entity: Entity, run: int, time_ns: int) -> bool:
+        """False if an entity with this id is another one: another kind, or where this one cannot have moved."""
+        if self.constants.kind != KINDS[entity.kind]:
+            return False
+        apart = (now - then for now, then in zip(entity.numbers[:3], self.place, strict=True))
+        away = math.hypot(*(0.0 if math.isnan(part) else part for part in apart))
+        return (
+            run != self.run
+            or entity.whole[_LIGHT] >= 0
+            or not is_leap(away, (time_ns - self.time_ns) / 1e9)
+        )
+
+    def now(self, entity: Entity, run: int, time_ns: int) -> _Life:
+        """The same, where an entity is now."""
+        if any(map(math.isnan, entity.numbers[:2])):
+            return self
+        return _Life(self.constants, run, time_ns, entity.numbers[:3])
 
 
 class Records:
@@ -640,9 +683,9 @@ class Stepper:
         self._origin: Origin | None = None
         self.last: tuple[list[GraphBlock], Codes] | None = None
         self._next = 0
-        self._moving: OrderedDict[str, EntityConstants] = (
-            OrderedDict()
-        )  # whom the last frame had, at the end
+        self._moving: OrderedDict[str, _Life] = OrderedDict()  # those of the last frame at the end
+        self._time_ns: int | None = None
+        self._run = 0  # of the clock: it ends where the clock jumps back
         self._standing: dict[str, tuple[Entity, EntityConstants]] = {}
         # The generator's own node ids, which begin anew with it, and what they are outside.
         self._inner: dict[str, int] = {}
@@ -675,7 +718,8 @@ class Stepper:
         while len(self._moving) > len(moving) + REMEMBERED:
             ident, _ = self._moving.popitem(last=False)
             self._inner.pop(ident, None)
-        known = {self._moving[e.ident].node: self._moving[e.ident] for e in moving}
+        constants = [self._moving[entity.ident].constants for entity in moving]
+        known = {one.node: one for one in constants}
         happened = self._happened(frame)
         with GcPaused():
             found = [self._records.graph(graph, self._outer, known) for graph in graphs]
@@ -692,40 +736,52 @@ class Stepper:
     def _node_of(self, ident: str) -> int | None:
         if ident in self._standing:
             return self._standing[ident][1].node
-        return self._moving[ident].node if ident in self._moving else None
+        return self._moving[ident].constants.node if ident in self._moving else None
 
     def _met(self, frame: Frame) -> tuple[list[Entity], list[Entity]]:
         """Entities of a frame that move, and those that stand and were not known.
 
         Everything is checked before anything is remembered: a frame that is refused has not been.
         """
-        check_entities(frame, self._known)
+        check_entities(frame, self._is_static)
+        if self._time_ns is not None and frame.time_ns < self._time_ns:
+            self._run += 1
+        self._time_ns = frame.time_ns
         moving = {entity.ident: entity for entity in frame.entities if not entity.static}
         new: dict[str, Entity] = {}
         for entity in frame.entities:
             if entity.static and entity.ident not in self._standing:
                 new.setdefault(entity.ident, entity)
+        # Node ids as of a recording: first those of new ids, then those of ids that have returned.
         for entity in frame.entities:
-            self._remember(entity, new)
+            if entity.ident not in self._moving and entity.ident not in self._standing:
+                self._enter(entity, new)
+        for ident, entity in moving.items():
+            self._follow(ident, entity, frame.time_ns)
         return list(moving.values()), list(new.values())
 
-    def _known(self, ident: str) -> tuple[bool, str] | None:
+    def _is_static(self, ident: str) -> bool | None:
         if ident in self._standing:
-            return True, self._standing[ident][1].kind
-        return (False, self._moving[ident].kind) if ident in self._moving else None
+            return True
+        return False if ident in self._moving else None
 
-    def _remember(self, entity: Entity, new: dict[str, Entity]) -> None:
-        ident = entity.ident
-        if ident in self._moving:
-            self._moving.move_to_end(ident)
-        elif ident not in self._standing:
-            texts = entity.special, entity.subkind, entity.type_name
-            known = EntityConstants(self._next, ident, KINDS[entity.kind], *texts)
-            self._next += 1
-            if ident in new:
-                self._standing[ident] = entity, known
-            else:
-                self._moving[ident] = known
+    def _enter(self, entity: Entity, new: dict[str, Entity], lifetime: int = 1) -> None:
+        texts = entity.special, entity.subkind, entity.type_name
+        known = EntityConstants(self._next, entity.ident, KINDS[entity.kind], *texts, lifetime)
+        self._next += 1
+        if entity.ident in new:
+            self._standing[entity.ident] = entity, known
+        else:
+            self._moving[entity.ident] = _Life(known, -1, 0, (_NAN,) * 3)
+
+    def _follow(self, ident: str, entity: Entity, time_ns: int) -> None:
+        """Take note of where an entity is; it is another one if its id has returned."""
+        life = self._moving[ident]
+        if not life.is_of(entity, self._run, time_ns):
+            self._inner.pop(ident, None)
+            self._enter(entity, {}, life.constants.lifetime + 1)
+        self._moving[ident] = self._moving[ident].now(entity, self._run, time_ns)
+        self._moving.move_to_end(ident)
 
     def _block(self, frame: Frame, moving: list[Entity], standing: list[Entity]) -> FrameBlock:
         """A frame as a block, in the generator's own node ids."""
@@ -756,8 +812,9 @@ class Stepper:
         return quantize(block, self._origin or Origin(0.0, 0.0, 0.0))
 
     def _node(self, entity: Entity) -> int:
-        known = self._standing[entity.ident][1] if entity.static else self._moving[entity.ident]
-        return known.node
+        if entity.static:
+            return self._standing[entity.ident][1].node
+        return self._moving[entity.ident].constants.node
 
     def _states(self, of: list[Entity]) -> States:
         numbers = np.array([e.numbers for e in of], np.float64).reshape(-1, len(NUMBERS))
@@ -772,31 +829,28 @@ class Stepper:
         )
 
 
-def check_entities(frame: Frame, known: Callable[[str], tuple[bool, str] | None]) -> None:
+def check_entities(frame: Frame, is_static: Callable[[str], bool | None]) -> None:
     """Refuse a frame that contradicts itself or those before it; nothing of it need be remembered then.
 
     Parameters
     ----------
     frame : Frame
-    known : callable
-        Of an id that was met before: whether it is static, and its kind.
+    is_static : callable
+        Of an id: whether the entity that had it before is static; None if there was none.
 
     Raises
     ------
     ValueError
-        Two entities have one id, one that moved is static or the other way round, or its kind has changed.
+        Two entities have one id, or one that moved is static or the other way round.
     """
     here: dict[str, Entity] = {}
     for entity in frame.entities:
-        ident, kind = entity.ident, KINDS[entity.kind]
-        static, was = known(ident) or (entity.static, kind)
+        ident, static = entity.ident, is_static(entity.ident)
         if ident in here and not (here[ident].static and entity.static):
             raise ValueError(f"two entities have the id {ident!r}")
-        if entity.static != static:
+        if static is not None and entity.static != static:
             now, before = ("is static", "moved") if entity.static else ("moves", "was static")
             raise ValueError(f"entity {ident!r} {before} before and {now} now")
-        if kind != was and not entity.static:
-            raise ValueError(f"entity {ident!r} was of kind {was!r} and is {kind!r} now")
         here[ident] = entity
 
 

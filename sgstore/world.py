@@ -63,6 +63,11 @@ def tolerance_ns(period_ns: int) -> int:
     return max(TOLERANCE_NS, period_ns // TOLERANCE_SHARE)
 
 
+def derivable_ns(period_ns: float) -> float:
+    """The longest time between two frames across which motion is derived: three median periods; ns."""
+    return 3 * period_ns + tolerance_ns(int(period_ns))
+
+
 def longest_step_ns(period_ns: int) -> float:
     """The longest time between two frames of a trace between which none is missing; ns."""
     return GAP * period_ns + tolerance_ns(period_ns)
@@ -75,8 +80,105 @@ POSE: Final = (
 )
 """Columns of :class:`States` that say where a body is, how it moves and how large it is, in order."""
 
+LARGEST: Final = 1_000.0
+"""Greatest length, width or height of a body; m."""
+
+FASTEST: Final = 150.0
+"""Greatest speed of a body; m/s."""
+
+HARDEST: Final = 30.0
+"""Greatest acceleration that differences of positions or velocities may give; m/s²."""
+
+LEAP: Final = 5.0
+"""Distance beyond the way at :data:`FASTEST` from which on a position is another body's; m."""
+
 INPUTS: Final = ("steer", "throttle", "brake", "gear", "hand_brake")
 """Columns of :class:`States` that say how a vehicle is driven, in order."""
+
+_SPEEDS: Final = slice(POSE.index("vx"), POSE.index("vz") + 1)
+_SIZES: Final = slice(POSE.index("length"), POSE.index("height") + 1)
+
+
+def implausible(values: Floats) -> Bools:
+    """The sizes and velocities that no body has: the one check of all flavours and of the online mode.
+
+    Parameters
+    ----------
+    values : (n, 16) float64
+        Columns :data:`POSE`.
+
+    Returns
+    -------
+    (n, 16) bool
+        Sizes below 0 or above :data:`LARGEST`; all three parts of a velocity above :data:`FASTEST`.
+    """
+    found = np.zeros(values.shape, np.bool_)
+    sizes, speeds = values[:, _SIZES], values[:, _SPEEDS]
+    found[:, _SIZES] = (sizes < 0) | (sizes > LARGEST)
+    with np.errstate(over="ignore"):
+        found[:, _SPEEDS] = (np.nansum(speeds * speeds, axis=1) > FASTEST**2)[:, None]
+    return found
+
+
+def is_plausible(
+    vx: float, vy: float, vz: float, length: float, width: float, height: float
+) -> bool:
+    """False if :func:`implausible` may find something among the numbers of one entity; fast."""
+    # A comparison with NaN is false.
+    if any(size < 0 or size > LARGEST for size in (length, width, height)):
+        return False
+    return not any(abs(part) > FASTEST / 2 for part in (vx, vy, vz))
+
+
+def without_implausible(values: Floats) -> tuple[Floats, list[tuple[int, str]]]:
+    """The same numbers, with NaN for those that no body has.
+
+    Parameters
+    ----------
+    values : (n, 16) float64
+        Columns :data:`POSE`.
+
+    Returns
+    -------
+    values : (n, 16) float64
+        The same array if nothing is implausible.
+    faults : list of (int, str)
+        Row and fault: ``"length is -4.5 m"``, ``"speed is 900 m/s"``.
+    """
+    found = implausible(values)
+    if not found.any():
+        return values, []
+    faults = [
+        (row, f"{POSE[column]} is {values[row, column]:g} m")
+        for row, column in np.argwhere(found).tolist()
+        if column >= _SIZES.start
+    ]
+    fast = np.flatnonzero(found[:, _SPEEDS.start])
+    with np.errstate(over="ignore"):
+        speeds = np.sqrt(np.nansum(values[fast, _SPEEDS] ** 2, axis=1)).tolist()
+    faults += [
+        (row, f"speed is {speed:g} m/s") for row, speed in zip(fast.tolist(), speeds, strict=True)
+    ]
+    return np.where(found, np.nan, values), faults
+
+
+def is_leap(away: float, seconds: float) -> bool:
+    """True if no body can move so far in so short a time.
+
+    Parameters
+    ----------
+    away : float
+        Distance; m.
+    seconds : float
+        Time that it took; s. If it is not above 0, the clock stands or jumps, and nothing is a leap.
+    """
+    return seconds > 0 and away > FASTEST * seconds + LEAP
+
+
+def leaps(away: Floats, seconds: Floats) -> Bools:
+    """:func:`is_leap` of arrays."""
+    return (seconds > 0) & (away > FASTEST * seconds + LEAP)
+
 
 HIGHEST_GEAR: Final = 127
 """A gear beyond it, forwards or backwards, is none; a store keeps 8 bits."""
@@ -101,6 +203,8 @@ class Entities:
     map_ref : tuple of str
         Id of the OpenDRIVE signal or object that this entity is, or the empty string. Of a signal that the map
         does not have: the lanes that it applies to, as :func:`sgstore.roads.lanes_ref` names them.
+    lifetime : tuple of int
+        1 of the first entity with an id, 2 of the next one with the same id, …; empty: 1 of all.
     """
 
     first: int
@@ -111,6 +215,7 @@ class Entities:
     type_name: tuple[str, ...]
     static: Bools
     map_ref: tuple[str, ...]
+    lifetime: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         return len(self.ident)
@@ -378,6 +483,8 @@ class Event:
     detail : str
         Markings that were crossed: ``broken``, ``solid``, ``other``, with commas. Of an environment, what it
         is from now on: ``precipitation=light, fog=mist``.
+    lifetime, other_lifetime : int
+        Which of the entities with these ids; see :class:`Entities`.
     """
 
     kind: str
@@ -388,6 +495,8 @@ class Event:
     other: str = ""
     value: float | None = None
     detail: str = ""
+    lifetime: int = 1
+    other_lifetime: int = 1
 
 
 FAR_NS: Final = 1_000_000_000

@@ -132,7 +132,6 @@ def test_a_word_that_is_not_known_is_refused_with_those_that_are(
         ([[thing("a", static=True), thing("a", 5)]], "two entities have the id 'a'"),
         ([[thing("a", static=True)], [thing("a", 5)]], "was static before and moves now"),
         ([[thing("a")], [thing("a", static=True)]], "moved before and is static now"),
-        ([[thing("a")], [thing("a", kind="bus")]], "was of kind 'car' and is 'bus' now"),
     ],
 )
 def test_a_frame_that_contradicts_itself_or_the_past_is_refused_and_has_not_been(

@@ -15,7 +15,14 @@ import numpy as np
 
 from sgstore.errors import TraceError
 from sgstore.mcap import IDS, Findings, OutOfOrder, digest_of, read_and_digest
-from sgstore.readers._blocks import FrameRows, LossTally, MessageDecoder, assemble, counted
+from sgstore.readers._blocks import (
+    FIRST_STEPS,
+    FrameRows,
+    LossTally,
+    MessageDecoder,
+    assemble,
+    counted,
+)
 from sgstore.readers._roles import channel_rank
 from sgstore.step import Frame, check_entities
 from sgstore.vocabulary import KINDS, TypeMeaning
@@ -412,16 +419,30 @@ class MessageTrace:
         TraceError
             The file cannot be read any more, has no frame, or no frame has the ego that was asked for.
         """
+        first_steps = self._first_steps()
         report = self.report = TraceReport()
         decoder = self.decoder(report)
         refs = frame_refs(self.info.channels, self.recording.window)
         runs = self.recording.walk(report, rank=self._rank)
-        yield from counted(assemble(runs, size, decoder, refs), report)
+        yield from counted(assemble(runs, size, decoder, refs, first_steps), report)
         decoder.settle()
         if not report.frames:
             topic = next(c.topic for c in self.info.channels if c.role == "ground_truth")
             reason = report.losses[0].reason if report.losses else "it has no messages"
             raise TraceError(f"no frame: {reason}", path=self.info.path, channel=topic)
+
+    def _first_steps(self) -> list[int]:
+        """Times between the first frames; ns."""
+        decoder = self.decoder(TraceReport())
+        times: list[int] = []
+        for run in self.recording.walk(TraceReport(), rank=self._rank):
+            for row in np.flatnonzero(np.isin(run.channel, [*decoder.channels])).tolist():
+                frame = decoder.decode(run, row)
+                if frame is not None:
+                    times.append(frame.time_ns)
+            if len(times) > FIRST_STEPS:
+                break
+        return np.diff(times[: FIRST_STEPS + 1]).tolist()
 
 
 AnySurvey = TypeVar("AnySurvey", bound=Survey[Any])
@@ -686,6 +707,8 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
             _lose(self._unreadable, self._named, run, row, error)
             return None
         self.first = frame.ego if self.first is None else self.first
+        for ident, words in frame.losses:
+            self.roster.fault(ident, words)
         for entity in frame.entities:
             if entity.static and entity.ident not in self._known:
                 self._stand(entity)
@@ -714,13 +737,10 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
             raise TypeError(f"{type(frame).__name__} is no Frame")
         if abs(frame.time_ns) >= _LATEST:
             raise ValueError(f"no time: {frame.time_ns} ns")
-        check_entities(frame, self._told)
+        check_entities(frame, self._is_static)
 
-    def _told(self, ident: str) -> tuple[bool, str] | None:
-        if ident not in self._known:
-            return None
-        entity = self._known[ident][1]
-        return entity.static, KINDS[entity.kind]
+    def _is_static(self, ident: str) -> bool | None:
+        return self._known[ident][1].static if ident in self._known else None
 
     def _stand(self, entity: Entity) -> None:
         """Enter what never moves.
@@ -736,7 +756,7 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
 
     def _enter(self, entity: Entity, pose: tuple[float, ...] | None = None) -> int:
         if entity.ident not in self._known:
-            meaning = TypeMeaning(KINDS[entity.kind], entity.special, entity.subkind)
+            meaning = _meaning(entity)
             node = self.roster.enter(entity.ident, meaning, entity.type_name, entity.map_ref, pose)
             self._known[entity.ident] = node, entity
         return self._known[entity.ident][0]
@@ -758,7 +778,16 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
             np.array([e.whole[0] for e in rows], np.int64),
             np.array([e.whole[1] for e in rows], np.int64),
             driven=_driven(moving),
+            kinds={
+                node: (_meaning(entity), entity.type_name)
+                for node, entity in moving.items()
+                if entity.kind != self._known[entity.ident][1].kind
+            },
         )
+
+
+def _meaning(entity: Entity) -> TypeMeaning:
+    return TypeMeaning(KINDS[entity.kind], entity.special, entity.subkind)
 
 
 def _driven(moving: dict[int, Entity]) -> dict[int, tuple[float, ...]]:

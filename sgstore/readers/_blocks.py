@@ -10,18 +10,33 @@ a block begins or ends.
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from collections import deque
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, ClassVar, Final, Generic, TypeVar
+from itertools import islice
+from typing import TYPE_CHECKING, ClassVar, Final, Generic, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
 from sgstore.columns import chained, taken
 from sgstore.mcap import IDS, Loss
-from sgstore.vocabulary import KIND_CODE
-from sgstore.world import INPUTS, POSE, Entities, FrameBlock, MessageRefs, States
+from sgstore.vocabulary import KIND_CODE, KINDS
+from sgstore.world import (
+    FASTEST,
+    HARDEST,
+    INPUTS,
+    POSE,
+    Entities,
+    FrameBlock,
+    MessageRefs,
+    States,
+    derivable_ns,
+    leaps,
+    without_implausible,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -30,6 +45,9 @@ if TYPE_CHECKING:
     from sgstore.world import Bools, Event, Floats, Ints, TraceReport
 
     Steps = tuple[Ints, Ints, Floats, Floats]
+
+Called: TypeAlias = "tuple[TypeMeaning, str]"
+"""What an entity is, and the simulator's own name of its type."""
 
 
 Raw = TypeVar("Raw")
@@ -72,6 +90,12 @@ class FrameRows:
         :data:`sgstore.world.INPUTS` of the ego; NaN where the recording has none.
     driven : mapping
         Node id → the same, of other vehicles than the ego.
+    kinds : mapping
+        Node id → what the frame says that it is, of entities that were entered as another kind.
+    seconds : float
+        Time since the frame before; s. NaN: it is not known, or too long to derive anything across it.
+    returned : int
+        Entities that have come back as others up to this frame; see :class:`~sgstore.readers._lives.Lives`.
     """
 
     time_ns: int
@@ -83,6 +107,9 @@ class FrameRows:
     light_state: Ints
     controls: tuple[float, ...] = NO_INPUTS
     driven: Mapping[int, tuple[float, ...]] = field(default_factory=dict[int, "tuple[float, ...]"])
+    kinds: Mapping[int, Called] = field(default_factory=dict[int, "Called"])
+    seconds: float = NAN
+    returned: int = 0
 
     def __len__(self) -> int:
         return len(self.node)
@@ -101,6 +128,19 @@ class FrameRows:
         )
 
 
+class EntityRow(NamedTuple):
+    """A row of :class:`sgstore.world.Entities`."""
+
+    ident: str
+    kind: int
+    special: str
+    subkind: str
+    type_name: str
+    static: bool
+    map_ref: str
+    lifetime: int = 1
+
+
 @dataclass(slots=True)
 class EntityTable:
     """The entities of a trace in the order in which they were met; the index is the node id. And its events.
@@ -115,17 +155,32 @@ class EntityTable:
         Numbers that nothing on earth has, in states and poses.
     happened : int
         How many events there were.
+    faults : dict
+        Number of an entity, such as ``length of entity 7`` → its first implausible value, and their number.
+    impossible : (2,) int64
+        Derived velocities and accelerations that no body has.
+
+    Notes
+    -----
+    A decoder knows an entity by the number that :meth:`enter` returned: there is one for each id. Node ids are
+    the same numbers until an id returns as another entity (:meth:`enter_again`): that one gets the next node
+    id, and those of later entities move up by one (:meth:`nodes_of`).
     """
 
     report: TraceReport
     size: int = 0
     absurd: int = 0
     happened: int = 0
+    faults: dict[str, tuple[str, int]] = field(default_factory=dict[str, tuple[str, int]])
+    impossible: Ints = field(default_factory=lambda: np.zeros(2, np.int64))
     _events: list[Event] = field(default_factory=list["Event"])
-    _first: int = 0
-    _rows: list[tuple[str, int, str, str, str, bool, str]] = field(default_factory=list)  # pyright: ignore[reportUnknownVariableType]
+    _rows: list[EntityRow] = field(default_factory=list["EntityRow"])
+    _taken: int = 0
     _poses: dict[int, tuple[float, ...]] = field(default_factory=dict[int, tuple[float, ...]])
     _idents: set[str] = field(default_factory=set[str])
+    _returned: list[tuple[int, EntityRow]] = field(default_factory=list[tuple[int, "EntityRow"]])
+    _returned_taken: int = 0
+    _since: dict[str, list[int]] = field(default_factory=dict[str, list[int]])
 
     def enter(
         self,
@@ -156,18 +211,54 @@ class EntityTable:
         node = self.size
         if pose is not None:
             self._poses[node] = pose
-        row = (
-            ident,
-            KIND_CODE[meaning.kind],
-            meaning.special,
-            meaning.subkind,
-            type_name,
-            pose is not None,
-            map_ref,
+        self._rows.append(
+            EntityRow(
+                ident,
+                KIND_CODE[meaning.kind],
+                meaning.special,
+                meaning.subkind,
+                type_name,
+                pose is not None,
+                map_ref,
+            )
         )
-        self._rows.append(row)
         self.size += 1
         return node
+
+    def entered(self, number: int) -> EntityRow:
+        """The entity with a number."""
+        return self._rows[number]
+
+    def enter_again(self, row: EntityRow, before: int, seq: int) -> int:
+        """Enter another entity with an id that is known, and return its node id.
+
+        Parameters
+        ----------
+        row : EntityRow
+        before : int
+            How many ids are known when it is met.
+        seq : int
+            Number of the first frame that has it.
+        """
+        self._returned.append((before, row))
+        self._since.setdefault(row.ident, []).append(seq)
+        return before + len(self._returned) - 1
+
+    @property
+    def returned(self) -> int:
+        """How many entities have an id that another one had before."""
+        return len(self._returned)
+
+    def lives(self, ident: str) -> int:
+        """How many entities have had an id."""
+        return 1 + len(self._since.get(ident, ()))
+
+    def nodes_of(self, numbers: Ints) -> Ints:
+        """Node ids of the first entities with some numbers; below 0: as they are."""
+        if not self._returned:
+            return numbers
+        places = np.array([place for place, _ in self._returned], np.int64)
+        return numbers + np.searchsorted(places, numbers, side="right")
 
     def happen(self, event: Event) -> None:
         """Take up an event."""
@@ -178,29 +269,84 @@ class EntityTable:
 
     def take_events(self) -> tuple[Event, ...]:
         """The events that were not taken yet."""
-        events, self._events = tuple(self._events), []
-        return events
+        events, self._events = self._events, []
+        if self._since:
+            events = [
+                replace(
+                    event,
+                    lifetime=self._lifetime(event.ident, event.seq),
+                    other_lifetime=self._lifetime(event.other, event.seq),
+                )
+                for event in events
+            ]
+        return tuple(events)
+
+    def _lifetime(self, ident: str, seq: int) -> int:
+        """Which of the entities with an id a frame has."""
+        return 1 + bisect_right(self._since.get(ident, ()), seq)
 
     def settle(self) -> None:
         """Report what is odd, once everything was taken."""
         warn = self.report.warnings.append
         if self.absurd:
             warn(f"{self.absurd} numbers of {FAR:g} and more are taken as missing")
+        for what, (first, count) in islice(self.faults.items(), LossTally.MOST):
+            reason = f"{what} {first}: missing in {count} states"
+            self.report.losses.append(Loss(reason, 0, 0))
+        if len(self.faults) > LossTally.MOST:
+            reason = f"{len(self.faults)} entities have sizes or speeds that no body has"
+            self.report.losses.append(Loss(reason, 0, 0))
+        velocities, accelerations = self.impossible.tolist()
+        if velocities:
+            warn(f"{velocities} velocities are not derived from jumps faster than {FASTEST:g} m/s")
+        if accelerations:
+            warn(f"{accelerations} derived accelerations above {HARDEST:g} m/s² are missing")
         if self.happened > MOST_EVENTS:
             warn(f"of {self.happened} events the report lists the first {MOST_EVENTS}")
+
+    def plausible(self, values: Floats, nodes: Sequence[int] | Ints) -> Floats:
+        """The numbers of entities without those that no body has; these are counted.
+
+        Parameters
+        ----------
+        values : (n, 16) float64
+            Columns :data:`POSE`.
+        nodes : (n,) int
+            Node id of each row.
+        """
+        values, faults = without_implausible(values)
+        for row, words in faults:
+            self.fault(self._rows[int(nodes[row])].ident, words)
+        return values
+
+    def fault(self, ident: str, words: str) -> None:
+        """Count a number that no body has: ``length is -4.5 m``."""
+        number, _, value = words.partition(" ")
+        what = f"{number} of entity {ident!r}"
+        first, count = self.faults.get(what, (value, 0))
+        self.faults[what] = first, count + 1
 
     def count_unknown(self, type_name: str) -> None:
         """Count an entity whose type name nothing maps to a kind of its own."""
         unknown = self.report.unknown_types
         unknown[type_name] = unknown.get(type_name, 0) + 1
 
-    def take(self, upto: int) -> tuple[Entities, States]:
-        """The entities that were not taken yet, up to a node id, and the poses of the static ones."""
-        count = upto - self._first
-        rows, self._rows = self._rows[:count], self._rows[count:]
-        columns = tuple(zip(*rows, strict=True)) if rows else ((),) * 7
+    def take(self, upto: int, returned: int) -> tuple[Entities, States]:
+        """The entities that were not taken yet, and the poses of the static ones.
+
+        Parameters
+        ----------
+        upto : int
+            How many ids are known.
+        returned : int
+            How many entities have an id that another one had before.
+        """
+        rows = self._rows[self._taken : upto]
+        for place, row in reversed(self._returned[self._returned_taken : returned]):
+            rows.insert(place - self._taken, row)
+        columns = tuple(zip(*rows, strict=True)) if rows else ((),) * len(EntityRow._fields)
         entities = Entities(
-            first=self._first,
+            first=self._taken + self._returned_taken,
             ident=columns[0],
             kind=np.array(columns[1], np.int8),
             special=columns[2],
@@ -208,14 +354,16 @@ class EntityTable:
             type_name=columns[4],
             static=np.array(columns[5], np.bool_),
             map_ref=columns[6],
+            lifetime=columns[7] if returned else (),
         )
-        nodes = [node for node in range(self._first, upto) if node in self._poses]
+        nodes = [node for node in range(self._taken, upto) if node in self._poses]
         values = np.array([self._poses.pop(node) for node in nodes], np.float64)
         absurd = np.abs(values) >= FAR
         self.absurd += int(absurd.sum())
         values[absurd] = np.nan
-        self._first = upto
-        return entities, _states(np.array(nodes, np.int64), values.reshape(-1, len(POSE)))
+        values = self.plausible(values.reshape(-1, len(POSE)), nodes)
+        self._taken, self._returned_taken = upto, returned
+        return entities, _states(self.nodes_of(np.array(nodes, np.int64)), values)
 
 
 class LossTally:
@@ -266,7 +414,11 @@ class MessageDecoder(Generic[Raw]):
     roster : EntityTable
         Takes up entities while messages are decoded.
     channels : frozenset of int
+    sure_kinds : bool
+        Whether the recording knows what entities are, as a simulator does; see :class:`Lives`.
     """
+
+    sure_kinds: ClassVar[bool] = True
 
     def __init__(
         self, channels: Collection[int], window: tuple[int, int], report: TraceReport
@@ -320,6 +472,7 @@ def assemble(
     size: int,
     decoder: MessageDecoder[Raw],
     refs: Callable[[Messages], MessageRefs],
+    first_steps: Iterable[int] = (),
 ) -> Iterator[FrameBlock]:
     """Blocks of frames from the messages of a recording.
 
@@ -332,6 +485,8 @@ def assemble(
     decoder : MessageDecoder
     refs : callable
         The references of those messages that belong to frames.
+    first_steps : iterable of int
+        Times between the first frames; ns.
 
     Yields
     ------
@@ -341,6 +496,8 @@ def assemble(
     wanted = np.zeros(IDS, np.bool_)
     wanted[[*decoder.channels]] = True
     raw: list[Raw] = []
+    sizes: list[int] = []  # how many ids are known with each of them
+    lives = Lives(decoder.roster, first_steps, sure_kinds=decoder.sure_kinds)
     done: list[FrameRows] = []  # the frame before the block, and those of it that are complete
     open_refs: list[MessageRefs] = []
     block_refs: list[MessageRefs] = []
@@ -355,19 +512,20 @@ def assemble(
                 continue
             window = size + (first > 0)
             if len(done) + len(raw) > window:  # the frame behind the block is complete now, too
-                done += _on_earth(decoder.complete(raw), decoder.roster)
+                done += lives.follow(_on_earth(decoder.complete(raw), decoder.roster), sizes)
                 yield _block(first, done, size, block_refs, decoder.roster, known)
-                first, done, raw = first + size, done[-2:], []
+                first, done, raw, sizes = first + size, done[-2:], [], []
                 window = size + 1
             if len(done) + len(raw) == window:
                 between.add(refs(run.span(start, row)))
                 start, known = row, entered
                 block_refs, open_refs = open_refs + between.take(), []
             raw.append(frame)
+            sizes.append(decoder.roster.size)
             open_refs += between.take()
         between.add(refs(run.span(start, len(run))))
     open_refs += between.take()
-    done += _on_earth(decoder.complete(raw), decoder.roster)
+    done += lives.follow(_on_earth(decoder.complete(raw), decoder.roster), sizes)
     if len(done) - (first > 0) > size:
         yield _block(first, done, size, block_refs, decoder.roster, known)
         first, done = first + size, done[-2:]
@@ -375,6 +533,7 @@ def assemble(
     last = (
         _block(first, done, left, open_refs, decoder.roster, decoder.roster.size) if left else None
     )
+    lives.settle()
     decoder.roster.settle()
     if between.dropped:
         words = f"{between.dropped} sensor messages stand far from any frame, and no frame refers to them"
@@ -448,17 +607,18 @@ def _block(
     offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     skip = len(window[0]) if skipped else 0
     rows = slice(skip, skip + int(offsets[-1]))
-    values, derived = derive(
+    values, derived, impossible = derive(
         np.concatenate([frame.node for frame in window]),
         np.repeat(np.arange(len(window)), [len(frame) for frame in window]),
-        np.array([frame.time_ns for frame in window], np.int64),
+        np.array([frame.seconds for frame in window]),
         np.concatenate([frame.values for frame in window]),
         np.concatenate([frame.light_state for frame in window]) >= 0,
         rows,
     )
+    roster.impossible += impossible
     nodes = np.concatenate([frame.node for frame in frames])
     ego = np.array([frame.ego for frame in frames], np.int64)
-    entities, scenery = roster.take(known)
+    entities, scenery = roster.take(known, frames[-1].returned)
     return FrameBlock(
         seq=np.arange(first, first + len(frames)),
         time_ns=np.array([frame.time_ns for frame in frames], np.int64),
@@ -480,17 +640,185 @@ def _block(
     )
 
 
+FIRST_STEPS: Final = 64
+"""Steps of the clock whose median is the period of a recording, at any time of it."""
+
+
+class Lives:
+    """Frames in order, with the time since the one before, and with the entities that their rows belong to.
+
+    An id that comes back as another kind, or at a place where no body can be, is another entity from then on. A
+    jump of the clock ends no entity: where a body can be after it is not known.
+
+    Parameters
+    ----------
+    roster : EntityTable
+        Takes up the other entities.
+    first_steps : iterable of int
+        Times between the first frames of the recording; ns.
+    sure_kinds : bool
+        False: what a frame calls an entity is a guess, and another guess alone makes no other entity.
+    """
+
+    MOST: ClassVar[int] = 20
+    """Entities that a report names."""
+
+    def __init__(
+        self, roster: EntityTable, first_steps: Iterable[int], *, sure_kinds: bool = True
+    ) -> None:
+        self._roster = roster
+        self._sure_kinds = sure_kinds
+        self._steps = deque((step for step in first_steps if step > 0), FIRST_STEPS)
+        self._time: int | None = None
+        self._seq = self._run = 0
+        self._gaps: list[int] = []
+        self._seen = np.zeros((0, 2), np.int64)  # of each id: time, and run of the clock; -1: never
+        self._places = np.zeros((0, 3))
+        self._nodes: dict[int, int] = {}  # of the ids that have returned
+        self._kinds: dict[int, int] = {}
+        self._told: list[str] = []
+
+    def follow(self, frames: list[FrameRows], sizes: list[int]) -> list[FrameRows]:
+        """The next frames; ``sizes``: how many ids are known with each."""
+        runs: list[int] = []
+        timed: list[FrameRows] = []
+        for frame in frames:
+            seconds = self._seconds(frame.time_ns)
+            timed.append(replace(frame, seconds=seconds, returned=self._roster.returned))
+            runs.append(self._run)
+        far = self._leaps(timed, runs)
+        if not (self._nodes or any(map(len, far)) or any(frame.kinds for frame in frames)):
+            self._seq += len(frames)
+            return timed
+        return [
+            self._entered(frame, rows.tolist(), size)
+            for frame, rows, size in zip(timed, far, sizes, strict=True)
+        ]
+
+    def settle(self) -> None:
+        """Report which ids have returned, and the gaps of the clock."""
+        warnings = self._roster.report.warnings
+        warnings += self._told[: self.MOST]
+        if len(self._told) > self.MOST:
+            warnings.append(f"{len(self._told)} ids in all come back as other entities")
+        if self._gaps:
+            longest = max(self._gaps) / 1e9
+            warnings.append(
+                f"{len(self._gaps)} gaps of more than three periods, the longest of {longest:g} s:"
+                " nothing is derived across them"
+            )
+
+    def _seconds(self, time_ns: int) -> float:
+        """Time since the last frame; NaN: nothing is derived across it."""
+        last, self._time = self._time, time_ns
+        step = 0 if last is None else time_ns - last
+        if step < 0:
+            self._run += 1
+        if step <= 0:
+            return NAN
+        # A median is at least the least: most steps need no median.
+        short = not self._steps or step <= 3 * min(self._steps)
+        joined = short or step <= derivable_ns(float(np.median(self._steps)))
+        self._steps.append(step)
+        if not joined:
+            self._gaps.append(step)
+        return step / 1e9 if joined else NAN
+
+    def _leaps(self, frames: list[FrameRows], runs: list[int]) -> list[Ints]:
+        """Of each frame the rows that lie where the entity of their last row cannot be."""
+        counts = [len(frame) for frame in frames]
+        node = np.concatenate([frame.node for frame in frames] or [np.zeros(0, np.int64)])
+        if not len(node):
+            return [node] * len(frames)
+        self._grow()
+        place = np.concatenate([frame.values[:, _X : _X + 3] for frame in frames])
+        times = np.array([frame.time_ns for frame in frames], np.int64)
+        now = np.repeat(np.stack([times, np.array(runs)], axis=1), counts, axis=0)
+        moves = np.concatenate([frame.light_state for frame in frames]) < 0
+        rows = np.flatnonzero(np.isfinite(place[:, :2]).all(axis=1) & moves)
+        rows = rows[np.argsort(node[rows], kind="stable")]
+        ids, place, now = node[rows], place[rows], now[rows]
+        begins = np.diff(ids, prepend=-1) != 0
+        before, was = np.roll(place, 1, axis=0), np.roll(now, 1, axis=0)
+        before[begins], was[begins] = self._places[ids[begins]], self._seen[ids[begins]]
+        ends = np.append(begins[1:], True)[: len(ids)]
+        self._places[ids[ends]], self._seen[ids[ends]] = place[ends], now[ends]
+        away = place - before
+        far = leaps(np.sqrt(np.nansum(away * away, axis=1)), (now[:, 0] - was[:, 0]) / 1e9)
+        found = np.sort(rows[far & (now[:, 1] == was[:, 1])])
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        cuts = np.searchsorted(found, starts)
+        return [
+            found[low:high] - start
+            for low, high, start in zip(cuts[:-1], cuts[1:], starts[:-1], strict=True)
+        ]
+
+    def _grow(self) -> None:
+        more = 2 * self._roster.size - len(self._seen)
+        if len(self._seen) < self._roster.size:
+            self._seen = np.concatenate([self._seen, np.full((more, 2), -1, np.int64)])
+            self._places = np.concatenate([self._places, np.zeros((more, 3))])
+
+    def _entered(self, frame: FrameRows, far: list[int], size: int) -> FrameRows:
+        """A frame with the node ids of its entities; those that have returned are entered."""
+        for row in far:
+            number = int(frame.node[row])
+            self._return(number, frame.kinds.get(number), size, "is where it cannot have moved")
+        known = {*frame.kinds, *self._kinds} if self._sure_kinds else set[int]()
+        for number in sorted(known & {*frame.node.tolist()}):
+            called = frame.kinds.get(number)
+            first = self._roster.entered(number).kind
+            kind = KIND_CODE[called[0].kind] if called else first
+            if kind != self._kinds.get(number, first):
+                self._return(number, called, size, f"is a {KINDS[kind]} now")
+        self._seq += 1
+        numbers, nodes = frame.node.tolist(), self._roster.nodes_of(frame.node).tolist()
+        found = [self._nodes.get(number, node) for number, node in zip(numbers, nodes, strict=True)]
+        of = dict(zip(numbers, found, strict=True))
+        return replace(
+            frame,
+            node=np.array(found, np.int64),
+            ego=of.get(frame.ego, -1),
+            driven={of[number]: told for number, told in frame.driven.items() if number in of},
+            returned=self._roster.returned,
+        )
+
+    def _return(self, number: int, called: Called | None, size: int, why: str) -> None:
+        """Enter the entity that an id means from this frame on."""
+        row = self._roster.entered(number)
+        if called is not None:
+            meaning, type_name = called
+            row = row._replace(
+                kind=KIND_CODE[meaning.kind],
+                special=meaning.special,
+                subkind=meaning.subkind,
+                type_name=type_name,
+            )
+        row = row._replace(lifetime=self._roster.lives(row.ident) + 1)
+        self._nodes[number] = self._roster.enter_again(row, size, self._seq)
+        self._kinds[number] = row.kind
+        name = f"{row.ident}#{row.lifetime}"
+        self._told.append(
+            f"entity {row.ident!r} {why} (frame {self._seq}): it is a new entity, {name}"
+        )
+
+
 def _on_earth(frames: list[FrameRows], roster: EntityTable) -> list[FrameRows]:
     """The same frames without numbers that nothing on earth has; they are counted, and missing from now on."""
-    values = np.concatenate([frame.values for frame in frames] or [np.zeros(0)])
-    if not (np.abs(values) >= FAR).any():
+    values = np.concatenate([frame.values for frame in frames] or [np.zeros((0, len(POSE)))])
+    absurd = np.abs(values) >= FAR
+    if absurd.any():
+        roster.absurd += int(absurd.sum())
+        values[absurd] = np.nan
+    nodes = np.concatenate([frame.node for frame in frames] or [np.zeros(0, np.int64)])
+    plausible = roster.plausible(values, nodes)
+    if plausible is values and not absurd.any():
         return frames
-    for frame in frames:
-        absurd = np.abs(frame.values) >= FAR
-        if absurd.any():
-            roster.absurd += int(absurd.sum())
-            frame.values[absurd] = np.nan
-    return frames
+    cuts = np.cumsum([len(frame) for frame in frames])[:-1]
+    return [
+        replace(frame, values=part)
+        for frame, part in zip(frames, np.split(plausible, cuts), strict=True)
+    ]
 
 
 def _controls(nodes: Ints, ego: Ints, frames: list[FrameRows], counts: Ints) -> dict[str, Floats]:
@@ -515,16 +843,16 @@ def _states(node: Ints, values: Floats, **more: NDArray[np.generic]) -> States:
 
 
 def derive(
-    node: Ints, frame: Ints, time_ns: Ints, values: Floats, fixed: Bools, rows: slice
-) -> tuple[Floats, Ints]:
+    node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bools, rows: slice
+) -> tuple[Floats, Ints, Ints]:
     """Velocities, accelerations and yaw rates that a recording lacks, by differences.
 
     Parameters
     ----------
     node, frame : (n,) int64
         Node id and frame of each row; frames ascend, a node comes once in a frame.
-    time_ns : (F,) int64
-        Time of each frame.
+    seconds : (F,) float64
+        Time from the frame before to each frame; s. NaN: nothing may be derived across it.
     values : (n, 16) float64
         Columns :data:`POSE`; NaN is what is lacking.
     fixed : (n,) bool
@@ -536,34 +864,43 @@ def derive(
     -------
     values : (m, 16) float64
         The wanted rows. A velocity is the difference of the positions one frame before and one behind,
-        or of one of them and this, where the entity is not in the other or time stands still; NaN if in
-        neither. An acceleration is the difference of velocities likewise if they were read, else the
-        second difference of positions, which needs both neighbours.
+        or of one of them and this, where the entity is not in the other, time stands still, or no body moves
+        so fast; NaN if in neither. An acceleration is the difference of velocities likewise if they were
+        read, else the second difference of positions: it needs both neighbours, and is NaN if no body has it.
     derived : (m,) int64
         Bit 0: velocity, bit 1: acceleration, bit 2: yaw rate.
+    impossible : (2,) int64
+        How many velocities and accelerations are missing or one-sided because no body has them.
     """
     wanted = values[rows].copy()
-    derived = np.zeros(len(wanted), np.int64)
+    derived, impossible = np.zeros(len(wanted), np.int64), np.zeros(2, np.int64)
     lacking = np.isnan(wanted[:, [_VELOCITY, _ACCELERATION, _YAW_RATE]]) & ~fixed[rows, None]
     if not lacking.any():
-        return wanted, derived
-    steps = _neighbours(node, frame, time_ns, rows)
+        return wanted, derived, impossible
+    steps = _neighbours(node, frame, seconds, rows)
+    moving, lost = _possible(values, rows, steps)
     columns = (
-        (_VELOCITY, 3, lambda: _slope(values[:, _X : _X + 3], rows, steps)),
-        (_ACCELERATION, 3, lambda: _accelerations(values, rows, steps)),
-        (_YAW_RATE, 1, lambda: _slope(values[:, [_HEADING]], rows, steps, turn=2 * np.pi)),
+        (_VELOCITY, 3, lambda: _slope(values[:, _X : _X + 3], rows, moving)),
+        (_ACCELERATION, 3, lambda: _accelerations(values, rows, steps, moving)),
+        (_YAW_RATE, 1, lambda: _slope(values[:, [_HEADING]], rows, moving, turn=2 * np.pi)),
     )
+    impossible[0] = int((lost & lacking[:, 0]).sum())
     for bit, (column, width, slopes_of) in enumerate(columns):
         if not lacking[:, bit].any():
             continue
         slopes = slopes_of()
         found = lacking[:, bit] & np.isfinite(slopes).all(axis=1)
+        if column == _ACCELERATION:
+            bent = np.isnan(values[rows, _VELOCITY])  # of positions: noise grows with the square
+            hard = found & bent & (np.hypot(slopes[:, 0], slopes[:, 1]) > HARDEST)
+            impossible[1] = int(hard.sum())
+            found &= ~hard
         wanted[found, column : column + width] = slopes[found]
         derived |= found.astype(np.int64) << bit
-    return wanted, derived
+    return wanted, derived, impossible
 
 
-def _neighbours(node: Ints, frame: Ints, time_ns: Ints, rows: slice) -> Steps:
+def _neighbours(node: Ints, frame: Ints, seconds: Floats, rows: slice) -> Steps:
     """Rows of the same node one frame before and behind; steps of time to them, NaN where there is none."""
     span = int(node.max()) + 1
     keys = frame * span + node
@@ -575,10 +912,24 @@ def _neighbours(node: Ints, frame: Ints, time_ns: Ints, rows: slice) -> Steps:
         key = keys[rows] + side * span
         at = np.minimum(np.searchsorted(sorted_keys, key), len(keys) - 1)
         there = order[at]
-        step = side * (time_ns[frame[there]] - time_ns[frame[rows]]) / 1e9
+        step = seconds[frame[rows] if side < 0 else frame[there]]
         found.append(there)
-        steps.append(np.where((sorted_keys[at] == key) & (step > 0), step, np.nan))
+        steps.append(np.where(sorted_keys[at] == key, step, np.nan))
     return found[0], found[1], steps[0], steps[1]
+
+
+def _possible(values: Floats, rows: slice, steps: Steps) -> tuple[Steps, Bools]:
+    """The steps without those in which no body moves so far, and which rows have lost one."""
+    before, behind, since, until = steps
+    position = values[:, _X : _X + 3]
+    lost = np.zeros(len(since), np.bool_)
+    kept: list[Floats] = []
+    for there, step in ((before, since), (behind, until)):
+        away = position[rows] - position[there]
+        far = np.nansum(away * away, axis=1) > (FASTEST * step) ** 2
+        lost |= far
+        kept.append(np.where(far, np.nan, step))
+    return (before, behind, kept[0], kept[1]), lost
 
 
 def _slope(values: Floats, rows: slice, steps: Steps, turn: float = 0.0) -> Floats:
@@ -598,10 +949,11 @@ def _slope(values: Floats, rows: slice, steps: Steps, turn: float = 0.0) -> Floa
     return np.where(np.isfinite(slopes), slopes, forth / until)
 
 
-def _accelerations(values: Floats, rows: slice, steps: Steps) -> Floats:
+def _accelerations(values: Floats, rows: slice, steps: Steps, moving: Steps) -> Floats:
+    """Accelerations; ``moving``: the steps in which a body may have moved as its positions say."""
     velocity = values[:, _VELOCITY : _VELOCITY + 3]
     position = values[:, _X : _X + 3]
-    before, behind, since, until = steps
+    before, behind, since, until = moving
     since, until = since[:, None], until[:, None]
     back = (position[rows] - position[before]) / since
     forth = (position[behind] - position[rows]) / until

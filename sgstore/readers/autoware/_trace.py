@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from sgstore.mcap import Messages, Recording
+    from sgstore.readers._blocks import Called
     from sgstore.roads import RoadMap
     from sgstore.world import Bools, Floats, Ints, TraceReport
 
@@ -132,6 +133,8 @@ class AutowareRawFrame:
         The poses of ``axes`` and of the ego in the world, once they are known.
     motion : (7,) float64
         Velocity, yaw rate and acceleration of the ego in its own axes.
+    kinds : dict
+        As :class:`~sgstore.readers._blocks.FrameRows` has them.
     """
 
     time_ns: int
@@ -145,6 +148,7 @@ class AutowareRawFrame:
     base: Pose | None = None
     ego: Pose | None = None
     motion: Floats = field(default_factory=lambda: np.full(7, np.nan))
+    kinds: dict[int, Called] = field(default_factory=dict[int, "Called"])
 
 
 @dataclass(slots=True)
@@ -160,6 +164,8 @@ class _Detection:
 class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
     """Messages → frames, with what must be remembered from one to the next.
 
+    The class of an object is a guess of the perception, and the one that it has most often counts.
+
     Parameters
     ----------
     survey : AutowareSurvey
@@ -172,6 +178,8 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
     report : TraceReport
         Takes up what cannot be used.
     """
+
+    sure_kinds: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -332,6 +340,10 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
         nodes = [
             self._enter(ident, survey.label_of(ident, labels[row])) for ident, row in first.items()
         ]
+        kinds: dict[int, Called] = {}
+        for node, row in zip(nodes, first.values(), strict=True):
+            if labels[row] != self.roster.entered(node).type_name:
+                kinds[node] = self._meaning(labels[row]), labels[row]
         if EGO not in self._nodes and self._has_ego():
             meaning = self._types.get(self._box.type.lower(), TypeMeaning("car"))
             self._nodes[EGO] = self.roster.enter(EGO, meaning, self._box.type)
@@ -344,6 +356,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
             text(head, "header.frame_id") or survey.world,
             {node: self._state_now(node, stamp) for node in self._shown},
             *self._reported(stamp),
+            kinds=kinds,
         )
 
     def _has_ego(self) -> bool:
@@ -352,9 +365,11 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
 
     def _enter(self, ident: str, label: str) -> int:
         if ident not in self._nodes:
-            meaning = self._types.get(label) or _KINDS.get(label) or TypeMeaning("unknown")
-            self._nodes[ident] = self.roster.enter(ident, meaning, label)
+            self._nodes[ident] = self.roster.enter(ident, self._meaning(label), label)
         return self._nodes[ident]
+
+    def _meaning(self, label: str) -> TypeMeaning:
+        return self._types.get(label) or _KINDS.get(label) or TypeMeaning("unknown")
 
     def _state_now(self, node: int, stamp: int) -> int:
         told, state = self._shown[node]
@@ -495,6 +510,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
             np.full(len(node), -1, np.int64),
             controls=controls if wanted == ego else (NAN,) * 5,
             driven=driven if (node == ego).any() else {},
+            kinds=frame.kinds,
         )
         return rows.with_heads(self._heads(frame.lights))
 

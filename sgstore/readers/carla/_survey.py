@@ -121,12 +121,15 @@ class Egos:
         Role name → actor id, as other messages than the list of actors tell it.
     seen : set of int
         Ids of objects that were seen.
+    later : dict
+        Actor id → what later lists call it, where that is another blueprint.
     """
 
     wanted: str
     actors: dict[int, Actor] = field(default_factory=dict[int, Actor])
     by_role: dict[str, int] = field(default_factory=dict[str, int])
     seen: set[int] = field(default_factory=set[int])
+    later: dict[int, list[Actor]] = field(default_factory=dict[int, list[Actor]])
 
     def id_of(self, role: str) -> int | None:
         """The vehicle with a role name, if there is one."""
@@ -538,9 +541,12 @@ class CarlaSurvey(Survey[Lead]):
             actor = Actor(text(told, "type"), "" if role == "None" else role)
             before = actors.setdefault(ident, actor)
             if before.type_name != actor.type_name:
+                later = self.egos.later.setdefault(ident, [])
+                if actor not in later and len(later) < _MOST_NOTES:
+                    later.append(actor)
                 note = (
                     f"actor {ident} is called {before.type_name!r} and {actor.type_name!r};"
-                    " the first name counts"
+                    " the first name counts while its objects have the class of the first"
                 )
                 self._note(note)
         return len(actors) > known

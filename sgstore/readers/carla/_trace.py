@@ -52,12 +52,14 @@ from sgstore.readers.carla._survey import (
     stamp_from,
     stamp_of,
 )
-from sgstore.world import POSE
+from sgstore.vocabulary import KINDS
+from sgstore.world import LARGEST, POSE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from sgstore.mcap import Messages, Recording
+    from sgstore.readers._blocks import Called
     from sgstore.roads import RoadMap
     from sgstore.world import Bools, Floats, Ints, TraceReport
 
@@ -119,6 +121,8 @@ class CarlaRawFrame:
         Actor id → mask of :data:`sgstore.vocabulary.VEHICLE_LIGHTS`.
     odometry : (11,) float64 or None
         Columns :data:`ODOMETRY_COLUMNS` of the ego, where it is not among the objects.
+    kinds : dict
+        As :class:`~sgstore.readers._blocks.FrameRows` has them.
     """
 
     time_ns: int
@@ -129,6 +133,7 @@ class CarlaRawFrame:
     controls: dict[int, Controls] = field(default_factory=dict[int, "Controls"])
     vehicle_lights: Mapping[int, int] = field(default_factory=dict[int, int])
     odometry: Floats | None = None
+    kinds: dict[int, Called] = field(default_factory=dict[int, "Called"])
 
 
 class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
@@ -158,6 +163,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
         self._nodes: dict[int, int] = {}
         self._idents: dict[int, int] = {}
         self._people: set[int] = set()
+        self._classes: dict[int, float] = {}
         self._seq = -1
         self._frame: CarlaRawFrame | None = None
         self._controls: dict[int, tuple[int, Controls]] = {}
@@ -218,16 +224,19 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
             self._untimed += 1
             time_ns = log_time
         idents = objects[:, _ID].astype(np.int64).tolist()
-        nodes = self._nodes
-        for row, ident in enumerate(idents):
+        nodes, kinds = self._nodes, dict[int, "Called"]()
+        for ident, classification in zip(idents, objects[:, _CLASS].tolist(), strict=True):
             if ident not in nodes:
-                self._enter(ident, float(objects[row, _CLASS]))
+                self._enter(ident, classification)
+            elif classification != self._classes[ident]:
+                kinds |= self._other(ident, classification)
         frame = CarlaRawFrame(
             time_ns,
             log_time,
             objects,
             np.array([nodes[ident] for ident in idents], np.int64),
             self._lights.of_frame(),
+            kinds=kinds,
         )
         for ident, (stamp, controls) in self._controls.items():
             if -SAME_TICK <= time_ns - stamp <= HOLDS:
@@ -249,9 +258,26 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
             self.roster.count_unknown(type_name)
         node = self.roster.enter(str(ident), meaning, type_name)
         self._nodes[ident] = node
+        self._classes[ident] = classification
         self._idents[node] = ident
         if meaning.kind == "person":
             self._people.add(node)
+
+    def _other(self, ident: int, classification: float) -> dict[int, Called]:
+        """What an object is that has another class than when it was entered, if that is another kind."""
+        node = self._nodes[ident]
+        if np.isnan(self._classes[ident]):
+            self._classes[ident] = classification
+        if np.isnan(classification) or classification == self._classes[ident]:
+            return {}
+        first = KINDS[self.roster.entered(node).kind]
+        meaning, type_name = meaning_of_object(None, classification), f"class {classification:.0f}"
+        for actor in self._survey.egos.later.get(ident, ()):
+            other = meaning_of_object(actor, classification)
+            if (other.kind == "person") == (meaning.kind == "person"):
+                meaning, type_name = other, actor.type_name
+        vague = meaning.kind in {"unknown", "vehicle"}
+        return {} if vague or meaning.kind == first else {node: (meaning, type_name)}
 
     def complete(self, frames: list[CarlaRawFrame]) -> list[FrameRows]:
         """Frames with their numbers, for all of them at once."""
@@ -259,6 +285,11 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
             return []
         nodes = np.concatenate([frame.nodes for frame in frames])
         people = np.isin(nodes, list(self._people))
+        start = 0
+        for frame in frames:
+            for node, (meaning, _) in frame.kinds.items():
+                people[start + np.flatnonzero(frame.nodes == node)] = meaning.kind == "person"
+            start += len(frame.nodes)
         values, usable = _numbers(np.concatenate([frame.objects for frame in frames]), ~people)
         done: list[FrameRows] = []
         start = 0
@@ -297,6 +328,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
             light_state=np.full(len(node), -1, np.int64),
             controls=driven.pop(ego, NO_INPUTS),
             driven=driven,
+            kinds=frame.kinds,
         )
         return rows.with_heads((self._lights.nodes, self._lights.values, frame.light_states))
 
@@ -413,7 +445,8 @@ def _numbers(objects: Floats, lifted: Bools) -> tuple[Floats, Bools]:
     values[:, 3:6] = angles
     values[:, 6:13] = objects[:, _MOTION : _MOTION + 7]
     values[:, 13:16] = _boxes(objects[:, _SHAPE], objects[:, _SIZE : _SIZE + 3])
-    half = np.where(lifted, np.nan_to_num(values[:, 15]) / 2, 0.0)
+    is_tall = lifted & (values[:, 15] > 0) & (values[:, 15] <= LARGEST)
+    half = np.where(is_tall, values[:, 15] / 2, 0.0)
     with np.errstate(invalid="ignore", over="ignore"):
         values[:, :3] += half[:, None] * up
         near = np.abs(values[:, :4]) < FAR
@@ -447,8 +480,6 @@ def _boxes(shape: Floats, size: Floats) -> Floats:
     boxes[sphere] = 2 * size[sphere, :1]
     upright = (shape == _CYLINDER) | (shape == _CONE)  # height, radius
     boxes[upright] = np.column_stack([2 * size[upright, 1], 2 * size[upright, 1], size[upright, 0]])
-    with np.errstate(invalid="ignore"):
-        boxes[~((boxes >= 0) & (boxes < FAR))] = np.nan
     return boxes
 
 

@@ -40,13 +40,14 @@ from sgstore.readers.foxglove._messages import (
     product,
     rotated,
 )
-from sgstore.vocabulary import LIGHT_STATE_CODE, normalize_name
+from sgstore.vocabulary import KINDS, LIGHT_STATE_CODE, normalize_name
 from sgstore.world import POSE
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from sgstore.mcap import Messages, Recording
+    from sgstore.readers._blocks import Called
     from sgstore.readers.foxglove._mapping import Ego
     from sgstore.readers.foxglove._messages import Box, Pose, SceneUpdate, Transform
     from sgstore.world import TraceReport
@@ -200,12 +201,14 @@ class FoxgloveSurvey(Survey[Lead]):
 class FoxgloveRawFrame:
     """A frame whose poses are still in the axes that they were told in.
 
-    ``boxes``: each with its node id and log time of the frame that it was told with.
+    ``boxes``: each with its node id and log time of the frame that it was told with. ``kinds``: as
+    :class:`~sgstore.readers._blocks.FrameRows` has them.
     """
 
     time_ns: int
     log_time_ns: int
     boxes: list[tuple[int, Box]] = field(default_factory=list)  # pyright: ignore[reportUnknownVariableType]
+    kinds: dict[int, Called] = field(default_factory=dict[int, "Called"])
 
 
 class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
@@ -226,6 +229,7 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
         self._axes = Axes()
         self._nodes: dict[tuple[int, str], int] = {}
         self._idents: list[str] = []
+        self._kinds: dict[int, Called] = {}
         self._ego = -1
         self._standing: dict[int, dict[str, tuple[int, Box]]] = {}
         self._open: FoxgloveRawFrame | None = None
@@ -276,6 +280,9 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
             frame.boxes += [
                 (self._nodes[source, ident], box) for ident, (_, box) in standing.items()
             ]
+        if self._kinds:
+            here = {node for node, _ in frame.boxes}
+            frame.kinds = {node: told for node, told in self._kinds.items() if node in here}
 
     def complete(self, frames: list[FoxgloveRawFrame]) -> list[FrameRows]:
         """Frames with the poses of their boxes in the axes that stand still."""
@@ -338,9 +345,21 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
             if len(standing) >= MAX_STANDING and ident not in standing:
                 self._left_out.add(f"more than {MAX_STANDING} entities at once", log_time)
                 continue
-            if (channel, ident) not in self._nodes:
+            node = self._nodes.get((channel, ident))
+            if node is None:
                 self._nodes[channel, ident] = self._enter(ident, box)
+            else:
+                self._see_kind(node, box)
             standing[ident] = (box.time_ns or time_ns, box)
+
+    def _see_kind(self, node: int, box: Box) -> None:
+        """Take note of what an entity is called now, if that is another kind than when it was entered."""
+        first, type_name = self.roster.entered(node), self._mapping.entity.type_of(box)
+        self._kinds.pop(node, None)
+        if type_name != first.type_name:
+            meaning = self._mapping.meaning(type_name)
+            if meaning.kind != KINDS[first.kind]:
+                self._kinds[node] = meaning, type_name
 
     def _enter(self, ident: str, box: Box) -> int:
         type_name = self._mapping.entity.type_of(box)
@@ -396,6 +415,7 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
             values=np.array(rows, np.float64).reshape(count, len(POSE)),
             lights=np.full(count, -1, np.int64),
             light_state=np.array(states, np.int64),
+            kinds=frame.kinds,
         )
 
     def _values(self, box: Box, time_ns: int) -> list[float] | None:

@@ -86,8 +86,11 @@ _ROUNDS: Final = 64
 _MOST_LAYOUTS: Final = 256
 """Layouts that are remembered for objects of one length; then they are forgotten and learned anew."""
 
-Tree = dict[int, "Tree | int | NDArray[np.int64]"]
-"""Fields that are read: number → those within, or the column of a double, or what states of a light mean."""
+Tree = dict[int, "Tree | int | str | NDArray[np.int64]"]
+"""Fields that are read: number → those within, or the column of a double, or what states of a light mean, or
+``type`` and ``vehicle``, the two fields that say what the object is."""
+TYPES: Final = 1 << 10
+"""More than any type of a vehicle; the code of an object is its type times this, and that of the vehicle."""
 
 
 @dataclass(slots=True)
@@ -97,7 +100,8 @@ class _ObjectLayout:
     ``compared``, ``mask``, ``expected``: places of all bytes that are no numbers, which of their bits count,
     and what those are. ``runs``: first column, place and number of doubles that follow one another. ``zero``:
     columns of sub-messages that are there but leave the number out. ``lights``: where states of lights stand,
-    and what they mean. ``parts``: which sub-messages of the base there are.
+    and what they mean. ``types``: where types stand, and by what they count in the code of an object.
+    ``parts``: which sub-messages of the base there are.
     """
 
     compared: Ints
@@ -106,6 +110,7 @@ class _ObjectLayout:
     runs: list[tuple[int, int, int]]
     zero: Ints
     lights: list[tuple[int, int, NDArray[np.int64]]]
+    types: list[tuple[int, int, int]]
     parts: set[str]
 
     def agree(self, objects: Bytes) -> Bools:
@@ -121,6 +126,7 @@ class _Learned:
     doubles: dict[int, int] = field(default_factory=dict[int, int])
     zero: list[int] = field(default_factory=list[int])
     lights: list[tuple[int, int, NDArray[np.int64]]] = field(default_factory=list)  # pyright: ignore[reportUnknownVariableType]
+    types: list[tuple[int, int, int]] = field(default_factory=list[tuple[int, int, int]])
     parts: set[int] = field(default_factory=set[int])
 
 
@@ -139,7 +145,7 @@ class MovingObjects:
         self._base, self._tree = self._trees(message.DESCRIPTOR)
         self._layouts: dict[int, list[_ObjectLayout]] = {}
 
-    def read(self, objects: list[bytes]) -> tuple[Floats, Bools, Ints]:
+    def read(self, objects: list[bytes]) -> tuple[Floats, Bools, Ints, Ints]:
         """The numbers of serialised objects.
 
         Returns
@@ -152,24 +158,28 @@ class MovingObjects:
             malformed is not usable.
         lights : (n,) int64
             Mask of :data:`sgstore.vocabulary.VEHICLE_LIGHTS`; -1 if the object tells nothing of its lights.
+        codes : (n,) int64
+            What each object is, as :func:`code_of` has it.
         """
         values = np.full((len(objects), len(POSE)), np.nan)
         usable = np.zeros(len(objects), np.bool_)
-        lights = np.full(len(objects), -1, np.int64)
+        lights, codes = np.full(len(objects), -1, np.int64), np.zeros(len(objects), np.int64)
+        columns = values, usable, lights, codes
         lengths = np.fromiter(map(len, objects), np.int64, len(objects))
         order = np.argsort(lengths, kind="stable")
         cuts = np.flatnonzero(np.diff(lengths[order])) + 1
         for rows in np.split(order, cuts) if len(order) else ():
             joined = b"".join([objects[row] for row in rows.tolist()])
             content = np.frombuffer(joined, np.uint8).reshape(len(rows), -1)
-            for row in self._read_alike(rows, content, values, usable, lights):
-                values[row], usable[row], lights[row] = self._read_one(objects[row])
-        return values, usable, lights
+            for row in self._read_alike(rows, content, columns):
+                values[row], usable[row], lights[row], codes[row] = self._read_one(objects[row])
+        return columns
 
     def _read_alike(
-        self, rows: NDArray[np.intp], content: Bytes, values: Floats, usable: Bools, lights: Ints
+        self, rows: NDArray[np.intp], content: Bytes, columns: tuple[Floats, Bools, Ints, Ints]
     ) -> list[int]:
         """Read objects of one length, and return the rows of those that are left over."""
+        values, usable, lights, codes = columns
         odd: list[int] = []
         for _ in range(_ROUNDS):
             if not len(rows):
@@ -183,7 +193,7 @@ class MovingObjects:
             alike = agree.all()
             here, found = (rows, content) if alike else (rows[agree], content[agree])
             values[here], usable[here] = _numbers(layout, found)
-            lights[here] = _lights(layout, found)
+            lights[here], codes[here] = _lights(layout, found), _codes(layout, found)
             if alike:
                 return odd
             rows, content = rows[~agree], content[~agree]
@@ -208,15 +218,22 @@ class MovingObjects:
                 if name in within
             }
         tree: Tree = {base.number: inner}
+        tree[found.fields_by_name["type"].number] = "type"
         vehicle = found.fields_by_name.get("vehicle_classification")
-        state = vehicle.message_type.fields_by_name.get("light_state") if vehicle else None
-        if vehicle is not None and state is not None and state.message_type is not None:
+        within = vehicle.message_type.fields_by_name if vehicle else {}
+        inside: Tree = {}
+        if "type" in within:
+            inside[within["type"].number] = "vehicle"
+        state = within.get("light_state")
+        if state is not None and state.message_type is not None:
             lamps: Tree = {
                 told.number: _meanings(told, bit)
                 for name, bit in _LIGHTS.items()
                 if (told := state.message_type.fields_by_name.get(name)) is not None
             }
-            tree[vehicle.number] = {state.number: lamps}
+            inside[state.number] = lamps
+        if inside:
+            tree[vehicle.number] = inside
         self._base_number = int(base.number)
         return parts, tree
 
@@ -246,6 +263,7 @@ class MovingObjects:
             runs=_runs(found.doubles),
             zero=np.array([c for c in found.zero if c not in found.doubles], np.int64),
             lights=found.lights,
+            types=found.types,
             parts={self._parts[number] for number in found.parts},
         )
 
@@ -280,14 +298,16 @@ class MovingObjects:
                 found.doubles[known] = at
             elif isinstance(known, np.ndarray) and wire == _VARINT:
                 found.lights.append((at, end, known))
+            elif isinstance(known, str) and wire == _VARINT:
+                found.types.append((at, end, TYPES if known == "type" else 1))
 
-    def _read_one(self, content: bytes) -> tuple[Floats, bool, int]:
+    def _read_one(self, content: bytes) -> tuple[Floats, bool, int, int]:
         """Read an object as protobuf does; what is malformed is not usable."""
         values = np.full(len(POSE), np.nan)
         try:
             thing = self._message.FromString(content)
         except DECODE_ERRORS:
-            return values, False, -1
+            return values, False, -1, 0
         for part, names in BASE.items():
             if part in self._base and thing.base.HasField(part):
                 told = getattr(thing.base, part)
@@ -295,7 +315,7 @@ class MovingObjects:
                     values[POSE.index(target)] = getattr(told, name, 0.0)
         oriented = thing.base.HasField("orientation")
         near = thing.base.HasField("position") and bool(_near(values[None], oriented=oriented)[0])
-        return values, near, light_bits(thing)
+        return values, near, light_bits(thing), code_of(thing)
 
 
 _TARGETS: Final = {
@@ -348,12 +368,33 @@ def _near(values: Floats, *, oriented: bool) -> Bools:
 def _lights(layout: _ObjectLayout, content: Bytes) -> Ints:
     bits = np.full(len(content), -1, np.int64)
     for start, stop, table in layout.lights:
-        state = np.zeros(len(content), np.uint64)
-        for place in range(stop - 1, start - 1, -1):
-            state = state << np.uint64(7) | (content[:, place] & 0x7F)
-        told = table[np.minimum(state, _STATES - 1).astype(np.int64)]
+        state = np.minimum(_whole(content, start, stop), np.uint64(_STATES - 1))
+        told = table[state.astype(np.int64)]
         bits = np.where(told < 0, bits, np.maximum(bits, 0) | told)
     return bits
+
+
+def _codes(layout: _ObjectLayout, content: Bytes) -> Ints:
+    codes = np.zeros(len(content), np.int64)
+    for start, stop, weight in layout.types:
+        told = np.minimum(_whole(content, start, stop), np.uint64(TYPES - 1))
+        codes += weight * told.astype(np.int64)
+    return codes
+
+
+def _whole(content: Bytes, start: int, stop: int) -> NDArray[np.uint64]:
+    """Numbers of variable length, one in each row."""
+    found = np.zeros(len(content), np.uint64)
+    for place in range(stop - 1, start - 1, -1):
+        found = found << np.uint64(7) | (content[:, place] & 0x7F).astype(np.uint64)
+    return found
+
+
+def code_of(thing: Any) -> int:
+    """What a ``MovingObject`` is, as a number: its type, and that of its class of vehicles."""
+    vehicle = getattr(getattr(thing, "vehicle_classification", None), "type", 0)
+    told = (part if 0 <= part < TYPES else TYPES - 1 for part in (thing.type, vehicle))
+    return next(told) * TYPES + next(told)
 
 
 def light_bits(thing: Any) -> int:

@@ -22,7 +22,7 @@ from google.protobuf import message_factory
 from sgstore.mcap import Loss
 from sgstore.readers._base import SurveyedTrace
 from sgstore.readers._blocks import NAN, NO_INPUTS, FrameRows, LossTally, MessageDecoder
-from sgstore.readers.osi._objects import UNTOLD, MovingObjects, TrafficLights
+from sgstore.readers.osi._objects import UNTOLD, MovingObjects, TrafficLights, code_of
 from sgstore.readers.osi._schema import (
     DECODE_ERRORS,
     GROUND_TRUTH,
@@ -35,12 +35,12 @@ from sgstore.readers.osi._schema import (
     parse,
 )
 from sgstore.readers.osi._survey import OsiSurvey, is_key, keys_of, schema_name
-from sgstore.vocabulary import TypeMeaning, type_meanings
+from sgstore.vocabulary import KINDS, TypeMeaning, type_meanings
 from sgstore.world import POSE, Event
 
 if TYPE_CHECKING:
     from sgstore.mcap import Messages, Recording
-    from sgstore.readers._blocks import EntityTable
+    from sgstore.readers._blocks import Called, EntityTable
     from sgstore.world import Bools, Floats, Ints, TraceReport
 
 
@@ -211,6 +211,8 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
         lead = survey.leads[survey.leading]
         self._class = lead.objects  # the numbers of fields are those of every version
         self._objects = MovingObjects(self._class)
+        self._codes: dict[int, int] = {}
+        self._kinds: dict[int, str] = {}
         names = {bulb: one.name for bulb, one in survey.signals.items()}
         self._lights = TrafficLights(self.roster, light_class(lead.message), names)
         self._environment = Environment(lead.message, self.roster)
@@ -265,13 +267,14 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
     def complete(self, frames: list[OsiRawFrame]) -> list[FrameRows]:
         """Frames with their numbers, read for all of them at once."""
         objects = [content for frame in frames for content in frame.objects]
-        values, usable, lights = self._objects.read(objects)
+        values, usable, lights, codes = self._objects.read(objects)
         turned = usable & (np.abs(values[:, _HEADING]) > math.pi)
         values[turned, _HEADING] = np.remainder(values[turned, _HEADING] + np.pi, 2 * np.pi) - np.pi
         node = np.array([node for frame in frames for node in frame.nodes], np.int64)
         ego = self._nodes.get(self._ego, -1) if self._ego is not None else -1
         of_ego, stands = node == ego, np.full(len(node), -1, np.int64)
         whole = bool(usable.all())
+        kinds = self._other_kinds(frames, node, np.where(usable, codes, -1), objects)
         done: list[FrameRows] = []
         start = 0
         for frame in frames:
@@ -285,11 +288,33 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
                 lights=lights[rows],
                 light_state=stands[rows],
                 controls=frame.controls,
+                kinds=kinds.get(len(done), {}),
             )
             one = one if whole else self._usable(one, usable[rows], ego)
             done.append(one.with_heads(frame.heads))
             start = rows.stop
         return done
+
+    def _other_kinds(
+        self, frames: list[OsiRawFrame], node: Ints, codes: Ints, objects: list[bytes]
+    ) -> dict[int, dict[int, Called]]:
+        """Frame → node id → what its object is, where that is of another kind than what was entered."""
+        entered = np.full(self.roster.size, -1, np.int64)
+        entered[[*self._codes]] = [*self._codes.values()]
+        rows = np.flatnonzero((codes >= 0) & (codes != entered[node]))
+        ends = np.cumsum([len(frame.objects) for frame in frames])
+        found: dict[int, dict[int, Called]] = {}
+        for row in rows.tolist():
+            number, code = int(node[row]), int(codes[row])
+            kind = KINDS[self.roster.entered(number).kind]
+            if self._kinds.get(code) == kind:
+                continue
+            called = self._called(self._class.FromString(objects[row]))
+            self._kinds[code] = called[0].kind
+            if called[0].kind != kind:
+                frame = int(np.searchsorted(ends, row, side="right"))
+                found.setdefault(frame, {})[number] = called
+        return found
 
     # One message ---------------------------------------------------------------------------------------
 
@@ -411,7 +436,17 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
         return node
 
     def _enter(self, thing: Any) -> int:
-        """Enter a moving object that is seen for the first time.
+        """Enter a moving object that is seen for the first time."""
+        meaning, type_name = self._called(thing)
+        if meaning.kind == "vehicle" and not meaning.subkind:
+            self.roster.count_unknown(type_name)
+        ident = self._idents.get(thing.id.value, str(thing.id.value))
+        node = self.roster.enter(ident, meaning, type_name)
+        self._codes[node] = code_of(thing)
+        return node
+
+    def _called(self, thing: Any) -> Called:
+        """What a moving object is, and its type.
 
         Its class counts if it is said to be a vehicle, or if nothing is said of what it is.
         """
@@ -427,12 +462,9 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
             special = meanings[role.lower()].special if role.lower() in meanings else ""
         vague = TypeMeaning("vehicle" if is_vehicle else "unknown")
         meaning = meanings.get(type_name.lower(), vague)
-        if meaning is vague and is_vehicle:
-            self.roster.count_unknown(type_name)
         if special:
             meaning = replace(meaning, special=special)
-        ident = self._idents.get(thing.id.value, str(thing.id.value))
-        return self.roster.enter(ident, meaning, type_name)
+        return meaning, type_name
 
     def _enter_statics(self) -> None:
         statics = self._survey.statics

@@ -23,6 +23,7 @@ from sgstore.readers.sumo._file import STEP, time_ns
 from sgstore.readers.sumo._lights import LightStates, lights_beside
 from sgstore.step import Frame
 from sgstore.vocabulary import KINDS, TypeMeaning, type_meanings
+from sgstore.world import LARGEST
 
 if TYPE_CHECKING:
     from sgstore.mcap import Recording
@@ -87,6 +88,10 @@ class SumoTrace(FramesTrace):
         if beside is not None:
             self.info = replace(self.info, mapping=digest_of(beside))
 
+    def start(self) -> None:
+        """Forget which element has which id."""
+        self._owners: dict[str, str] = {}
+
     def on_map(self, road_map: RoadMap | None) -> None:
         """Find the places of traffic lights in the road map that the recording is read with."""
         if road_map is None or self._lights is None:
@@ -108,7 +113,7 @@ class SumoTrace(FramesTrace):
         """Return the frame that a time step tells."""
         time = time_ns(message.data)
         frame = Frame(message.log_time_ns if time is None else time)
-        step = _TimeStep(frame)
+        step = _TimeStep(frame, self._owners)
         try:
             parser = MarkupParser(step.start, step.end, most=MAX_ENTITIES, whose="recordings")
             parser.feed(message.data, last=True)
@@ -131,10 +136,13 @@ class SumoTrace(FramesTrace):
 
 
 class _TimeStep:
-    """Handler of events of XML: vehicles, persons and containers become entities of a frame."""
+    """Handler of events of XML: vehicles, persons and containers become entities of a frame.
 
-    def __init__(self, frame: Frame) -> None:
-        self._frame = frame
+    SUMO has vehicles and persons of one name. ``owners``: the element that had a name first.
+    """
+
+    def __init__(self, frame: Frame, owners: dict[str, str]) -> None:
+        self._frame, self._owners = frame, owners
         self._idents: set[str] = set()
 
     def start(self, tag: str, told: dict[str, str]) -> None:
@@ -142,7 +150,9 @@ class _TimeStep:
         if tag not in {"vehicle", "person", "container"} or "x" not in told:
             return
         ident = told["id"]
-        while ident in self._idents:  # SUMO has vehicles and persons of one name
+        if self._owners.setdefault(ident, tag) != tag:
+            ident = f"{tag} {ident}"
+        while ident in self._idents:
             ident = f"{tag} {ident}"
         self._idents.add(ident)
         walks = tag == "person"
@@ -157,7 +167,7 @@ class _TimeStep:
         width, height = _number(told, "width", size[1]), _number(told, "height", size[2])
         heading = math.radians(90.0 - _number(told, "angle"))
         ahead = (math.cos(heading), math.sin(heading))
-        back = 0.0 if math.isnan(length + heading) else length / 2
+        back = length / 2 if 0 < length <= LARGEST and math.isfinite(heading) else 0.0
         speed, push = _number(told, "speed"), _number(told, "acceleration")
         # SUMO does not let vehicles slide: they move where they look to. Of a lane change it knows no more.
         way = ahead if math.isfinite(heading) else (math.nan, math.nan)
