@@ -72,6 +72,49 @@ def test_the_gap_is_between_footprints(x: float, y: float, heading: float, expec
     assert gap(car, other)[0] == pytest.approx(expected, abs=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("x", "y", "heading", "expected"),
+    [
+        pytest.param(10, 0, 0, 6, id="apart: the gap"),
+        pytest.param(4, 0, 0, 0, id="touching"),
+        pytest.param(3.7, 0.5, 0, -0.3, id="bumper in bumper"),
+        pytest.param(1, 1.9, 0, -0.1, id="side in side"),
+        pytest.param(2.8, 0, PI / 2, -0.2, id="bumper in door"),
+        pytest.param(0, 0, 0, -2, id="one in the other: out sideways"),
+        pytest.param(0, 0, PI / 2, -3, id="crosswise: out along either axis"),
+    ],
+)
+def test_the_clearance_is_the_gap_or_the_shortest_way_out(
+    x: float, y: float, heading: float, expected: float
+) -> None:
+    numbers = PairNumbers(moving(0, 0), moving(x, y, heading))
+
+    assert numbers["clearance"][0] == pytest.approx(expected, abs=1e-12)
+
+
+def test_boxes_moved_out_by_their_clearance_touch_and_by_less_overlap() -> None:
+    a, b = random_pairs(3000)
+    a, b = (np.insert(one, 2, 0, axis=1) for one in (a, b))
+    numbers = PairNumbers(a, b)
+    depth = -numbers["clearance"]
+    deep = depth > 1e-6
+    a, b, depth = a[deep], b[deep], depth[deep]
+
+    def freed(share: float) -> Floats:
+        """Whether a move in one of 720 directions separates the boxes."""
+        free = np.zeros(len(a), bool)
+        for angle in np.arange(720) / 720 * 2 * PI:
+            moved = b.copy()
+            moved[:, 0] += np.cos(angle) * depth * share
+            moved[:, 1] += np.sin(angle) * depth * share
+            free |= PairNumbers(a, moved)["gap"] > 0
+        return free
+
+    assert len(depth) > 200
+    assert freed(1.001).all()
+    assert not freed(0.999).any()
+
+
 @pytest.mark.parametrize("column", range(5))
 def test_a_missing_number_makes_the_gap_missing(column: int) -> None:
     a = np.array([[0, 0, 0, 4, 2.0]] * 2)
@@ -274,6 +317,15 @@ def apart(a: Box, b: Box) -> float:
     return shapely.distance(one, other)
 
 
+def clear(a: Box, b: Box) -> float:
+    """The gap, or the shortest way out of an overlap: from the centre to an edge of the Minkowski sum."""
+    shapes = [corners(np.array([[0.0, 0.0, o.heading, o.length, o.width]]))[0] for o in (a, b)]
+    sums = shapely.MultiPoint([one + other for one in shapes[0] for other in shapes[1]]).convex_hull
+    there = shapely.Point((b.place - a.place).real, (b.place - a.place).imag)
+    inside = sums.contains(there)
+    return -sums.exterior.distance(there) if inside else sums.distance(there)
+
+
 def closing(a: Box, b: Box) -> float:
     """The part of b's velocity, as a sees it, that leads to a."""
     there = (b.place - a.place) / abs(b.place - a.place)
@@ -302,6 +354,7 @@ DEFINITIONS: dict[str, Callable[[Box, Box], float | None]] = {
     "rel_speed": lambda a, b: abs(b.velocity - a.velocity),
     "apparent_heading": lambda a, b: angle(b.heading - cmath.phase(b.place - a.place)),
     "closing_time": lambda a, b: apart(a, b) / closing(a, b) if closing(a, b) > 0 else None,
+    "clearance": clear,
 }
 """Of all but those with a test of their own: ``ttc``, ``lon_gap`` and ``lat_gap``."""
 

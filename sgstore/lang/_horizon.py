@@ -295,7 +295,7 @@ def _safe(margin: float, speed: float) -> float:
 
 _SMALL: Final[Mapping[str, Callable[[float, float], float]]] = {
     "dist": lambda value, _: value,
-    "gap": lambda value, _: value + BODY,
+    **dict.fromkeys(("gap", "clearance"), lambda value, _: value + BODY),
     "ttc": lambda value, speed: 2 * speed * value + BODY,
     "closing_time": lambda value, speed: 2 * speed * value + BODY,
     "headway": lambda value, speed: speed * value + BODY,

@@ -7,6 +7,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Final
 
 import sgstore.pair_numbers._boxes as boxes
+import sgstore.pair_numbers._contact as contact
 import sgstore.pair_numbers._crossing as crossing
 import sgstore.pair_numbers._encounter as encounter
 import sgstore.pair_numbers._evading as evading
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from sgstore.pair_numbers._declared import PairFunction
 
 # New columns come behind.
-_FAMILIES: Final = (boxes, encounter, following, crossing, rss, evading, mild)
+_FAMILIES: Final = (boxes, encounter, following, crossing, rss, evading, mild, contact)
 
 PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
     name: one for family in _FAMILIES for name, one in family.NUMBERS.items()
