@@ -37,6 +37,9 @@ BUCKET_FRAMES = 60
 GAP: Final = 2.5
 """Between frames that are further apart than so many median periods of their trace some are missing."""
 
+JUMP_NS: Final = 86_400_000_000_000
+"""Time between two frames where the clock jumps back, as all that looks along time has it: a day; ns."""
+
 TOLERANCE_NS: Final = 1_000
 """Times that differ by no more than this are the same; ns."""
 

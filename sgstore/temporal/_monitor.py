@@ -337,8 +337,8 @@ class Monitor:
     ) -> tuple[FrameTime, list[NodeNames]]:
         """Ask all questions of the graphs of a frame."""
         self._pulse.step(graphs[0].time_ns)
-        tick, start = self._pulse.tick, self._pulse.start
-        here = FrameTime(tick.number, tick.time, (tick.time - start) / 1e9)
+        tick, time = self._pulse.tick, self._pulse.told(self._pulse.tick.time)
+        here = FrameTime(tick.number, time, (time - self._pulse.start) / 1e9)
         people: list[NodeNames] = []
         for (number, world), questions in zip(self._scopes, self._questions, strict=True):
             view = self._view(graphs[number], here, number if classed else None)

@@ -33,7 +33,7 @@ from sgstore.temporal._plan import Ask, ask_text
 from sgstore.temporal._robustness import MARGIN_CELLS, MarginTable, margin_columns
 from sgstore.temporal._signals import Clock, SignalValues, evaluate_rows
 from sgstore.vocabulary import RELATIONS
-from sgstore.world import longest_step_ns, tolerance_ns
+from sgstore.world import JUMP_NS, longest_step_ns, tolerance_ns
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -482,7 +482,8 @@ def _clocks(
         longest, tolerance = longest_step_ns(period), tolerance_ns(period)
         ticks = Clock.of(ascending(times), numbers, period, longest, tolerance)
         if gaps == "bridge":
-            ticks = replace(ticks, runs=np.zeros_like(ticks.runs))
+            jumps = np.diff(ticks.times, prepend=ticks.times[:1]) == JUMP_NS
+            ticks = replace(ticks, runs=np.cumsum(jumps))
         found[trace_id] = TraceReader(trace_id, name, ids[rows], numbers, times, logs, start, ticks)
     return found
 
@@ -565,6 +566,13 @@ def _by_trace(ids: Ints) -> Iterable[tuple[int, slice]]:
 
 
 def ascending(times: Ints) -> Ints:
-    """Times that ascend, where a recording's stand still or go back: a nanosecond later than the one before."""
+    """Times that ascend, where a recording's stand still or jump back.
+
+    A time that is equal to the one before counts as a nanosecond later. Behind a jump back all times are later by
+    so much that :data:`sgstore.world.JUMP_NS` lie between: the jump is a gap, and no bound of time spans it.
+    """
+    steps = np.diff(times, prepend=times[:1])
+    if np.any(steps < 0):
+        times = times + np.cumsum(np.where(steps < 0, JUMP_NS - steps, 0))
     ticks = np.arange(len(times))
     return np.maximum.accumulate(times - ticks) + ticks if len(times) else times

@@ -585,6 +585,6 @@ class RobustnessMonitor:
         if decisive["name"] < 0:
             return Robustness(value, nodes=nodes, names=called)
         condition = condition_text(self._plan, self._stream.name(int(decisive["name"])))
-        time = int(decisive["time"])
+        time = self._pulse.told(int(decisive["time"]))
         when = int(decisive["frame"]), time, (time - self._pulse.start) / NS
         return Robustness(value, condition, *when, nodes, called)

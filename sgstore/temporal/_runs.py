@@ -136,7 +136,7 @@ class FrameLine:
     def begins(self) -> Bools:
         """(F,) whether a trace begins with a frame, or what follows a gap."""
         found = np.zeros(len(self.ids), np.bool_)
-        if self.apart:  # a time that goes back is no gap, and is not told apart from one by buckets
+        if self.apart:
             longest = np.array([longest_step_ns(period) for period in self.periods.tolist()])
             found[1:] = np.diff(self.times) > longest[self.owners[1:]]
             found |= np.diff(seq_of(self.ids), prepend=-2) != 1

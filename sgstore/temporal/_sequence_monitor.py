@@ -334,7 +334,7 @@ class SequenceMonitor:
     def step(self, here: FrameTime, people: NodeNames) -> list[MonitorEvent]:
         """A frame has come, and the questions were asked of it: what is known from it on."""
         self._conditions.step()
-        gap = self._pulse.gap and self.query.gaps != "bridge"
+        gap = self._pulse.breaks(bridge=self.query.gaps == "bridge")
         for number in range(len(self._steps)):
             now = self._now(number)
             held = self._held[number]
@@ -513,8 +513,9 @@ class SequenceMonitor:
                     if first < p.number <= last or (p.number == last + 1 > first and not p.gap)
                 ]
             case "then":
-                by = self._pulse.tick.tolerance
-                return [p for p in found if p.number > first and _within(link, place, p, by)]
+                by, jump = self._pulse.tick.tolerance, self._pulse.jump_after(place.time)
+                found = [p for p in found if first < p.number < jump]
+                return [p for p in found if _within(link, place, p, by)]
 
     def _closed(  # noqa: PLR0911 - a case each
         self, place: StepFrame, link: StepLink, held: StepState | None, stop: int
@@ -535,6 +536,8 @@ class SequenceMonitor:
                 return place.run.over and undecided > place.run.last + 1
             case "then":
                 within = link.within
+                if undecided >= self._pulse.jump_after(place.time):
+                    return True
                 if within is None:
                     return False
                 if within.frames:
@@ -589,7 +592,8 @@ class SequenceMonitor:
         return one.number, other.number
 
     def _moment(self, place: StepFrame) -> FrameTime:
-        return FrameTime(place.number, place.time, (place.time - self._pulse.start) / 1e9)
+        time = self._pulse.told(place.time)
+        return FrameTime(place.number, time, (time - self._pulse.start) / 1e9)
 
     # What is kept
 

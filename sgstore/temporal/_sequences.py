@@ -34,6 +34,7 @@ from sgstore.temporal._plan import (
     way_text,
 )
 from sgstore.temporal._runs import RunFinder
+from sgstore.world import JUMP_NS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -99,6 +100,11 @@ class BindingLine:
         breaks = np.ones(self.stride, np.bool_)
         breaks[1 : self.frames] = clock.gap_before[1:]
         self._breaks = breaks
+        jumps = np.flatnonzero(np.diff(clock.times) == JUMP_NS)
+        lasts = np.append(jumps, self.frames - 1)
+        self._lasts = lasts[
+            np.searchsorted(jumps, np.arange(self.frames))
+        ]  # before the clock jumps
 
     def frame(self, places: Ints) -> Ints:
         """The frame of each place."""
@@ -154,7 +160,7 @@ class BindingLine:
             return places, places
         if leg.kind == "then":
             low = np.maximum(self._moved(frame, leg.after, "left"), frame + 1)
-            high = self._moved(frame, leg.within, "right")
+            high = np.minimum(self._moved(frame, leg.within, "right"), self._lasts[frame])
         else:
             low, high = frame + 1, frame + 1
             if leg.kind == "until":

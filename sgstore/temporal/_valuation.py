@@ -10,7 +10,7 @@ told.
 
 from __future__ import annotations
 
-from bisect import bisect_left, insort
+from bisect import bisect_left, bisect_right, insort
 from collections import deque
 from dataclasses import dataclass, field
 from itertools import combinations
@@ -44,7 +44,7 @@ from sgstore.temporal._robustness import MarginTable, margin_columns
 from sgstore.temporal._signals import NS, Clock, SignalValues, wrapped
 from sgstore.temporal._windows import next_window, window_value
 from sgstore.vocabulary import RELATIONS
-from sgstore.world import longest_step_ns, tolerance_ns
+from sgstore.world import JUMP_NS, longest_step_ns, tolerance_ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -359,11 +359,11 @@ class StreamClock:
     Attributes
     ----------
     tick : Tick
-        The last frame.
+        The last frame. Behind a jump back of the clock its time is later than any before; see :meth:`told`.
     start : int
         The time of the first frame; ns.
-    gap : bool
-        Whether a gap lies before the last frame.
+    gap, jump : bool
+        Whether a gap lies before the last frame, and whether the clock has jumped back.
     """
 
     def __init__(self, period_ns: int | None = None) -> None:
@@ -371,8 +371,11 @@ class StreamClock:
         self._spans: deque[int] = deque()
         self._sorted: list[int] = []
         self.tick = Tick(0, -1)
+        self._last_ns = 0
         self.start = 0
-        self.gap = False
+        self.gap = self.jump = False
+        # Of each jump back: the time of the tick behind it, by how much ticks are later, and its number.
+        self._jumps: list[tuple[int, int, int]] = []
 
     @property
     def period(self) -> int:
@@ -382,17 +385,38 @@ class StreamClock:
         return self._sorted[(len(self._sorted) - 1) // 2] if self._sorted else 0
 
     def step(self, time_ns: int) -> None:
-        """The next frame; one that is not later than the one before counts as a nanosecond later."""
-        last = self.tick
+        """The next frame; see :func:`sgstore.temporal._offline.ascending` for one that is not later."""
+        last, told = self.tick, self._last_ns
+        self._last_ns = time_ns
+        self.jump = last.number >= 0 and time_ns < told
         if last.number < 0:
             self.start = time_ns
+        elif self.jump:
+            self.gap = True
+            behind = last.time + JUMP_NS
+            self._jumps.append((behind, behind - time_ns, last.number + 1))
+            time_ns = behind
         else:
-            time_ns = max(time_ns, last.time + 1)
+            time_ns = max(time_ns + (self._jumps[-1][1] if self._jumps else 0), last.time + 1)
             span = time_ns - last.time
             self.gap = bool(self.period) and span > longest_step_ns(self.period)
             if self._period is None:
                 self._remember(span)
         self.tick = Tick(time_ns, last.number + 1, tolerance_ns(self.period))
+
+    def breaks(self, *, bridge: bool) -> bool:
+        """Return whether runs end before the last frame; ``bridge``: gaps end none, but jumps back do."""
+        return self.jump or (self.gap and not bridge)
+
+    def told(self, time: int) -> int:
+        """The time of a frame as it was told, by that of its tick; ns."""
+        after = bisect_right(self._jumps, (time, NEVER, 0))
+        return time - self._jumps[after - 1][1] if after else time
+
+    def jump_after(self, time: int) -> int:
+        """The number of the first frame behind the next jump back of the clock; :data:`NEVER`: none so far."""
+        after = bisect_right(self._jumps, (time, NEVER, 0))
+        return self._jumps[after][2] if after < len(self._jumps) else NEVER
 
     def _remember(self, span: int) -> None:
         if len(self._spans) == TIMES:
@@ -473,7 +497,7 @@ class SignalState:
     @property
     def gap(self) -> bool:
         """Tell whether a gap lies before this frame."""
-        return self.pulse.gap and not self._bridge
+        return self.pulse.breaks(bridge=self._bridge)
 
     @property
     def oldest(self) -> int:
