@@ -10,6 +10,7 @@ a block begins or ends.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections import deque
 from dataclasses import dataclass, field, replace
@@ -31,6 +32,7 @@ from sgstore.world import (
     MessageRefs,
     States,
     derivable_ns,
+    is_leap,
     leaps,
     without_implausible,
 )
@@ -644,11 +646,27 @@ FIRST_STEPS: Final = 64
 """Steps of the clock whose median is the period of a recording, at any time of it."""
 
 
+TWINS_NS: Final = 1_000_000_000
+"""How long an entity may be away and go on where it was while another one has its id; ns."""
+TWINS: Final = 3
+"""Entities beside the last one that may have one id at once."""
+
+_Seen: TypeAlias = "tuple[tuple[float, ...], int]"
+"""Where and when an entity was seen last: its position, and ns."""
+
+
+def _away(one: _Seen, other: _Seen) -> float:
+    """Distance of two places; a coordinate that one of them lacks does not count."""
+    apart = (a - b for a, b in zip(one[0], other[0], strict=True))
+    return math.hypot(*(part for part in apart if not math.isnan(part)))
+
+
 class Lives:
     """Frames in order, with the time since the one before, and with the entities that their rows belong to.
 
     An id that comes back as another kind, or at a place where no body can be, is another entity from then on. A
-    jump of the clock ends no entity: where a body can be after it is not known.
+    jump of the clock ends no entity: where a body can be after it is not known. If two entities have one id at
+    once, as where two recordings were mixed, both go on.
 
     Parameters
     ----------
@@ -676,6 +694,9 @@ class Lives:
         self._places = np.zeros((0, 3))
         self._nodes: dict[int, int] = {}  # of the ids that have returned
         self._kinds: dict[int, int] = {}
+        self._left: dict[
+            int, list[tuple[int, int, _Seen]]
+        ] = {}  # entities that were left, the last ones
         self._told: list[str] = []
 
     def follow(self, frames: list[FrameRows], sizes: list[int]) -> list[FrameRows]:
@@ -687,12 +708,12 @@ class Lives:
             timed.append(replace(frame, seconds=seconds, returned=self._roster.returned))
             runs.append(self._run)
         far = self._leaps(timed, runs)
-        if not (self._nodes or any(map(len, far)) or any(frame.kinds for frame in frames)):
+        if not (self._nodes or any(far) or any(frame.kinds for frame in frames)):
             self._seq += len(frames)
             return timed
         return [
-            self._entered(frame, rows.tolist(), size)
-            for frame, rows, size in zip(timed, far, sizes, strict=True)
+            self._entered(frame, last_seen, size)
+            for frame, last_seen, size in zip(timed, far, sizes, strict=True)
         ]
 
     def settle(self) -> None:
@@ -724,12 +745,13 @@ class Lives:
             self._gaps.append(step)
         return step / 1e9 if joined else NAN
 
-    def _leaps(self, frames: list[FrameRows], runs: list[int]) -> list[Ints]:
-        """Of each frame the rows that lie where the entity of their last row cannot be."""
+    def _leaps(self, frames: list[FrameRows], runs: list[int]) -> list[dict[int, _Seen]]:
+        """Of each frame the rows that lie where the entity of their last row cannot be, and where that was."""
         counts = [len(frame) for frame in frames]
+        found: list[dict[int, _Seen]] = [{} for _ in frames]
         node = np.concatenate([frame.node for frame in frames] or [np.zeros(0, np.int64)])
         if not len(node):
-            return [node] * len(frames)
+            return found
         self._grow()
         place = np.concatenate([frame.values[:, _X : _X + 3] for frame in frames])
         times = np.array([frame.time_ns for frame in frames], np.int64)
@@ -745,13 +767,12 @@ class Lives:
         self._places[ids[ends]], self._seen[ids[ends]] = place[ends], now[ends]
         away = place - before
         far = leaps(np.sqrt(np.nansum(away * away, axis=1)), (now[:, 0] - was[:, 0]) / 1e9)
-        found = np.sort(rows[far & (now[:, 1] == was[:, 1])])
-        starts = np.concatenate([[0], np.cumsum(counts)])
-        cuts = np.searchsorted(found, starts)
-        return [
-            found[low:high] - start
-            for low, high, start in zip(cuts[:-1], cuts[1:], starts[:-1], strict=True)
-        ]
+        ends = np.cumsum(counts)
+        for at in np.flatnonzero(far & (now[:, 1] == was[:, 1])).tolist():
+            frame = int(np.searchsorted(ends, rows[at], side="right"))
+            row = int(rows[at] - ends[frame] + counts[frame])
+            found[frame][row] = tuple(before[at].tolist()), int(was[at, 0])
+        return found
 
     def _grow(self) -> None:
         more = 2 * self._roster.size - len(self._seen)
@@ -759,11 +780,13 @@ class Lives:
             self._seen = np.concatenate([self._seen, np.full((more, 2), -1, np.int64)])
             self._places = np.concatenate([self._places, np.zeros((more, 3))])
 
-    def _entered(self, frame: FrameRows, far: list[int], size: int) -> FrameRows:
+    def _entered(self, frame: FrameRows, far: dict[int, _Seen], size: int) -> FrameRows:
         """A frame with the node ids of its entities; those that have returned are entered."""
-        for row in far:
+        for row in sorted(far):
             number = int(frame.node[row])
-            self._return(number, frame.kinds.get(number), size, "is where it cannot have moved")
+            here = tuple(frame.values[row, _X : _X + 3].tolist()), frame.time_ns
+            if not self._goes_on(number, far[row], here, frame.kinds.get(number)):
+                self._return(number, frame.kinds.get(number), size, "is where it cannot have moved")
         known = {*frame.kinds, *self._kinds} if self._sure_kinds else set[int]()
         for number in sorted(known & {*frame.node.tolist()}):
             called = frame.kinds.get(number)
@@ -782,6 +805,24 @@ class Lives:
             driven={of[number]: told for number, told in frame.driven.items() if number in of},
             returned=self._roster.returned,
         )
+
+    def _goes_on(self, number: int, last: _Seen, here: _Seen, called: Called | None) -> bool:
+        """Return whether an entity that had the id a moment ago goes on: two have one id at once."""
+        entered = self._roster.entered(number).kind
+        kind = KIND_CODE[called[0].kind] if called else entered
+        first = int(self._roster.nodes_of(np.array([number]))[0])
+        left = self._nodes.get(number, first), self._kinds.get(number, entered), last
+        others = self._left.setdefault(number, [])
+        for other in others:
+            node, was, seen = other
+            step = here[1] - seen[1]
+            if was == kind and 0 <= step <= TWINS_NS and not is_leap(_away(here, seen), step / 1e9):
+                others.remove(other)
+                self._nodes[number], self._kinds[number] = node, was
+                others.append(left)
+                return True
+        others[:] = [*others[-TWINS:], left]
+        return False
 
     def _return(self, number: int, called: Called | None, size: int, why: str) -> None:
         """Enter the entity that an id means from this frame on."""

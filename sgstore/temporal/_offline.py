@@ -568,8 +568,8 @@ def _by_trace(ids: Ints) -> Iterable[tuple[int, slice]]:
 def ascending(times: Ints) -> Ints:
     """Times that ascend, where a recording's stand still or jump back.
 
-    A time that is equal to the one before counts as a nanosecond later. Behind a jump back all times are later by
-    so much that :data:`sgstore.world.JUMP_NS` lie between: the jump is a gap, and no bound of time spans it.
+    A time that is equal to the one before counts as a nanosecond later. Behind a jump back all times are later
+    by so much that :data:`sgstore.world.JUMP_NS` lie between: the jump is a gap, which no bound of time spans.
     """
     steps = np.diff(times, prepend=times[:1])
     if np.any(steps < 0):
