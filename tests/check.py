@@ -53,7 +53,7 @@ TESTS = {
     "plugins": "plugins relations abstractions flavours",
     "query": "query api datasets",
     "quoting": "user_tables",
-    "readers": "osi osi_* carla carla_* carlasgg autoware foxglove commonroad sumo cdr flavours",
+    "readers": "osi osi_* carla carla_* carlasgg autoware foxglove commonroad sumo cdr flavours stamps",
     "rebuild": "rebuilding",
     "relations": "relations relations_* motion",
     "roads": "roads roads_* lane_dist lane_places lane_courses roundabouts",

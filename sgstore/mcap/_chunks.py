@@ -69,6 +69,11 @@ class Recording(Protocol):
         ...
 
     @property
+    def has_log_times(self) -> bool:
+        """Whether messages have log times of their own, besides the times in them."""
+        ...
+
+    @property
     def window(self) -> tuple[int, int]:
         """Log times, both included, between which messages are frames."""
         ...

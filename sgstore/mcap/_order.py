@@ -188,7 +188,7 @@ class OrderCheck:
 
 
 @dataclass(slots=True)
-class _Run:
+class _FileRun:
     """Messages that stand together in the file.
 
     ``place``: byte offset of the chunk, -1 outside chunks; ``offsets``: of the records, outside chunks only.
@@ -229,7 +229,7 @@ class TimeOrder:
     ) -> None:
         self.findings = findings
         self._again = again
-        self._runs: list[_Run] = []
+        self._runs: list[_FileRun] = []
         self._kept = np.zeros(IDS, np.bool_)
         self._cache: OrderedDict[int, Messages] = OrderedDict()
         self._last = np.zeros(IDS, np.int64)
@@ -257,7 +257,7 @@ class TimeOrder:
         outside = run.chunk_offset < 0
         offsets = run.offset.copy() if outside else None
         size = int(run.length.sum())
-        self._runs.append(_Run(run.chunk_offset, len(run), size, offsets))
+        self._runs.append(_FileRun(run.chunk_offset, len(run), size, offsets))
         return np.where(self._kept[run.channel], run.length, 0).astype(np.uint32)
 
     def walk(

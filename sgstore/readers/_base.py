@@ -8,7 +8,7 @@ frames can be read; a :class:`~sgstore.readers._blocks.MessageDecoder`, which ma
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -24,6 +24,7 @@ from sgstore.readers._blocks import (
     counted,
 )
 from sgstore.readers._roles import channel_rank
+from sgstore.readers._stamps import Stamps
 from sgstore.step import Frame, check_entities
 from sgstore.vocabulary import KINDS, TypeMeaning
 from sgstore.world import POSE, Channel, MessageRefs, TraceInfo, TraceReport
@@ -136,11 +137,14 @@ class Lead:
         How much is in them, by the measure of the flavour.
     first_ns : int
         Least log time of its frames.
+    stamps : Stamps
+        The times in its messages.
     """
 
     frames: int = 0
     weight: int = 0
     first_ns: int = (1 << 63) - 1
+    stamps: Stamps = field(default_factory=Stamps)
 
 
 AnyLead = TypeVar("AnyLead", bound=Lead)
@@ -255,6 +259,12 @@ class Survey(Generic[AnyLead]):
             if channel >= 0:
                 self._met[channel] = met = self.meet(channel)
                 watched[channel] = self.watches(channel, met=met)
+
+    def see_stamp(self, run: Messages, row: int, stamp_ns: int | None) -> None:
+        """Take note of the time in a message of a channel that may lead, unless a clip carries it in."""
+        log_time, (start, end) = int(run.log_time_ns[row]), self._window
+        if start <= log_time <= end:
+            self.leads[int(run.channel[row])].stamps.see(log_time, stamp_ns)
 
     def count(self, run: Messages, row: int, weight: int) -> None:
         """Count a frame of a channel that may lead; what a clip carries in from outside of it is none."""

@@ -18,6 +18,8 @@ class MessageFile:
 
     Attributes
     ----------
+    has_log_times : bool
+        ``False``: a log time is the time in a message.
     window : tuple of int
         All log times there are.
     profile, compression : str
@@ -25,6 +27,7 @@ class MessageFile:
         What an MCAP file that holds the same has.
     """
 
+    has_log_times = False
     window = (0, (1 << 63) - 1)
     profile, compression = "", "zstd"
     metadata: Final[Mapping[RecordPlace, Metadata]] = MappingProxyType({})

@@ -17,7 +17,16 @@ import numpy as np
 
 from sgstore.errors import TraceError
 from sgstore.readers._base import Lead, Survey, ref_of
-from sgstore.readers._ros2 import ColumnReader, decode, parse_definition, records, short_name, text
+from sgstore.readers._ros2 import (
+    ColumnReader,
+    decode,
+    number,
+    parse_definition,
+    records,
+    short_name,
+    text,
+)
+from sgstore.readers._stamps import Stamps
 
 if TYPE_CHECKING:
     from mcap.records import Channel, Schema
@@ -116,6 +125,13 @@ def labels_of(table: Floats) -> list[str]:
     likely = np.argmax(np.nan_to_num(classes[:, :, 1], nan=-1.0), axis=1)
     label = np.nan_to_num(classes[np.arange(len(table)), likely, 0]).astype(np.int64)
     return [LABELS[one] if 0 <= one < len(LABELS) else LABELS[0] for one in label.tolist()]
+
+
+def stamp_at(told: dict[str, Any], path: str) -> int | None:
+    """The time at a path of a message; ns. ``None`` if it is beyond all clocks."""
+    seconds, nanos = (number(told, f"{path}.{part}") for part in ("sec", "nanosec"))
+    there = 0 <= seconds < 1 << 32 and 0 <= nanos < 1 << 32
+    return int(seconds) * 1_000_000_000 + int(nanos) if there else None
 
 
 class AutowareSurvey(Survey[ObjectLead]):
@@ -223,7 +239,7 @@ class AutowareSurvey(Survey[ObjectLead]):
         if content == OBJECTS:
             self._tables[channel] = ColumnReader(found, CLASS_COLUMNS, "objects")
             order = RANK[short_name(schema.name).rpartition("/")[2]]
-            self.leads[channel] = ObjectLead(order=order)
+            self.leads[channel] = ObjectLead(order=order, stamps=Stamps(explicit=False))
 
     # One message -------------------------------------------------------------------------------------
 
@@ -233,16 +249,18 @@ class AutowareSurvey(Survey[ObjectLead]):
         content = self.contents[channel]
         if content == OBJECTS:
             self.count(run, row, 0)
+            self.leads[channel].stamps.next()
         with suppress(TraceError):
             if content == OBJECTS:
-                self._take_objects(channel, run.data(row))
+                self._take_objects(channel, run, row)
             elif content == POSE_OF_EGO:
                 self._take_pose(channel, run.data(row))
             else:
                 self._take_transforms(channel, run, row)
 
-    def _take_objects(self, channel: int, data: memoryview) -> None:
-        head, table = self._tables[channel].read(data)
+    def _take_objects(self, channel: int, run: Messages, row: int) -> None:
+        head, table = self._tables[channel].read(run.data(row))
+        self.see_stamp(run, row, stamp_at(head, "header.stamp"))
         self._frames.setdefault(channel, text(head, "header.frame_id"))
         self.leads[channel].objects += len(table)
         for ident, label in zip(idents_of(table), labels_of(table), strict=True):

@@ -31,6 +31,7 @@ from sgstore.errors import TraceError
 from sgstore.readers._base import SurveyedTrace
 from sgstore.readers._blocks import FAR, NAN, FrameRows, MessageDecoder
 from sgstore.readers._ros2 import ColumnReader, decode, ident_of, number, records, text
+from sgstore.readers._stamps import NO_TIME
 from sgstore.readers.autoware._survey import (
     CLASS_COLUMNS,
     EGO,
@@ -44,6 +45,7 @@ from sgstore.readers.autoware._survey import (
     content_of,
     idents_of,
     labels_of,
+    stamp_at,
 )
 from sgstore.readers.foxglove._mapping import Ego, mapping_for
 from sgstore.readers.foxglove._messages import Axes, Pose, normed, product, rotated
@@ -193,6 +195,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
         self._table = ColumnReader(
             survey.structures[survey.leading], _columns(self._is_predicted()), "objects"
         )
+        self._stamps = survey.leads[survey.leading].stamps.reading()
         super().__init__({survey.leading, *self._takers()}, survey.recording.window, report)
         self._take = self._takers()
         self._axes = Axes()
@@ -208,6 +211,8 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
     def decode(self, run: Messages, row: int) -> AutowareRawFrame | None:
         """The frame that a message is; ``None`` if it is none, cannot be read, or lies outside the window."""
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
+        if channel == self._survey.leading:
+            self._stamps.next()
         try:
             take = self._take.get(channel)
             if take is not None:
@@ -229,6 +234,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
 
     def settle(self) -> None:
         """Report what could not be used, once all frames are read."""
+        self._untimed = self._stamps.untimed
         super().settle()
         warn = self._report.warnings.append
         if self._unplaced:
@@ -265,6 +271,10 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
     def _decoded(self, channel: int, data: memoryview) -> dict[str, Any]:
         return decode(self._survey.structures[channel], data)
 
+    def _stamp(self, told: dict[str, Any], path: str, log_time: int) -> int:
+        """The time in a message of a channel that does not lead."""
+        return self._stamps.beside(log_time, stamp_at(told, path))
+
     def _take_transforms(self, channel: int, log_time: int, data: memoryview) -> None:
         for told in records(self._decoded(channel, data), "transforms"):
             child = text(told, "child_frame_id")
@@ -273,7 +283,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
             pose = _pose_at(told, "transform.translation", "transform.rotation")
             if pose is not None:
                 parent = text(told, "header.frame_id")
-                self._axes.tell(child, parent, _stamp(told, "header.stamp", log_time), pose)
+                self._axes.tell(child, parent, self._stamp(told, "header.stamp", log_time), pose)
 
     def _take_pose(self, channel: int, log_time: int, data: memoryview) -> None:
         told = self._decoded(channel, data)
@@ -281,7 +291,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
         pose = _pose_at(told, f"{name}.pose.position", f"{name}.pose.orientation")
         if pose is None:
             raise TraceError("its pose is none")
-        stamp = _stamp(told, "header.stamp", log_time)
+        stamp = self._stamp(told, "header.stamp", log_time)
         self._axes.tell(self._survey.ego_axes, self._survey.world, stamp, pose)
         twist = f"{name.replace('pose', 'twist')}.twist"
         paths = [f"{twist}.linear.{axis}" for axis in _VECTOR]
@@ -296,7 +306,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
 
     def _take_lights(self, channel: int, log_time: int, data: memoryview) -> None:
         told = self._decoded(channel, data)
-        stamp = _stamp(told, "stamp", log_time)
+        stamp = self._stamp(told, "stamp", log_time)
         for group in (*records(told, "traffic_light_groups"), *records(told, "signals")):
             ident = ident_of(group, "traffic_light_group_id")
             ident = ident_of(group, "traffic_signal_id") if ident is None else ident
@@ -316,7 +326,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
         told = self._decoded(channel, data)
         value = number(told, "report")
         if np.isfinite(value):
-            stamp = _stamp(told, "stamp", log_time)
+            stamp = self._stamp(told, "stamp", log_time)
             self._reports[self._survey.contents[channel]] = stamp, int(value)
 
     # Frames ------------------------------------------------------------------------------------------
@@ -325,8 +335,9 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
         head, table = self._table.read(data)
         if (table[:, _BOX_BEGINS + 17] == _POLYGON).any():
             self._measure(table, data)
-        stamp = _stamp(head, "header.stamp", log_time)
-        self._untimed += stamp == log_time and not number(head, "header.stamp.sec") > 0
+        stamp = self._stamps.time(log_time, stamp_at(head, "header.stamp"))
+        if stamp is None:
+            raise TraceError(NO_TIME)
         labels = labels_of(table)
         idents = idents_of(table)
         if not all(idents):
@@ -591,13 +602,6 @@ def _pose_at(told: dict[str, Any], place: str, turn: str) -> Pose | None:
     way = np.array([number(told, f"{turn}.{part}") for part in (*_VECTOR, "w")])
     usable = np.isfinite(way).all() and (np.abs(at) < FAR).all()
     return (at, normed(way)) if usable else None
-
-
-def _stamp(told: dict[str, Any], path: str, log_time: int) -> int:
-    """The time in a message; ns. The log time where it has none."""
-    seconds, nanos = (number(told, f"{path}.{part}") for part in ("sec", "nanosec"))
-    there = 0 <= seconds < 1 << 32 and 0 <= nanos < 1 << 32 and (seconds or nanos)
-    return int(seconds) * 1_000_000_000 + int(nanos) if there else log_time
 
 
 def _state_of(elements: Iterable[dict[str, Any]]) -> str:

@@ -27,6 +27,7 @@ from sgstore.readers._ros2 import (
     short_name,
     text,
 )
+from sgstore.readers._stamps import Stamps
 from sgstore.readers.carla._signals import read_places
 from sgstore.vocabulary import TypeMeaning, type_meanings, vague_kind
 from sgstore.world import Event
@@ -258,7 +259,9 @@ OF_ONE_VEHICLE: Final = frozenset({STATUS, COMMANDS, VEHICLE, ODOMETRY, COLLISIO
 """What the bridge publishes under the role name of a vehicle."""
 
 NEVER: Final = -(1 << 62)
-"""Time of what bears none; ns."""
+"""Time of what was not told yet; ns."""
+STAMP: Final = ("header.stamp.sec", "header.stamp.nanosec")
+"""The numbers of a message's time."""
 _MAX_SECONDS: Final = 1 << 32
 
 
@@ -302,16 +305,16 @@ def role_in(topic: str) -> str:
     return parts[-2] if len(parts) > 2 else ""
 
 
-def stamp_of(message: dict[str, Any]) -> int:
-    """Time in a message's header; ns. :data:`NEVER` if it has none, or one beyond all clocks."""
+def stamp_of(message: dict[str, Any]) -> int | None:
+    """Time in a message's header; ns. ``None`` if it has none, or one beyond all clocks."""
     return stamp_from([number(message, f"header.stamp.{part}") for part in ("sec", "nanosec")])
 
 
-def stamp_from(told: Floats | list[float]) -> int:
+def stamp_from(told: Floats | list[float]) -> int | None:
     """Time of seconds and nanoseconds, likewise."""
     seconds, nanos = told
     there = abs(seconds) < _MAX_SECONDS and abs(nanos) < _MAX_SECONDS
-    return int(seconds) * 1_000_000_000 + int(nanos) if there else NEVER
+    return int(seconds) * 1_000_000_000 + int(nanos) if there else None
 
 
 # Collisions and crossed lane markings, as the sensors of CARLA's bridge tell them ---------------
@@ -384,10 +387,11 @@ class CarlaSurvey(Survey[Lead]):
         self.ego: int | None = None
         self.lights: dict[int, Light] = {}
         self._tables: dict[int, ColumnReader] = {}
+        self._stamps: dict[int, ColumnReader] = {}
         # Places of the vehicles with a role, to find them among objects that no list of actors names: their
         # odometry by role; stamp, ids and places of the objects of the last frame.
-        self._odometry: dict[str, tuple[int, Floats]] = {}
-        self._objects: tuple[int, Floats] = (0, np.zeros((0, 4)))
+        self._odometry: dict[str, tuple[int | None, Floats]] = {}
+        self._objects: tuple[int | None, Floats] = (None, np.zeros((0, 4)))
         self._tries = 0
         self._last: dict[int, bytes] = {}
         self._lasting: list[Ref] = []
@@ -472,7 +476,8 @@ class CarlaSurvey(Survey[Lead]):
         self.structures[channel] = found
         if content == OBJECTS:
             self._tables[channel] = ColumnReader(found, _PLACES, "objects")
-            self.leads[channel] = Lead()
+            self._stamps[channel] = ColumnReader(found, STAMP)
+            self.leads[channel] = Lead(stamps=Stamps(explicit=False))
 
     # One message -----------------------------------------------------------------------------------
 
@@ -483,7 +488,10 @@ class CarlaSurvey(Survey[Lead]):
             return
         if self.contents[channel] == OBJECTS:
             self.count(run, row, int(run.length[row]))
+            self.leads[channel].stamps.next()
             with suppress(TraceError):  # reported when frames are read
+                told = self._stamps[channel].read(run.data(row))[1][0]
+                self.see_stamp(run, row, stamp_from(told))
                 self._look_for_egos(run.data(row), channel)
             return
         try:
@@ -589,6 +597,8 @@ class CarlaSurvey(Survey[Lead]):
         stamp, table = self._objects
         self._tries += 1
         for role, (when, place) in self._odometry.items():
+            if when is None or stamp is None:
+                continue
             near = np.abs(table[:, 1:] - place).max(axis=1, initial=0) <= SAME_PLACE
             if abs(when - stamp) <= SAME_TICK and near.sum() == 1:
                 self.egos.by_role.setdefault(role, int(table[near, 0][0]))

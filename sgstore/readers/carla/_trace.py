@@ -34,6 +34,7 @@ from sgstore.opendrive import read_map
 from sgstore.readers._base import SurveyedTrace
 from sgstore.readers._blocks import FAR, NAN, NO_INPUTS, UPRIGHT, FrameRows, MessageDecoder
 from sgstore.readers._ros2 import MAX_IDENT, ColumnReader, decode
+from sgstore.readers._stamps import NO_TIME
 from sgstore.readers.carla._signals import Lights, signals_of
 from sgstore.readers.carla._survey import (
     COMMANDS,
@@ -43,6 +44,7 @@ from sgstore.readers.carla._survey import (
     OBJECTS,
     ODOMETRY,
     SAME_TICK,
+    STAMP,
     STATUS,
     VEHICLE_LIGHTS,
     CarlaSurvey,
@@ -76,7 +78,6 @@ COLUMNS: Final = (
     *(f"shape.dimensions[{i}]" for i in range(3)),
 )
 """Numbers that are read of every ``derived_object_msgs/Object``."""
-STAMP: Final = ("header.stamp.sec", "header.stamp.nanosec")
 CONTROLS: Final = (
     *("steer", "throttle", "brake", "gear", "hand_brake", "reverse", "manual_gear_shift"),
 )
@@ -173,12 +174,15 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
         self._driven = survey.driven
         self._drivers: dict[int, int] = {}
         self._take = self._takers()
+        self._stamps = survey.leads[survey.leading].stamps.reading()
         super().__init__({survey.leading, *self._take}, survey.recording.window, report)
         self._lights = Lights(survey.lights, signals, road_map, self.roster)
 
     def decode(self, run: Messages, row: int) -> CarlaRawFrame | None:
         """The frame that a message is; ``None`` if it is none, cannot be read, or lies outside the window."""
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
+        if channel == self._leading:
+            self._stamps.next()
         try:
             take = self._take.get(channel)
             if take is not None:
@@ -193,6 +197,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
 
     def settle(self) -> None:
         """Report what could not be used, once all frames are read."""
+        self._untimed = self._stamps.untimed
         warn = self._report.warnings.append
         if self._lights.unplaced:
             warn(
@@ -219,10 +224,9 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
         if not known.all():
             self._unusable.add("an object has no id", log_time)
             objects = objects[known]
-        time_ns = stamp_of(head)
-        if time_ns == NEVER:
-            self._untimed += 1
-            time_ns = log_time
+        time_ns = self._stamps.time(log_time, stamp_of(head))
+        if time_ns is None:
+            raise TraceError(NO_TIME)
         idents = objects[:, _ID].astype(np.int64).tolist()
         nodes, kinds = self._nodes, dict[int, "Called"]()
         for ident, classification in zip(idents, objects[:, _CLASS].tolist(), strict=True):
@@ -376,9 +380,10 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
     def _take_light_states(self, channel: int, _log_time: int, data: memoryview) -> None:
         self._lights.update(decode(self._survey.structures[channel], data))
 
-    def _take_controls(self, channel: int, _log_time: int, data: memoryview) -> None:
+    def _take_controls(self, channel: int, log_time: int, data: memoryview) -> None:
         told = self._fields[channel].read(data)[1][0]
-        stamp, ident = stamp_from(told[:2]), self._drivers[channel]
+        ident = self._drivers[channel]
+        stamp = self._stamps.beside(log_time, stamp_from(told[:2]))
         controls = np.where(np.isfinite(told[2:]), told[2:], NAN).tolist()
         applied = self._survey.contents[channel] == STATUS
         self._controls[ident] = stamp, _inputs(controls, applied=applied)
@@ -391,22 +396,22 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
         found = self._survey
         message = decode(found.structures[channel], data)
         ident = found.egos.id_of(self._driven[channel])
-        stamp = stamp_of(message)
-        place = log_time if stamp == NEVER else stamp, log_time, self._seq
+        place = self._stamps.beside(log_time, stamp_of(message)), log_time, self._seq
         named = "" if ident is None else str(ident)
         self.roster.happen(event_of(found.contents[channel], message, place, named))
 
-    def _take_vehicle_lights(self, _channel: int, _log_time: int, data: memoryview) -> None:
-        stamp, lights = _vehicle_lights(data)
+    def _take_vehicle_lights(self, _channel: int, log_time: int, data: memoryview) -> None:
+        told, lights = _vehicle_lights(data)
+        stamp = self._stamps.beside(log_time, told)
         self._vehicle_lights = stamp, lights
         if self._frame is not None and abs(self._frame.time_ns - stamp) <= SAME_TICK:
             self._frame.vehicle_lights = lights
 
-    def _take_odometry(self, channel: int, _log_time: int, data: memoryview) -> None:
+    def _take_odometry(self, channel: int, log_time: int, data: memoryview) -> None:
         if self._frame is not None and self._ego in self._nodes and self._odometry[1] is None:
             return  # it is among the objects
         told = self._fields[channel].read(data)[1][0]
-        self._odometry = stamp_from(told[:2]), told[2:]
+        self._odometry = self._stamps.beside(log_time, stamp_from(told[:2])), told[2:]
         self._see_odometry()
 
     def _see_odometry(self) -> None:

@@ -200,7 +200,7 @@ _PLACE: Final = dict.fromkeys(("x", "y", "z"))
 _TURN: Final = dict.fromkeys(("x", "y", "z", "w"))
 _SOLID: Final = {"pose": {"position": _PLACE, "orientation": _TURN}, "size": _PLACE}
 _SCENE_FIELDS: Final[dict[str, Any]] = {
-    "deletions": dict.fromkeys(("type", "id")),
+    "deletions": dict.fromkeys(("timestamp", "type", "id")),
     "entities": {
         **dict.fromkeys(("timestamp", "frame_id", "id", "lifetime", "frame_locked")),
         "metadata": dict.fromkeys(("key", "value")),
@@ -222,8 +222,10 @@ class Box:
     ----------
     id, axes : str
         Its id, and the axes (``frame_id``) that its pose is given in.
-    time_ns, lifetime_ns : int
-        When it was so, and how long it stays; 0: not told, until it is replaced.
+    time_ns : int or None
+        When it was so; ``None``: not told.
+    lifetime_ns : int
+        How long it stays; 0: until it is replaced.
     locked : bool
         Whether it moves with its axes.
     metadata : dict
@@ -235,7 +237,7 @@ class Box:
 
     id: str
     axes: str
-    time_ns: int
+    time_ns: int | None
     lifetime_ns: int
     locked: bool
     metadata: dict[str, str]
@@ -244,16 +246,25 @@ class Box:
 
 
 @dataclass(frozen=True, slots=True)
+class Deletion:
+    """A ``SceneEntityDeletion``: of the entity ``id``, or of all (``None``), that are older than ``time_ns``.
+
+    ``time_ns`` is ``None`` if it is not told: then of any age.
+    """
+
+    id: str | None
+    time_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
 class SceneUpdate:
     """A ``SceneUpdate``: what is there, and what is there no more.
 
-    ``deleted``: ids; ``cleared``: whether all that was there before is deleted. ``bodiless``: entities that are
-    lines, texts or arrows only.
+    ``bodiless``: entities that are lines, texts or arrows only.
     """
 
     boxes: list[Box]
-    deleted: list[str]
-    cleared: bool
+    deletions: list[Deletion]
     bodiless: int
 
 
@@ -263,7 +274,7 @@ class Transform:
 
     parent: str
     child: str
-    time_ns: int
+    time_ns: int | None
     pose: Pose | None
 
 
@@ -313,13 +324,11 @@ class ChannelReader:
         told = self._parsed(data)
         entities = _list(told, "entities", MAX_ENTITIES)
         deletions = _list(told, "deletions", MAX_ENTITIES)
-        kinds = [(int(_get(gone, "type", 0)), str(_get(gone, "id", ""))) for gone in deletions]
         found = [_box(entity) for entity in entities]
         boxes = [box for box in found if box is not None]
         return SceneUpdate(
             boxes=boxes,
-            deleted=[ident for kind, ident in kinds if kind != _DELETE_ALL],
-            cleared=any(kind == _DELETE_ALL for kind, _ in kinds),
+            deletions=[_deletion(gone) for gone in deletions],
             bodiless=len(found) - len(boxes),
         )
 
@@ -390,7 +399,7 @@ def _box(entity: Any) -> Box | None:
         id=str(_get(entity, "id", "")),
         axes=str(_get(entity, "frame_id", "")),
         time_ns=_time(_get(entity, "timestamp", None)),
-        lifetime_ns=_time(_get(entity, "lifetime", None)),
+        lifetime_ns=_time(_get(entity, "lifetime", None)) or 0,
         locked=bool(_get(entity, "frame_locked", 0)),
         metadata={str(_get(pair, "key", "")): str(_get(pair, "value", "")) for pair in pairs},
         pose=pose,
@@ -433,14 +442,23 @@ def _numbers(part: Any, names: Iterable[str]) -> list[float]:
     return [float(_get(part, name, 0.0)) for name in names]
 
 
-def _time(part: Any) -> int:
-    """A timestamp or duration; ns. Protobuf has ``seconds`` and ``nanos``, JSON ``sec`` and ``nsec``."""
+def _deletion(gone: Any) -> Deletion:
+    every = int(_get(gone, "type", 0)) == _DELETE_ALL
+    time_ns = _time(_get(gone, "timestamp", None))
+    return Deletion(None if every else str(_get(gone, "id", "")), time_ns)
+
+
+def _time(part: Any) -> int | None:
+    """A timestamp or duration; ns. Protobuf has ``seconds`` and ``nanos``, JSON ``sec`` and ``nsec``.
+
+    ``None``: it is not there, or beyond all clocks.
+    """
     if part is None:
-        return 0
+        return None
     seconds = _get(part, "seconds", None)
     if seconds is None:
         seconds, nanos = _get(part, "sec", 0), _get(part, "nsec", 0)
     else:
         nanos = _get(part, "nanos", 0)
     time_ns = int(seconds) * 1_000_000_000 + int(nanos)
-    return time_ns if abs(time_ns) < _LATEST else 0
+    return time_ns if abs(time_ns) < _LATEST else None

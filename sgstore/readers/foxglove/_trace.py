@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from typing import TYPE_CHECKING, ClassVar, Final
 
@@ -27,6 +27,7 @@ import numpy as np
 from sgstore.errors import TraceError
 from sgstore.readers._base import Lead, Ref, Survey, SurveyedTrace, count_ref, ref_of
 from sgstore.readers._blocks import FAR, NAN, FrameRows, LossTally, MessageDecoder
+from sgstore.readers._stamps import NO_TIME
 from sgstore.readers.foxglove._mapping import Mapping, mapping_for
 from sgstore.readers.foxglove._messages import (
     ERRORS,
@@ -49,7 +50,7 @@ if TYPE_CHECKING:
     from sgstore.mcap import Messages, Recording
     from sgstore.readers._blocks import Called
     from sgstore.readers.foxglove._mapping import Ego
-    from sgstore.readers.foxglove._messages import Box, Pose, SceneUpdate, Transform
+    from sgstore.readers.foxglove._messages import Box, Deletion, Pose, SceneUpdate, Transform
     from sgstore.world import TraceReport
 
 
@@ -174,11 +175,15 @@ class FoxgloveSurvey(Survey[Lead]):
 
     def look(self, run: Messages, row: int) -> None:
         """Look at a scene, or at transforms."""
-        reader = self.readers[int(run.channel[row])]
+        channel = int(run.channel[row])
+        reader = self.readers[channel]
+        if reader.name == SCENE:
+            self.leads[channel].stamps.next()
         try:
             data = bytes(run.data(row))
             if reader.name == SCENE:
                 scene = reader.scene(data)
+                self.see_stamp(run, row, time_of(scene))
                 self.count(run, row, bool(scene.boxes))
                 for box in scene.boxes:
                     ident = self.mapping.entity.ident_of(box)
@@ -192,6 +197,11 @@ class FoxgloveSurvey(Survey[Lead]):
                         count_ref(self._transforms, one.child, ref_of(run, row))
         except ERRORS:  # counted as a loss when the frames are read
             return
+
+
+def time_of(scene: SceneUpdate) -> int | None:
+    """The time of a message: that of its latest entity; ``None``: none tells it."""
+    return max((box.time_ns for box in scene.boxes if box.time_ns is not None), default=None)
 
 
 # Frames -------------------------------------------------------------------------------------------
@@ -235,12 +245,14 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
         self._open: FoxgloveRawFrame | None = None
         self._left_out = LossTally()
         self._bodiless = self._odd_axes = 0
-        self._last = (0, 0)
+        self._stamps = survey.leads[survey.leading].stamps.reading()
 
     def decode(self, run: Messages, row: int) -> FoxgloveRawFrame | None:
         """The frame that a message of the leading scene is; of others ``None``."""
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
         reader = self._readers[channel]
+        if channel == self._leading:
+            self._stamps.next()
         try:
             data = bytes(run.data(row))
             if reader.name != SCENE:
@@ -251,7 +263,10 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
             what = f"a message of schema {reader.name} cannot be read"
             self.lose(f"{what}: {type(error).__name__}: {error}", run, row)
             return None
-        time_ns = self._time_of(scene, log_time)
+        time_ns = self._time(channel, scene, log_time)
+        if time_ns is None:
+            self.lose(NO_TIME, run, row)
+            return None
         self._take_scene(channel, scene, time_ns, log_time)
         last = self._open
         if channel != self._leading:
@@ -293,6 +308,7 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
 
     def settle(self) -> None:
         """Report what could not be used, once all frames are read."""
+        self._untimed = self._stamps.untimed
         super().settle()
         self._report.losses += self._left_out.losses()
         warn = self._report.warnings.append
@@ -309,31 +325,22 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
 
     def _take_transforms(self, told: list[Transform], log_time: int) -> None:
         for one in told:
-            time_ns = one.time_ns or log_time
+            time_ns = self._stamps.beside(log_time, one.time_ns)
             if one.pose is None or not self._axes.tell(one.child, one.parent, time_ns, one.pose):
                 self._odd_axes += 1
 
-    def _time_of(self, scene: SceneUpdate, log_time: int) -> int:
-        """The time of a message: that of its latest entity, else as far behind the last as it was logged."""
-        times = [box.time_ns for box in scene.boxes if box.time_ns]
-        last, last_log = self._last
-        if times:
-            time_ns = max(times)
-        elif last:
-            time_ns = last + log_time - last_log
-        else:
-            time_ns = log_time
-            self._untimed += bool(scene.boxes)
-            return time_ns
-        self._last = (time_ns, log_time)
-        return time_ns
+    def _time(self, channel: int, scene: SceneUpdate, log_time: int) -> int | None:
+        """The time of a message."""
+        if channel != self._leading or not self.is_inside(log_time):
+            return self._stamps.beside(log_time, time_of(scene))
+        return self._stamps.time(log_time, time_of(scene))
 
     def _take_scene(self, channel: int, scene: SceneUpdate, time_ns: int, log_time: int) -> None:
         standing = self._standing.setdefault(channel, {})
-        if scene.cleared or self._mapping.scene.snapshot:
+        if self._mapping.scene.snapshot:
             standing.clear()
-        for ident in scene.deleted:
-            standing.pop(ident, None)
+        for gone in scene.deletions:
+            self._delete(standing, gone, log_time)
         self._bodiless += scene.bodiless
         seen: set[str] = set()
         for box in scene.boxes:
@@ -350,7 +357,17 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
                 self._nodes[channel, ident] = self._enter(ident, box)
             else:
                 self._see_kind(node, box)
-            standing[ident] = (box.time_ns or time_ns, box)
+            told = time_ns if box.time_ns is None else self._stamps.beside(log_time, box.time_ns)
+            if box.time_ns not in {None, told}:  # it is of another clock
+                box = replace(box, time_ns=told)  # noqa: PLW2901
+            standing[ident] = (told, box)
+
+    def _delete(self, standing: dict[str, tuple[int, Box]], gone: Deletion, log_time: int) -> None:
+        """Delete what is older than a deletion."""
+        before = None if gone.time_ns is None else self._stamps.beside(log_time, gone.time_ns)
+        for ident in [*standing] if gone.id is None else [gone.id]:
+            if ident in standing and (before is None or standing[ident][0] < before):
+                del standing[ident]
 
     def _see_kind(self, node: int, box: Box) -> None:
         """Take note of what an entity is called now, if that is another kind than when it was entered."""
@@ -420,7 +437,7 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
 
     def _values(self, box: Box, time_ns: int) -> list[float] | None:
         """The columns of :data:`POSE` of a box; ``None`` if it has no pose in the axes that stand still."""
-        at = time_ns if box.locked or not box.time_ns else box.time_ns
+        at = time_ns if box.locked or box.time_ns is None else box.time_ns
         outer = self._axes.pose(box.axes or self._root, self._root, at)
         if box.pose is None or outer is None:
             return None

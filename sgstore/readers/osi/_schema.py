@@ -560,6 +560,16 @@ def parse(message: type[Any], data: bytes) -> tuple[Any, Any, list[bytes]]:
     return parsed, ground, objects
 
 
+def time_of(message: Any, ground: Any) -> int | None:
+    """The time that a message says it is of, in ns; ``None`` if it says none that can be."""
+    for part in (ground, message):
+        if part.HasField("timestamp"):
+            time_ns = part.timestamp.seconds * 1_000_000_000 + part.timestamp.nanos
+            if abs(time_ns) < LATEST_NS:
+                return int(time_ns)
+    return None
+
+
 @lru_cache(maxsize=64)
 def _truth_in(message: type[Any]) -> int:
     """Number of the field that is the ground truth in messages of a class; 0: they are it."""

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 from sgstore.errors import MapError, TraceError
 from sgstore.readers._base import Lead, Ref, Survey, ref_of
 from sgstore.readers._blocks import EntityTable
+from sgstore.readers._stamps import Stamps
 from sgstore.readers.osi._lanes import FIELDS as LANE_FIELDS
 from sgstore.readers.osi._lanes import LaneSignal, OsiLanes
 from sgstore.readers.osi._objects import Statics, TrafficLights
@@ -36,6 +37,7 @@ from sgstore.readers.osi._schema import (
     message_class,
     object_class,
     parse,
+    time_of,
 )
 from sgstore.roads import OF_LANES
 from sgstore.world import TraceReport
@@ -439,6 +441,7 @@ class OsiSurvey(Survey[OsiLead]):
             objects=object_class(message),
             latch=_Latch(present, bulbs),
             lanes=lanes,
+            stamps=Stamps(logged=self.recording.has_log_times),
         )
 
     # One message -------------------------------------------------------------------------------------
@@ -467,9 +470,11 @@ class OsiSurvey(Survey[OsiLead]):
             self.map_name = PurePosixPath(name.replace("\\", "/")).name
 
     def _look_at_frame(self, lead: OsiLead, run: Messages, row: int) -> None:
+        lead.stamps.next()
         try:
             data = bytes(run.data(row))
             message, ground, objects = parse(lead.message, data)
+            self.see_stamp(run, row, time_of(message, ground))
             told = {name: some for name in lead.latch.fields if (some := getattr(ground, name))}
             words = lights_of(ground)
             if lead.latch.look(told, words, ref_of(run, row)) and lead.lanes is not None:

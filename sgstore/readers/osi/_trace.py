@@ -22,17 +22,18 @@ from google.protobuf import message_factory
 from sgstore.mcap import Loss
 from sgstore.readers._base import SurveyedTrace
 from sgstore.readers._blocks import NAN, NO_INPUTS, FrameRows, LossTally, MessageDecoder
+from sgstore.readers._stamps import NO_TIME
 from sgstore.readers.osi._objects import UNTOLD, MovingObjects, TrafficLights, code_of
 from sgstore.readers.osi._schema import (
     DECODE_ERRORS,
     GROUND_TRUTH,
-    LATEST_NS,
     SENSOR_VIEW,
     enum_name,
     has_field,
     light_class,
     lights_of,
     parse,
+    time_of,
 )
 from sgstore.readers.osi._survey import OsiSurvey, is_key, keys_of, schema_name
 from sgstore.vocabulary import KINDS, TypeMeaning, type_meanings
@@ -220,10 +221,13 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
             has_field(one.message, "host_vehicle_data") for one in survey.leads.values()
         )
         self._frames = 0
+        self._stamps = lead.stamps.reading()
 
     def decode(self, run: Messages, row: int) -> OsiRawFrame | None:
         """The frame that a message begins, if it begins one; what else it says is taken up."""
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
+        if channel == self._leading:
+            self._stamps.next()
         try:
             data = bytes(run.data(row))
             if channel in self._survey.hosts:
@@ -234,10 +238,14 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
             if not self.is_inside(log_time):
                 self._lights.update(lights_of(ground))
                 return None
-            time_ns = time_of(message, ground)
-            if channel == self._leading:
+            stamp = time_of(message, ground)
+            if channel != self._leading:
+                self._take_aside(told, self._stamps.beside(log_time, stamp))
+                return None
+            time_ns = self._stamps.time(log_time, stamp)
+            if time_ns is not None:
                 return self._frame(told, time_ns, log_time)
-            self._take_aside(told, log_time if time_ns is None else time_ns)
+            self.lose(NO_TIME, run, row)
         except DECODE_ERRORS as error:
             what = "a ground truth message cannot be read"
             self.lose(f"{what}: {type(error).__name__}: {error}", run, row)
@@ -245,6 +253,7 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
 
     def settle(self) -> None:
         """Report what could not be used, once all frames are read."""
+        self._untimed = self._stamps.untimed
         self._environment.settle()
         warn = self._report.warnings.append
         if self._lights.unplaced:
@@ -319,7 +328,7 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
     # One message ---------------------------------------------------------------------------------------
 
     def _frame(
-        self, told: tuple[Any, Any, list[bytes]], time_ns: int | None, log_time: int
+        self, told: tuple[Any, Any, list[bytes]], time_ns: int, log_time: int
     ) -> OsiRawFrame | None:
         """A frame, unless the message goes on with the last one."""
         message, ground, contents = told
@@ -329,11 +338,10 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
             self._lights.update(lights_of(ground))
             self._join(last, message, nodes, objects)
             return None
-        self._untimed += time_ns is None
         if last is None:
             self._enter_statics()
         self._lights.update(lights_of(ground))
-        frame = OsiRawFrame(log_time if time_ns is None else time_ns, log_time, self._lights.rows())
+        frame = OsiRawFrame(time_ns, log_time, self._lights.rows())
         self._open = frame
         self._environment.look(ground, frame.time_ns, log_time, self._frames)
         self._frames += 1
@@ -492,16 +500,6 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
             lights=frame.lights[usable],
             light_state=frame.light_state[usable],
         )
-
-
-def time_of(message: Any, ground: Any) -> int | None:
-    """The time that a message says it is of, in ns; ``None`` if it says none that can be."""
-    for part in (ground, message):
-        if part.HasField("timestamp"):
-            time_ns = part.timestamp.seconds * 1_000_000_000 + part.timestamp.nanos
-            if abs(time_ns) < LATEST_NS:
-                return time_ns
-    return None
 
 
 def controls_of(data: Any) -> tuple[float, ...]:
