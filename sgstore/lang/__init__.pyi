@@ -102,8 +102,26 @@ from ._why_not import why_not as why_not
 from .library import NamedPattern as NamedPattern
 from .library import pattern_named as pattern_named
 from .library import patterns as patterns
+from ._unknowns import CONNECTIVES as CONNECTIVES
+from ._unknowns import any_of as any_of
+from ._unknowns import certain as certain
+from ._unknowns import has_pairs as has_pairs
+from ._unknowns import negated as negated
+from ._unknowns import pushed as pushed
+from ._unknowns import spelled_out as spelled_out
+from ._unknowns import undecided as undecided
+from ._unknowns import unknown as unknown
 
 __all__ = [
+    "CONNECTIVES",
+    "any_of",
+    "certain",
+    "has_pairs",
+    "negated",
+    "pushed",
+    "spelled_out",
+    "undecided",
+    "unknown",
     "Column",
     "Columns",
     "all_known",

@@ -863,7 +863,7 @@ def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog)
         session.injective,
         settings.ego,
         settings.unknown_is_false,
-        settings.end or "strong",
+        settings.end or "bounded",
         settings.gaps or "break",
         written.robustness,
         returns,

@@ -774,13 +774,15 @@ def _of_block(sql: SqlBuilder, join: Join, given: SharedRelation | None, leaf: B
     """The value of a block for each frame and binding of the nodes outside."""
     keys = frozenset(leaf.scope.outer)
     alias = f":block {leaf.number}"
-    rows = _block_rows(sql, leaf, given, keys)
-    on = [f'{quoted(alias)}."frame_id" = {join.frame}']
-    on += [
-        f"{quoted(alias)}.{column} = {join.nodes[key]}"
-        for key, column in zip(sorted(keys), columns_of(keys), strict=True)
-    ]
-    join.select.join(nested(rows, alias), on, "LEFT JOIN")
+    if alias not in join.lanes:  # a condition may speak of one block twice
+        join.lanes.add(alias)
+        rows = _block_rows(sql, leaf, given, keys)
+        on = [f'{quoted(alias)}."frame_id" = {join.frame}']
+        on += [
+            f"{quoted(alias)}.{column} = {join.nodes[key]}"
+            for key, column in zip(sorted(keys), columns_of(keys), strict=True)
+        ]
+        join.select.join(nested(rows, alias), on, "LEFT JOIN")
     value = f'{quoted(alias)}."value"'
     if leaf.word == "EXISTS":
         return f"coalesce({value}, FALSE)"

@@ -502,7 +502,7 @@ def _check(span: TextSpan, children: Children) -> s.CheckClause:
 
 def _quantifier(span: TextSpan, children: Children) -> s.QuantifierClause:
     word, *nodes, where, absent = children
-    return s.QuantifierClause(word.text.upper(), tuple(nodes), where, bool(absent), span)
+    return s.QuantifierClause(word.text.upper(), tuple(nodes), where, absent is not False, span)
 
 
 def _quantified(span: TextSpan, children: Children) -> s.QuantifiedNode:

@@ -815,7 +815,7 @@ class BoundQuantifier:
     where : Bound or None
         What must be true of them in some frame, so that they count.
     absent : bool
-        What a condition on them is where one of them is absent.
+        Whether a condition on an absent one of them counts for it; else it is false.
     """
 
     word: str
@@ -843,8 +843,9 @@ class BoundCheck:
     unknown_is_false : bool
         As in :class:`Query`.
     end : str
-        How the end of a trace is taken: ``strong`` (what is still due is missed), ``weak`` (it is forgiven),
-        ``pending`` (the verdict says that it was due).
+        How the end of a trace is taken: ``bounded`` (an operator whose bound is not over is pending, others
+        have failed), ``strong`` (what is still due is missed), ``weak`` (it is forgiven), ``pending`` (all that
+        is still due is pending).
     gaps : str
         Whether a gap in the recording ends a run (``break``) or not (``bridge``); with ``unknown`` nothing is
         known of what happened in it.
@@ -867,7 +868,7 @@ class BoundCheck:
     injective: bool = True
     ego: str | None = None
     unknown_is_false: bool = False
-    end: str = "strong"
+    end: str = "bounded"
     gaps: str = "break"
     robustness: bool = False
     returns: tuple[ReturnColumn, ...] = ()

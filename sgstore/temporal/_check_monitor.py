@@ -16,9 +16,15 @@ import numpy as np
 
 from sgstore.errors import QueryError
 from sgstore.matches import Interval
+from sgstore.temporal._check_plan import FAVOURABLE, SIGNS, UNFAVOURABLE, base_name, plan_of_check
 from sgstore.temporal._checks import (
+    HOLDS,
+    PENDING,
+    UNKNOWN,
+    VIOLATED,
     Level,
     Verdict,
+    doubt_text,
     folded_values,
     innermost,
     levels_of,
@@ -36,11 +42,12 @@ from sgstore.temporal._formula import (
     Tick,
     least,
     looks_ahead,
+    may_end,
     propositions,
 )
 from sgstore.temporal._match_values import AT_FRAME, ReturnedValues
 from sgstore.temporal._match_values_monitor import MatchValues
-from sgstore.temporal._plan import plan_of_check, plan_of_returned
+from sgstore.temporal._plan import plan_of_returned
 from sgstore.temporal._robustness_monitor import RobustnessMonitor
 from sgstore.temporal._sequence_monitor import FrameTime, MonitorEvent
 from sgstore.temporal._valuation import BindingTable, Partial, Valuation
@@ -120,8 +127,18 @@ class ObligationState:
         """Tell whether the formula is true if no frame follows."""
         if self.word in {"broken", "begins"}:
             return self.word == "begins"
-        open_terms = [d for duty in self.duties if duty for d in _open(duty)]
-        return all(term.ended for term in open_terms)
+        return all(term.ended for term in self._open)
+
+    @property
+    def _open(self) -> list[Term]:
+        return [d for duty in self.duties if duty for d in _open(duty)]
+
+    def at_end(self, end: str, tick: Tick) -> int:
+        """Return what is known if the frame of a tick is the last: ``VIOLATED``, ``PENDING`` or ``HOLDS``."""
+        if self.ended or end == "weak":
+            return HOLDS
+        due = end == "pending" or (end == "bounded" and all(may_end(t, tick) for t in self._open))
+        return PENDING if due else VIOLATED
 
 
 @dataclass(frozen=True, slots=True)
@@ -342,6 +359,9 @@ class _CheckEntry:
         What values over time need of former frames.
     final : bool
         Whether no frame changes it any more.
+    doubt : Doubt or None
+        What the other evaluation knows, as if no unknown condition were in favour of the check; ``None``: the
+        same.
     """
 
     state: ObligationState
@@ -350,11 +370,36 @@ class _CheckEntry:
     over: tuple[Span, ...]
     memory: Memory
     final: bool = False
+    doubt: Doubt | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """The other evaluation of a binding, which an unknown condition has parted from the first.
+
+    Attributes
+    ----------
+    state : ObligationState
+    counted : int
+    violated : bool
+        Whether the check was violated in it.
+    name : str
+        The unknown proposition.
+    at : FrameTime
+        The frame in which it was unknown.
+    """
+
+    state: ObligationState
+    counted: int
+    violated: bool
+    name: str
+    at: FrameTime
 
 
 def _same(one: _CheckEntry, other: _CheckEntry) -> bool:
     return (
         one.state is other.state
+        and one.doubt == other.doubt
         and one.counted == other.counted
         and one.since is other.since
         and one.over == other.over
@@ -405,7 +450,13 @@ class CheckMonitor:
         self._letters = Valuation(
             plan, self._variables, questions, pulse, bridge=check.gaps == "bridge"
         )
-        bits = self._letters.bits
+        self._plan = plan
+        bits = dict(self._letters.bits)
+        self._signed: dict[str, list[tuple[int, int, str]]] = {sign: [] for sign in SIGNS}
+        every = (n for one in (formula, *guards.values()) for n in propositions(one))
+        for name in sorted(n for n in {*every} if n[-1] in SIGNS):
+            bits[name] = 1 << len(bits)
+            self._signed[name[-1]].append((bits[base_name(name)], bits[name], base_name(name)))
         self._automaton = Automaton(formula, reset, tuple(guards.values()), bits)
         strangers = _CheckEntry(self._automaton.begun, 0, None, (), self._letters.begun)
         self._known = BindingTable(self._letters.lattice, strangers)
@@ -420,6 +471,7 @@ class CheckMonitor:
         self._values = MatchValues(self._returned.parts, plan, *about, bridge=bridge)
         self._ended: dict[tuple[Partial, Span], dict[str, Any]] = {}
         self._told: dict[Key, tuple[int, int]] = {}
+        self._full = 0
         self._immediate = all(q.word == "FORALL" for q in check.quantifiers)
 
     @property
@@ -433,6 +485,7 @@ class CheckMonitor:
         """A frame has come, and the questions were asked of it: what is known from it on."""
         if self._margins is not None:
             self._margins.step()
+        self._count_full()
         known, check = self._known, self._check
         found = {row: entry for row, entry in known.held.items() if entry.final}
         left = (row for row in known.held if row not in found) if found else known.held
@@ -446,11 +499,17 @@ class CheckMonitor:
             if before.final:
                 found[row] = before
                 continue
-            step = automaton.step(before.state, letter & mask, tick, seen)
+            best, worst = (self._with_unknown(letter, sign) & mask for sign in SIGNS)
+            step = automaton.step(before.state, best, tick, seen)
             entry = stepped(before, step, here, memories.get(row, ()))
+            if before.doubt is not None or best != worst:
+                other = (before.doubt or before).state
+                doubted = automaton.step(other, worst, tick, seen)
+                doubt = self._doubted(before, entry, doubted, letter, here)
+                entry = replace(entry, doubt=doubt)
             if entry is not before:
                 changed.append(row)
-                if automaton.final(entry.state, entry.counted):
+                if entry.doubt is None and automaton.final(entry.state, entry.counted):
                     entry = replace(entry, memory=(), final=True)
             found[row] = entry
         grown = [(row, len(known.of(row).over)) for row in changed] if check.returns else []
@@ -461,6 +520,42 @@ class CheckMonitor:
         if not self._immediate:
             return []
         return list(self._events(here, changed))
+
+    def _with_unknown(self, letter: int, sign: str) -> int:
+        """A letter with the unknown propositions that count in one of the evaluations."""
+        for bit, signed, _ in self._signed[sign]:
+            if letter & bit:
+                letter |= signed
+        return letter
+
+    def _doubted(
+        self,
+        before: _CheckEntry,
+        entry: _CheckEntry,
+        step: ObligationStep,
+        letter: int,
+        here: FrameTime,
+    ) -> Doubt | None:
+        """What the other evaluation knows of a binding now; ``None``: the same as the first."""
+        old = before.doubt
+        broken = step.started or (self._compat and not step.state.ended)
+        own = entry.since is not None or len(entry.over) > len(before.over)
+        violated = (old is not None and old.violated) or (broken and not own)
+        counted = (before if old is None else old).counted | step.guards
+        if step.state is entry.state and not violated and counted == entry.counted:
+            return None
+        if old is not None:
+            return replace(old, state=step.state, counted=counted, violated=violated)
+        every = [*self._signed[UNFAVOURABLE], *self._signed[FAVOURABLE]]
+        name = next(name for bit, _, name in every if letter & bit)
+        return Doubt(step.state, counted, violated, name, here)
+
+    def _count_full(self) -> None:
+        """Count the frames in which all entities are there that were met up to now."""
+        questions = self._questions
+        if self._kinds & questions.fresh:
+            self._full = 0
+        self._full += all(questions.here[k] == len(questions.met(k)) for k in self._kinds)
 
     def _return(self, grown: list[tuple[Partial, int]]) -> None:
         """Work out what is returned of violations that ended with this frame, given how many had before."""
@@ -587,12 +682,22 @@ class CheckMonitor:
         """The status of the check for the entities seen so far: one of ``STATUS``."""
         levels = self._levels()
         bindings = innermost(levels)
-        return STATUS[self._folded_codes(levels, [self._of(key) for key in bindings.tolist()])]
+        known = STATUS[self._folded_codes(levels, [self._of(key) for key in bindings.tolist()])]
+        if known != "false" and any(one.doubt for one in self._known.held.values()):
+            return "unknown" if self._worst() in {UNKNOWN, VIOLATED} else known
+        return known
+
+    def _worst(self) -> int:
+        """What is known with no unknown condition in favour of the check, if the trace ends now."""
+        levels = self._levels(doubted=True)
+        codes = [self._code_at_end(self._of(key)) for key in innermost(levels).tolist()]
+        return int(folded_values(levels, np.array(codes, np.int8), HOLDS)[0][0])
 
     def _of(self, key: list[int]) -> _CheckEntry:
         return self._known.of(tuple(key))
 
-    def _levels(self) -> list[Level]:
+    def _levels(self, *, doubted: bool = False) -> list[Level]:
+        """The bindings of each quantifier; ``doubted``: those of the other evaluation."""
         domains = {n: np.array(sorted(met), np.int64) for n, met in self._domains.items()}
         size = len(self._variables)
 
@@ -601,8 +706,9 @@ class CheckMonitor:
         ) -> Bools:
             bit = self._guards.get(quantifier, 0)
             rest = (None,) * (size - len(variables))
-            told = [self._known.of((*key, *rest)).counted & bit == bit for key in bindings.tolist()]
-            return np.array(told, np.bool_)
+            found = (self._known.of((*key, *rest)) for key in bindings.tolist())
+            every = [(one.doubt if doubted and one.doubt else one).counted for one in found]
+            return np.array([counted & bit == bit for counted in every], np.bool_)
 
         apart = np.array(sorted(self._others), np.int64) if self._check.injective else None
         return levels_of(self._check.quantifiers, domains, apart=apart, counts=counts)
@@ -611,19 +717,40 @@ class CheckMonitor:
         codes = np.array([_code(entry, compat=self._compat) for entry in entries], np.int8)
         return int(folded_values(levels, codes, CERTAINLY_TRUE)[0][0])
 
+    def _spans(self, entry: _CheckEntry, last: FrameTime) -> list[Span]:
+        """The violations of a binding in a trace that has ended."""
+        found = list(entry.over)
+        if entry.since is not None:
+            found.append((entry.since, last))
+        elif not self._compat and self._ends(entry.state) == VIOLATED:
+            # Of what SGSM reports every violation is told already: the last frame's, too.
+            found.append((last, last))
+        return found
+
+    def _ends(self, state: ObligationState) -> int:
+        return HOLDS if self._compat else state.at_end(self._check.end, self._pulse.tick)
+
+    def _code_at_end(self, entry: _CheckEntry) -> int:
+        """What is known of a binding in a trace that has ended."""
+        own = self._ends(entry.state)
+        if entry.since is not None or entry.over or own == VIOLATED:
+            return VIOLATED
+        if entry.doubt is None:
+            return own
+        other = UNKNOWN if entry.doubt.violated else self._ends(entry.doubt.state)
+        return UNKNOWN if other == VIOLATED else other
+
     def finish(self, trace: str, last: FrameTime) -> tuple[Verdict, list[MonitorEvent]]:
         """The trace has ended: the verdict, and what only the end makes known."""
         levels = self._levels()
         bindings = innermost(levels)
         entries = [self._of(key) for key in bindings.tolist()]
-        # Of what SGSM reports every violation is told already: the last frame's, too.
-        weak = self._check.end == "weak" or self._compat
-        spans = [_spans(entry, last, weak=weak) for entry in entries]
-        truths = folded_values(levels, np.array([not one for one in spans], np.bool_))
-        holds = bool(truths[0][0])
-        verdict = "true" if holds else "false"
-        if self._check.end == "pending":
-            verdict = STATUS[self._folded_codes(levels, entries)]
+        codes = np.array([self._code_at_end(one) for one in entries], np.int8)
+        best, worst = int(folded_values(levels, codes, HOLDS)[0][0]), self._worst()
+        word = "true" if worst == HOLDS else "pending" if worst == PENDING else "unknown"
+        if best == VIOLATED:
+            word = "false"
+        spans = [self._spans(entry, last) for entry in entries]
 
         def violations(row: int, names: Mapping[str, str]) -> tuple[Interval, ...]:
             key = tuple(bindings[row].tolist())
@@ -634,16 +761,32 @@ class CheckMonitor:
 
         found = verdict_of(
             self._check,
-            Verdict(self.name, trace, verdict),
+            Verdict(self.name, trace, word),
             levels,
-            truths,
+            codes,
             self._domains,
             violations,
             _interval(trace, (last, last), {}),
         )
+        if word == "unknown":
+            found = replace(found, reason=self._reason(trace))
+        if word == "true":
+            found = replace(found, absent_frames=last.seq + 1 - self._full)
         if self._margins is not None:
             found = replace(found, robustness=self._margins.told(levels, self._domains))
+        holds = word != "false"
         return found, list(self._at_end(last, holds=holds, bindings=bindings, spans=spans))
+
+    def _reason(self, trace: str) -> str:
+        """Why the verdict is unknown: the condition that decides, of whom, and in which frame."""
+        for key in innermost(self._levels(doubted=True)).tolist():
+            entry = self._of(key)
+            if entry.doubt is not None and self._code_at_end(entry) == UNKNOWN:
+                names = zip(self._variables, key, strict=True)
+                who = [self._domains[name][node] for name, node in names]
+                condition = self._plan.doubts[entry.doubt.name]
+                return doubt_text(condition, who, f"{trace}#{entry.doubt.at.seq}")
+        return "it is unknown whether a quantifier is about an entity"
 
     def _at_end(
         self, last: FrameTime, *, holds: bool, bindings: Keys, spans: list[list[Span]]
@@ -682,16 +825,6 @@ def _code(entry: _CheckEntry, *, compat: bool) -> int:
     if entry.state.word == "kept":
         return CERTAINLY_TRUE
     return PRESUMABLY_TRUE if entry.state.ended else PRESUMABLY_FALSE
-
-
-def _spans(entry: _CheckEntry, last: FrameTime, *, weak: bool) -> list[Span]:
-    """The violations of a binding in a trace that has ended."""
-    found = list(entry.over)
-    if entry.since is not None:
-        found.append((entry.since, last))
-    elif not (weak or entry.state.ended):
-        found.append((last, last))
-    return found
 
 
 def _interval(trace: str, span: Span, values: Mapping[str, Any]) -> Interval:

@@ -19,18 +19,28 @@ from sgstore.lang import (
     compile_checks,
     entities,
     of_check,
+    relation,
     traces_of,
+    value_text,
 )
 from sgstore.matches import Interval, notes_in
-from sgstore.store import IN_NOTEBOOK
-from sgstore.temporal._formula import Formula, Proposition, formula_text, tolerant
+from sgstore.store import IN_NOTEBOOK, trace_of
+from sgstore.temporal._check_plan import (
+    FAVOURABLE,
+    SIGNS,
+    UNFAVOURABLE,
+    WHOLE,
+    base_name,
+    empty_plan,
+    plan_of_check,
+)
+from sgstore.temporal._formula import Formula, Proposition, formula_text, propositions, tolerant
 from sgstore.temporal._match_values import AT_FRAME, ReturnedValues, Stretches
 from sgstore.temporal._matches import lacking
-from sgstore.temporal._offline import PlanValues, TraceReader, refuse_many, traces
+from sgstore.temporal._offline import PlanValues, TraceReader, frame_times, refuse_many, traces
 from sgstore.temporal._plan import (
     kept_throughout,
     needs_text,
-    plan_of_check,
     plan_of_returned,
     plan_text,
 )
@@ -57,13 +67,18 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang import Catalog, CheckInCatalog, Window
-    from sgstore.lang.ir import BoundCheck, BoundQuantifier, OverMatch
+    from sgstore.lang.ir import Bound, BoundCheck, BoundQuantifier, OverMatch
     from sgstore.store import StoreFile
     from sgstore.world import Bools, Floats, Ints
 
+    Codes = NDArray[np.int8]
     Keys = NDArray[np.int64]
     Statuses = NDArray[np.int8]
     Array = NDArray[Any]
+
+
+VIOLATED, UNKNOWN, PENDING, HOLDS = range(4)
+"""What is known of a binding, in order: the smaller of two holds for both, the greater for either."""
 
 
 # Quantifiers: which entities of a trace they are about, and what is true of all, or of some, of them ----
@@ -231,6 +246,17 @@ def unknown_notes(told: Iterable[tuple[str, str, str]]) -> list[str]:
     ]
 
 
+def doubt_text(condition: Bound, who: Sequence[str], frame: str) -> str:
+    """Text of the condition that is unknown, of whom, and in which frame."""
+    written = value_text(condition).removeprefix("(").removesuffix(")")
+    return f"{written} is unknown{' of ' * bool(who)}{', '.join(who)} in {frame}"
+
+
+def absence_text(frames: int) -> str:
+    """Text of the number of frames in which an entity is absent."""
+    return f"an entity is absent in {frames} frame{'s' * (frames != 1)}"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Verdict:
     """Verdict of a check on a trace.
@@ -240,9 +266,8 @@ class Verdict:
     check, trace : str
         Their names.
     verdict : str
-        ``true`` or ``false``; with ``USING END pending`` also ``presumably_true``, ``presumably_false``; and
-        ``unknown`` of a trace that cannot answer it, or, with ``USING GAPS unknown``, if it depends on what
-        happened in a gap.
+        ``true`` or ``false``, if that holds whatever is unknown; ``pending``, if something is still due at the end
+        of the recording; else ``unknown``.
     first_violation : Interval or None
         The first of the violations.
     violations : tuple of Interval
@@ -254,6 +279,8 @@ class Verdict:
         Why the verdict is ``unknown``; else empty.
     robustness : Robustness or None
         By how much the check is met, if it asks for that by ``ROBUSTNESS``.
+    absent_frames : int
+        Of a ``true`` verdict: the number of frames in which an entity that the check is about is absent.
     """
 
     check: str
@@ -264,13 +291,15 @@ class Verdict:
     status: Statuses | None = None
     reason: str = ""
     robustness: Robustness | None = None
+    absent_frames: int = 0
 
     def __repr__(self) -> str:
         number = len(self.violations)
         more = f", {number} violation{'s' * (number > 1)}" if number else ""
         more += f" by {self.robustness.value:.3g}" if self.robustness else ""
         why = f", {self.reason}" if self.reason else ""
-        return f"<Verdict {self.check!r} of {self.trace!r}: {self.verdict}{more}{why}>"
+        away = f", {absence_text(self.absent_frames)}" if self.absent_frames else ""
+        return f"<Verdict {self.check!r} of {self.trace!r}: {self.verdict}{more}{why}{away}>"
 
     def _repr_html_(self) -> str:
         """The verdict with its violations as a table, for notebooks."""
@@ -378,7 +407,7 @@ def verdict_of(
     check: BoundCheck,
     verdict: Verdict,
     levels: Sequence[Level],
-    truths: Sequence[Bools],
+    codes: Codes,
     names: Mapping[str, Mapping[int, str]],
     violations: Callable[[int, Mapping[str, str]], tuple[Interval, ...]],
     last: Interval,
@@ -390,8 +419,8 @@ def verdict_of(
     check : BoundCheck
     verdict : Verdict
     levels : sequence of Level
-    truths : sequence of (B,) bool
-        As :func:`folded_values` gives them.
+    codes : (B,) int8
+        What is known of the bindings of the last level, from :data:`VIOLATED` to :data:`HOLDS`.
     names : mapping of str to mapping of int to str
         Names of the entities that each variable may be.
     violations : function
@@ -403,16 +432,17 @@ def verdict_of(
         return replace(verdict, violations=violations(0, {}))
     word = levels[0].word
     depth = next((n for n, level in enumerate(levels) if level.word != word), len(levels))
-    level, values = levels[depth - 1], truths[depth]
+    folded = folded_values(levels, codes, HOLDS)
+    level, values = levels[depth - 1], folded[depth]
     variables = [node for q in check.quantifiers[:depth] for node in q.nodes]
     found: list[Witness] = []
-    for row in np.flatnonzero(values == (word == "FORSOME")).tolist():
+    for row in np.flatnonzero(values == (HOLDS if word == "FORSOME" else VIOLATED)).tolist():
         nodes = dict(zip(variables, level.bindings[row].tolist(), strict=True))
         called = {name: names[name][node] for name, node in nodes.items()}
         inner = violations(row, called) if depth == len(levels) else ()
-        found.append(Witness(nodes, called, bool(values[row]), inner))
+        found.append(Witness(nodes, called, bool(values[row] == HOLDS), inner))
     told: tuple[Interval, ...] = ()
-    if not truths[0][0]:
+    if folded[0][0] == VIOLATED:
         every = {(i.start_seq, i.end_seq): i for w in found for i in w.violations}
         told = tuple(every[key] for key in sorted(every)) or (last,)
     return replace(verdict, violations=told, witnesses=tuple(found))
@@ -526,7 +556,7 @@ class CheckRun:
         """
         with self._file.snapshot():
             (one,) = compile_checks(self._text, self._catalog(), self._parameters)
-            check = StoreCheck(self._file, one, compat=False, status=False)
+            check = StoreCheck(self._file, one, margins=True)
             for trace in check.readers():
                 if len(trace):
                     yield trace.frame_ids, check.margins(trace)
@@ -537,6 +567,24 @@ class CheckRun:
             StoreCheck(self._file, one, compat=False, status=False).text() for one in self._checks
         ]
         return "\n\n".join(parts)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """What is known of bindings.
+
+    Attributes
+    ----------
+    codes : (B,) int8
+        From :data:`VIOLATED` to :data:`HOLDS`.
+    told : list of (violations, status)
+    in_gap : (B,) bool
+        Whether it depends on what happened in a gap.
+    """
+
+    codes: Codes
+    told: list[_BindingVerdict]
+    in_gap: Bools
 
 
 _BindingVerdict = tuple[tuple[Violation, ...], "Statuses | None"]
@@ -553,9 +601,19 @@ class StoreCheck:
     one : CheckInCatalog
     compat, status : bool
         As ``sgsm_compat`` and ``status`` of :class:`CheckRun`.
+    margins : bool
+        Whether :meth:`margins` will be asked.
     """
 
-    def __init__(self, file: StoreFile, one: CheckInCatalog, *, compat: bool, status: bool) -> None:
+    def __init__(
+        self,
+        file: StoreFile,
+        one: CheckInCatalog,
+        *,
+        compat: bool = False,
+        status: bool = False,
+        margins: bool = False,
+    ) -> None:
         check = one.check
         self._file, self._check, self._catalog = file, check, one.catalog
         self._compat, self._want_status = compat, status
@@ -567,9 +625,9 @@ class StoreCheck:
             self._values.test(part.operand)
             if part.at is not None:
                 self._values.test(part.at)
-        self._quantity = self._plan.quantity(check.formula) if check.robustness else None
-        lasting = kept_throughout(check) if check.robustness else None
-        self._lasting = None if lasting is None else self._plan.quantity(lasting)
+        self._quantity = self._plan.margin(check.formula, WHOLE) if check.robustness else None
+        self._lasting = kept_throughout(check)
+        self._ranked = self._plan.quantity(self._lasting or check.formula) if margins else None
         self._people: dict[int, dict[str, dict[int, str]]] = {}
 
     @cached_property
@@ -644,6 +702,29 @@ class StoreCheck:
                 reasons += [lacks[facts.trace_id]] if facts.trace_id in lacks else []
                 yield Verdict(self._check.name, facts.name, "unknown", reason="; ".join(reasons))
 
+    @cached_property
+    def _absences(self) -> dict[int, int]:
+        """The number of frames of each trace in which an entity that the check is about is absent."""
+        frames = frame_times(self._file, None)["frame_id"]
+        full = np.ones(len(frames), np.bool_)
+        owners = trace_of(frames)
+        plan = empty_plan(self._check)
+        for node in self._check.scope.nodes:
+            ask = plan.atoms[plan.presence(node)]
+            statement = relation(ask.query, self._knowing, None, (), {node})
+            *before, (sql, values) = statement.steps()
+            counted = f'SELECT "frame_id", count(*) AS "there" FROM ({sql}) GROUP BY "frame_id"'
+            found = self._file.arrays(counted, values, given=before, plain=True)
+            there = np.zeros(len(frames), np.int64)
+            ids, many = (np.ma.getdata(found[name]) for name in ("frame_id", "there"))
+            order = np.argsort(frames)
+            there[order[np.searchsorted(frames, ids, sorter=order)]] = many
+            sizes = {t: len(some.get(node, ())) for t, some in self._people.items()}
+            wanted = np.array([sizes.get(t, 0) for t in owners.tolist()])
+            full &= there >= wanted
+        traces, number = np.unique(owners[~full], return_counts=True)
+        return dict(zip(traces.tolist(), number.tolist(), strict=True))
+
     def _read_people(self) -> None:
         """The entities that variables may be, with their names, by trace."""
         for node in self._check.scope.nodes:
@@ -652,55 +733,119 @@ class StoreCheck:
                 self._people.setdefault(trace, {}).setdefault(node, {})[number] = name
 
     def _verdict(self, trace: TraceReader) -> Verdict:
-        levels = self._levels(trace)
-        bindings = innermost(levels)
-        kinds, members = self._alike(trace, bindings)
-        values = np.zeros(len(kinds), np.bool_)
-        told: list[_BindingVerdict] = [((), None)] * len(kinds)
-        for low in range(0, len(kinds), trace.together):
-            part = slice(low, low + trace.together)
-            values[part], told[part] = self._evaluated(trace, kinds[part])
-        truths = folded_values(levels, values[members])
-        if self._check.gaps == "unknown" and trace.clock.gap_before.any():
-            least, most = self._bounds(trace, kinds)
-            ends = [folded_values(levels, end[members])[0][0] for end in (least, most)]
-            if ends[0] != ends[1]:
-                reason = "it depends on what happened in a gap"
-                return Verdict(self._check.name, trace.name, "unknown", reason=reason)
-        found = self._reported(trace, levels, truths, [told[i] for i in members.tolist()])
+        levels = self._levels(trace, FAVOURABLE)
+        judged = self._judged(trace, levels)
+        strict, other = levels, judged
+        if self._doubts_guards(trace):
+            strict = self._levels(trace, UNFAVOURABLE)
+            other = self._judged(trace, strict)
+        best, worst = (
+            int(folded_values(some, one.codes, HOLDS)[0][0])
+            for some, one in ((levels, judged), (strict, other))
+        )
+        if best == VIOLATED or worst == HOLDS:
+            word = "false" if best == VIOLATED else "true"
+        else:
+            word = "pending" if worst == PENDING else "unknown"
+        found = self._reported(
+            trace, word, (levels, judged) if word == "false" else (strict, other)
+        )
+        if word == "unknown":
+            found = replace(found, reason=self._reason(trace, strict, other))
+        if word == "true":
+            found = replace(found, absent_frames=self._absences.get(trace.trace_id, 0))
         if self._quantity is None:
             return found
-        robustness = self._robustness(self._quantity, trace, levels, (kinds, members))
+        robustness = self._robustness(self._quantity, trace, levels)
         return replace(found, robustness=robustness)
 
-    def _robustness(
-        self,
-        quantity: Formula,
-        trace: TraceReader,
-        levels: list[Level],
-        alike: tuple[Keys, Ints],
-    ) -> Robustness:
-        """Margin by which a trace meets the check; ``alike`` is what :meth:`_alike` found."""
-        kinds, members = alike
-        size = max(trace.together // MARGIN_CELLS, 1)
-        parts = [np.zeros(0)]
-        for low in range(0, len(kinds), size):
-            some = kinds[low : low + size]
-            value = self._margins(quantity, trace, some).value(quantity)[:, 0]
-            parts.append(np.broadcast_to(value, len(some)))
-        value, row = folded_margins(levels, np.concatenate(parts)[members])
+    def _judged(self, trace: TraceReader, levels: Sequence[Level]) -> Judged:
+        """What is known of each binding of the last level."""
+        kinds, members = self._alike(trace, innermost(levels))
+        codes = np.zeros(len(kinds), np.int8)
+        told: list[_BindingVerdict] = [((), None)] * len(kinds)
+        gaps = self._check.gaps == "unknown" and bool(trace.clock.gap_before.any())
+        in_gap = np.zeros(len(kinds), np.bool_)
+        for low in range(0, len(kinds), trace.together):
+            part = slice(low, low + trace.together)
+            codes[part], told[part] = self._evaluated(trace, kinds[part])
+            if gaps:
+                least, most = self._bounds(trace, kinds[part])
+                in_gap[part] = least != most
+                codes[part][in_gap[part]] = UNKNOWN
+        told = [told[i] for i in members.tolist()]
+        return Judged(codes[members], told, in_gap[members])
+
+    def _doubts_guards(self, trace: TraceReader) -> bool:
+        """Tell whether it is unknown of somebody whether a quantifier is about them."""
+        names = {n for guard in self._guards.values() for n in propositions(guard)}
+        doubts = {base_name(name) for name in names if name[-1] in SIGNS}
+        return any(len(trace.relations[name].frames) for name in doubts)
+
+    def _reason(self, trace: TraceReader, levels: Sequence[Level], judged: Judged) -> str:
+        """Why the verdict is unknown: the condition that decides, of whom, and in which frame."""
+        rows = np.flatnonzero(judged.codes == UNKNOWN)
+        if not len(rows):
+            return "it is unknown whether a quantifier is about an entity"
+        row = int(rows[0])
+        if judged.in_gap[row]:
+            return "it depends on what happened in a gap"
+        binding = innermost(levels)[row : row + 1]
+        found = self._decisive_doubt(trace, binding)
+        if found is None:
+            return "too little is known"
+        name, frame = found
+        names = self._people.get(trace.trace_id, {})
+        who = [names[v][n] for v, n in zip(self._variables, binding[0].tolist(), strict=True)]
+        return doubt_text(self._plan.doubts[name], who, f"{trace.name}#{trace.numbers[frame]}")
+
+    def _decisive_doubt(self, trace: TraceReader, binding: Keys) -> tuple[str, int] | None:
+        """The unknown proposition that decides the verdict of a binding, and its frame."""
+        values = PlanValues(self._plan, trace, self._variables, binding)
+        columns: dict[str, Floats] = {}
+        for name in propositions(self._formula):
+            if name[-1] in SIGNS:
+                flags = values.evaluation(name[-1]).proposition(name)
+                columns[name] = np.where(flags, 0.0, -np.inf)
+            else:
+                columns[name] = np.where(values.proposition(name), np.inf, -np.inf)
+        table = MarginTable(columns, trace.clock.times, trace.clock.tolerance)
+        starts = range(len(trace)) if self._reset is not None else (0,)
+        value = table.value(self._formula)
+        for start in starts:
+            if value[0, start] == 0:
+                found = table.decisive(self._formula, 0, start)
+                return None if found is None else (base_name(found[0]), found[1])
+        return None
+
+    def _robustness(self, quantity: Formula, trace: TraceReader, levels: list[Level]) -> Robustness:
+        """Margin by which a trace meets the check, at least and at most."""
+        kinds, members = self._alike(trace, innermost(levels))
+        ends: list[tuple[float, int | None]] = []
+        for sign in (UNFAVOURABLE, FAVOURABLE):
+            size = max(trace.together // MARGIN_CELLS, 1)
+            parts = [np.zeros(0)]
+            for low in range(0, len(kinds), size):
+                some = kinds[low : low + size]
+                value = self._margins(quantity, trace, some, sign).value(quantity)[:, 0]
+                parts.append(np.broadcast_to(value, len(some)))
+            ends.append(folded_margins(levels, np.concatenate(parts)[members]))
+            if not self._plan.doubts:
+                break
+        (value, row), most = ends[0], ends[-1][0]
+        upper = None if most == value else most
         if row is None:
-            return Robustness(value)
+            return Robustness(value, upper=upper)
         binding = innermost(levels)[row : row + 1]
         names = self._people.get(trace.trace_id, {})
         nodes = dict(zip(self._variables, binding[0].tolist(), strict=True))
         called = {name: names[name][node] for name, node in nodes.items()}
         decisive = self._margins(quantity, trace, binding).decisive(quantity, 0, 0)
         if decisive is None:
-            return Robustness(value, nodes=nodes, names=called)
+            return Robustness(value, nodes=nodes, names=called, upper=upper)
         name, at = decisive
         when = int(trace.numbers[at]), int(trace.times[at]), trace.seconds(at)
-        return Robustness(value, condition_text(self._plan, name), *when, nodes, called)
+        return Robustness(value, condition_text(self._plan, name), *when, nodes, called, upper)
 
     def margins(self, trace: TraceReader) -> Floats:
         """Margins by which a trace meets the check; NaN where only numbers that are not known decide.
@@ -708,8 +853,7 @@ class StoreCheck:
         Of a check that says what is ``ALWAYS`` true, of everybody: (F,), that of each frame. What is not known
         of somebody, or in some frame, does not count. Of any other check: (1,), that of the whole trace.
         """
-        each = self._lasting is not None
-        quantity = self._lasting if self._lasting is not None else self._quantity
+        each, quantity = self._lasting is not None, self._ranked
         assert quantity is not None  # noqa: S101 - who asks has asked for margins
         levels = self._levels(trace)
         kinds, members = self._alike(trace, innermost(levels))
@@ -718,7 +862,7 @@ class StoreCheck:
         for low in range(0, len(kinds), size):
             some = kinds[low : low + size]
             value, other = (
-                self._margins(quantity, trace, some, unknown).value(quantity)
+                self._margins(quantity, trace, some, unknown=unknown).value(quantity)
                 for unknown in (-np.inf, np.inf)
             )
             value = np.where(np.isinf(value) & (value != other), np.nan, value)
@@ -731,9 +875,14 @@ class StoreCheck:
         return np.array([folded_margins(levels, np.concatenate(parts)[members])[0]])
 
     def _margins(
-        self, quantity: Formula, trace: TraceReader, bindings: Keys, unknown: float = -np.inf
+        self,
+        quantity: Formula,
+        trace: TraceReader,
+        bindings: Keys,
+        counted: str = UNFAVOURABLE,
+        unknown: float = -np.inf,
     ) -> MarginTable:
-        values = PlanValues(self._plan, trace, self._variables, bindings)
+        values = PlanValues(self._plan, trace, self._variables, bindings, counted)
         about = values.test, values.proposition, trace.clock.tolerance, unknown
         columns = margin_columns(self._plan, quantity, *about)
         return MarginTable(columns, trace.clock.times, trace.clock.tolerance)
@@ -743,7 +892,8 @@ class StoreCheck:
         parts: list[tuple[Bools, Bools]] = []
         for low in range(0, len(bindings), trace.together):
             some = bindings[low : low + trace.together]
-            columns = PlanValues(self._plan, trace, self._variables, some).columns(self._formula)
+            values = PlanValues(self._plan, trace, self._variables, some)
+            columns = values.columns(self._formula)
             times, gaps = trace.clock.times, trace.clock.gap_before
             lenient = tolerant(self._formula, trace.clock.tolerance)
             parts.append(within_bounds(lenient, columns, times, gaps, len(some)))
@@ -751,7 +901,7 @@ class StoreCheck:
         least = np.concatenate([nothing, *(part[0] for part in parts)])
         return least, np.concatenate([nothing, *(part[1] for part in parts)])
 
-    def _levels(self, trace: TraceReader) -> list[Level]:
+    def _levels(self, trace: TraceReader, counted: str = FAVOURABLE) -> list[Level]:
         people = self._people.get(trace.trace_id, {})
         domains = {
             node: np.array(sorted(people.get(node, ())), np.int64)
@@ -767,10 +917,9 @@ class StoreCheck:
             if guard is None or not len(bindings):
                 return np.ones(len(bindings), np.bool_)
             size = trace.together
-            parts = [
-                PlanValues(self._plan, trace, variables, bindings[low : low + size]).formula(guard)
-                for low in range(0, len(bindings), size)
-            ]
+            some = (bindings[low : low + size] for low in range(0, len(bindings), size))
+            about = self._plan, trace, variables
+            parts = [PlanValues(*about, part, counted).formula(guard) for part in some]
             return np.concatenate([part.any(axis=1) for part in parts])
 
         injective = self._check.injective
@@ -795,66 +944,70 @@ class StoreCheck:
         _, first, members = np.unique(sorts, axis=0, return_index=True, return_inverse=True)
         return bindings[first], members.reshape(-1)
 
-    def _evaluated(self, trace: TraceReader, bindings: Keys) -> tuple[Bools, list[_BindingVerdict]]:
-        """The verdict of some bindings, and more of those that it is due to."""
+    def _evaluated(self, trace: TraceReader, bindings: Keys) -> tuple[Codes, list[_BindingVerdict]]:
+        """What is known of some bindings, and more of those that the verdict is due to."""
         values = PlanValues(self._plan, trace, self._variables, bindings)
+        codes, told = self._in_evaluation(trace, values, len(bindings))
+        doubts = [name for name in propositions(self._formula) if name[-1] in SIGNS]
+        doubtful = np.zeros(len(bindings), np.bool_)
+        for name in doubts:
+            doubtful |= values.evaluation(name[-1]).proposition(name).any(axis=1)
+        if doubtful.any():
+            other = values.evaluation(UNFAVOURABLE)
+            worst, _ = self._in_evaluation(trace, other, len(bindings), among=doubtful)
+            worst[worst == VIOLATED] = UNKNOWN
+            kept = doubtful & (codes != VIOLATED)
+            codes[kept] = worst[kept]
+        return codes, told
+
+    def _in_evaluation(
+        self, trace: TraceReader, values: PlanValues, rows: int, among: Bools | None = None
+    ) -> tuple[Codes, list[_BindingVerdict]]:
+        """What one of the two evaluations says of some bindings; ``among``: those that are wanted."""
         columns = values.columns(self._formula)
-        truths = values.formula(self._formula)[:, 0].copy()
+        truths = values.formula(self._formula)[:, 0]
         resets = values.formula(self._reset) if self._reset is not None else None
-        told: list[_BindingVerdict] = []
+        codes = np.where(truths, HOLDS, VIOLATED).astype(np.int8)
+        told: list[_BindingVerdict] = [((), None)] * rows
         lenient = tolerant(self._formula, trace.clock.tolerance)
-        for row in range(len(bindings)):
+        for row in range(rows):
             needed = not truths[row] or self._compat or self._want_status
-            if not (needed or self._check.end == "pending"):
-                told.append(((), None))
+            if not needed or (among is not None and not among[row]):
                 continue
             own = {name: column[min(row, len(column) - 1)] for name, column in columns.items()}
-            settled = Settled(lenient, own, trace.clock.times)
+            settled = Settled(lenient, own, trace.clock.times, trace.clock.tolerance)
             reset = resets[row] if resets is not None else None
-            truths[row], one = self._one(settled, reset)
-            told.append(one)
-        return truths, told
+            codes[row], told[row] = self._one(settled, reset)
+        return codes, told
 
-    def _one(self, settled: Settled, reset: Bools | None) -> tuple[bool, _BindingVerdict]:
-        weak = self._check.end == "weak"
-        wanted = self._compat or self._want_status or self._check.end == "pending"
-        status = settled.statuses() if wanted else None
+    def _one(self, settled: Settled, reset: Bools | None) -> tuple[int, _BindingVerdict]:
+        status = settled.statuses() if self._compat or self._want_status else None
         if self._compat and status is not None:
             broken = status < PRESUMABLY_TRUE
-            return not broken.any(), (tuple(_runs(broken)), status)
-        violations = tuple(settled.violations(reset, weak=weak))
-        holds = bool(settled.value[0])
-        if weak and not holds:
-            holds = not violations
-        return holds, (violations, status)
+            return VIOLATED if broken.any() else HOLDS, (tuple(_runs(broken)), status)
+        violations, due = settled.judged(reset, self._check.end)
+        code = VIOLATED if violations else PENDING if due else HOLDS
+        return code, (tuple(violations), status)
 
     def _reported(
-        self,
-        trace: TraceReader,
-        levels: list[Level],
-        truths: list[Bools],
-        told: list[_BindingVerdict],
+        self, trace: TraceReader, word: str, about: tuple[Sequence[Level], Judged]
     ) -> Verdict:
-        status = self._joined(levels, told, len(trace))
-        verdict = "true" if truths[0][0] else "false"
-        if self._check.end == "pending" and status is not None:
-            verdict = STATUS[int(status[-1])]
-
+        levels, judged = about
+        status = self._joined(levels, judged.told, len(trace))
         bindings = innermost(levels)
 
         def violations(row: int, names: Mapping[str, str]) -> tuple[Interval, ...]:
-            spans = told[row][0]
+            spans = judged.told[row][0] if judged.codes[row] == VIOLATED else ()
             values = self._values_of(trace, bindings[row : row + 1], spans)
             return tuple(
                 _interval(trace, one, {**names, **more})
                 for one, more in zip(spans, values, strict=True)
             )
 
-        kept = status if self._want_status else None
         names = self._people.get(trace.trace_id, {})
         last = _interval(trace, (len(trace) - 1, len(trace) - 1, True), {})
-        found = Verdict(self._check.name, trace.name, verdict, status=kept)
-        return verdict_of(self._check, found, levels, truths, names, violations, last)
+        found = Verdict(self._check.name, trace.name, word, status=status)
+        return verdict_of(self._check, found, levels, judged.codes, names, violations, last)
 
     def _values_of(
         self, trace: TraceReader, binding: Keys, spans: Sequence[Violation]
@@ -876,10 +1029,10 @@ class StoreCheck:
         ]
 
     def _joined(
-        self, levels: list[Level], told: list[_BindingVerdict], frames: int
+        self, levels: Sequence[Level], told: list[_BindingVerdict], frames: int
     ) -> Statuses | None:
         """The status of the whole check at each frame, of those of its bindings."""
-        if not (self._want_status or self._check.end == "pending"):
+        if not self._want_status:
             return None
         rows = [status for _, status in told if status is not None]
         codes = np.array(rows, np.int8).reshape(len(rows), frames)

@@ -369,6 +369,34 @@ class Term:
                 return any(operand.ended for operand in self.operands)
 
 
+def may_end(term: Term, tick: Tick) -> bool:
+    """Tell whether a combination is true, or still due, if the frame of a tick is the last.
+
+    An operator that looks ahead is due if its bound is not over, and so is ``NEXT``. One without an upper bound
+    has failed.
+    """
+    match term.word:
+        case "duty":
+            formula, since, weak = term.operands
+            if weak or not isinstance(formula, Until):
+                return True
+            if formula.bound.high is None:
+                return False
+            if since is None:
+                return True
+            frames = formula.bound.frames
+            age = (tick.number if frames else tick.time) - since
+            return age < formula.bound.high - (0 if frames else tick.tolerance)
+        case "not":
+            return not term.operands[0].ended
+        case "and":
+            return all(may_end(operand, tick) for operand in term.operands)
+        case "or":
+            return any(may_end(operand, tick) for operand in term.operands)
+        case _:
+            return term.ended
+
+
 class Terms:
     """All combinations that are in use."""
 

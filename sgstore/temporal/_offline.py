@@ -6,6 +6,7 @@ at a time.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
@@ -28,6 +29,7 @@ from sgstore.lang import (
 from sgstore.matches import TooMuchError, Windows
 from sgstore.records import dataclass
 from sgstore.store import trace_of
+from sgstore.temporal._check_plan import FAVOURABLE, SIGNS, CheckPlan
 from sgstore.temporal._formula import Formula, propositions, tolerant
 from sgstore.temporal._plan import Ask, ask_text
 from sgstore.temporal._robustness import MARGIN_CELLS, MarginTable, margin_columns
@@ -255,15 +257,36 @@ class PlanValues(SignalValues):
     variables : tuple of str
         What the columns of the bindings are.
     bindings : (B, n) int64
+    counted : str
+        Of a check: the sign of the unknown propositions that are true; the others are false.
     """
 
     def __init__(
-        self, plan: Plan, trace: TraceReader, variables: tuple[str, ...], bindings: Keys
+        self,
+        plan: Plan,
+        trace: TraceReader,
+        variables: tuple[str, ...],
+        bindings: Keys,
+        counted: str = FAVOURABLE,
     ) -> None:
         super().__init__(trace.clock)
         self._plan, self._trace = plan, trace
         self._variables, self._bindings = variables, bindings
+        self._counted = counted
         self._atoms: dict[str, Bools] = {}
+        self._tests: dict[str, Column] = {}
+
+    def evaluation(self, counted: str) -> PlanValues:
+        """The values of the other evaluation of a check, with all that is the same in both."""
+        found = copy(self)
+        found._counted = counted  # noqa: SLF001 - of one's own kind
+        return found
+
+    def test(self, test: Test) -> Column:
+        """The value of a test, worked out once."""
+        if test.name not in self._tests:
+            self._tests[test.name] = super().test(test)
+        return self._tests[test.name]
 
     def formula(self, formula: Formula) -> Bools:
         """(B, F) where a formula is true."""
@@ -277,6 +300,10 @@ class PlanValues(SignalValues):
 
     def proposition(self, name: str) -> Bools:
         """(B, F), or (1, F), where the atom, or the test, of that name is true."""
+        if name[-1] in SIGNS:
+            if name[-1] != self._counted:
+                return np.zeros((1, len(self._trace)), np.bool_)
+            name = name[:-1]
         if name in self._plan.tests:
             found = self.test(self._plan.tests[name]).true
             return np.broadcast_to(found, (len(found), len(self._trace)))
@@ -305,9 +332,21 @@ class PlanValues(SignalValues):
 
     def signal(self, signal: Ask) -> Column:
         """The values of a signal: (B, F)."""
+        if isinstance(self._plan, CheckPlan) and signal.name in self._plan.states:
+            return self._state(*self._plan.states[signal.name])
         found = self._trace.relations[signal.name]
         places = found.find(self._projected(signal.variables))
         return found.column(places, len(self._trace))
+
+    def _state(self, of: Ask | None, doubt: str | None) -> Column:
+        """Where a value is there, 0 if it is known and 1 if it is not."""
+        frames = len(self._trace)
+        if of is None:
+            return Column(np.zeros((1, frames)), np.ones((1, frames), np.bool_))
+        found = self._trace.relations[of.name]
+        there = found.flags(found.find(self._projected(of.variables)), frames)
+        values = np.zeros((1, frames)) if doubt is None else self.proposition(doubt)
+        return Column(np.broadcast_to(values, there.shape).astype(np.float64), there)
 
     def _projected(self, variables: tuple[str, ...]) -> Keys:
         if not variables:

@@ -14,10 +14,10 @@ A :class:`Plan` has all that an expression, or several of one statement, need of
 
 In a :class:`~sgstore.temporal._formula.Formula` of the plan, a proposition is the name of an atom or of a test.
 
-**What is unknown is false, where time begins.** An atom that is NULL is false; so is one that speaks of an
-entity that is absent (or true, where ``ABSENT AS TRUE`` says so). Logic outside of atoms has two values. Which
-part of a condition becomes an atom is chosen for speed: its value is that of its smallest conditions, each
-being true or false.
+In steps and values an atom that is NULL is false, and so is one that speaks of an entity that is absent. Logic
+outside of atoms has two values. Which part of a condition becomes an atom is chosen for speed: its value is that
+of its smallest conditions, each being true or false. Checks have plans of their own
+(:mod:`sgstore.temporal._check_plan`).
 
 For whoever evaluates a plan frame by frame (a monitor): for each frame, ask each atom for its matches, project
 them to ``variables``, and step a formula for each binding with ``letter[name] = projection in matches``. Of an
@@ -32,7 +32,7 @@ from itertools import combinations
 from typing import TYPE_CHECKING, Final
 
 import sgstore.temporal._formula as f
-from sgstore.lang import Type, relation, unnumbered_text, value_text
+from sgstore.lang import CONNECTIVES, Type, relation, unnumbered_text, value_text
 from sgstore.lang import ir as b
 from sgstore.records import dataclass
 from sgstore.temporal._formula import formula_text
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from sgstore.lang.ir import BoundCheck, BoundHold, BoundStep, Length, StepLink, StepWay
 
 
-CONNECTIVES: Final = frozenset({"AND", "OR", "NOT", "XOR", "IMPLIES"})
 _KNOWN: Final = frozenset({"IS NULL", "IS NOT NULL"})
 FALSE: Final = b.Value(value=False, type=Type.boolean)
 TRUE: Final = b.Value(value=True, type=Type.boolean)
@@ -149,8 +148,6 @@ class Plan:
         The statement: settings and relations are taken from it, and of its scope the nodes and edges.
     bound : tuple of str
         Keys of the nodes that a binding speaks of.
-    absent : frozenset of str
-        Those of which conditions are true where they are absent.
     prefix : str
         How names begin, so that those of several plans differ.
 
@@ -165,7 +162,6 @@ class Plan:
 
     whole: b.Query
     bound: tuple[str, ...]
-    absent: frozenset[str] = frozenset()
     prefix: str = ""
     atoms: dict[str, Ask] = field(default_factory=dict[str, Ask])
     signals: dict[str, Ask] = field(default_factory=dict[str, Ask])
@@ -184,7 +180,7 @@ class Plan:
             return self._over_time(expression)
         things = self._things(expression)
         split = isinstance(expression, b.Operation) and bool(things & self._manifold)
-        if self._guarded(expression) == things and not things & self.absent and not split:
+        if self._guarded(expression) == things and not split:
             return self._atom(expression, things)
         return self._logic(expression)
 
@@ -196,10 +192,10 @@ class Plan:
                 return f.TEMPORAL[word](*map(self.quantity, operands), bound)
             case b.Operation(word=word, operands=operands) if word in CONNECTIVES:
                 return f.LOGIC[word](*map(self.quantity, operands))
-            case b.Operation(word=word, operands=operands) if _has_margin(expression):
-                test = self.test(_MARGINS[word](*operands))
+            case b.Operation(word=word, operands=operands) if has_margin(expression):
+                test = self.test(MARGINS[word](*operands))
                 self.margins.setdefault(test.name, expression)
-                return self._lapsing(test.name, self._things(expression))
+                return f.Proposition(test.name)
             case _:
                 return self.formula(expression)
 
@@ -239,7 +235,7 @@ class Plan:
             case b.Operation(word=word) if word in CONNECTIVES:
                 return self._logic(expression)
             case _:
-                return self._lapsing(self.test(expression).name, self._things(expression))
+                return f.Proposition(self.test(expression).name)
 
     def _logic(self, expression: b.Bound) -> f.Formula:
         match expression:
@@ -259,8 +255,6 @@ class Plan:
         asked together with it: one question finds few, where each alone might find many.
         """
         flat = [part for operand in operands for part in b.conjuncts(operand)]
-        if self.absent:
-            return flat
         nodes = {id(part): self._things(part) for part in flat}
         apart = self._manifold
         plain = [p for p in flat if not (b.is_temporal(p) or nodes[id(p)] & apart)]
@@ -296,12 +290,7 @@ class Plan:
             name = self._names[key] = f"{self.prefix}a{len(self.atoms) + 1}"
             where = () if expression == TRUE else tuple(b.conjuncts(_two_valued(expression)))
             self.atoms[name] = Ask(name, self._query(things, where), self._variables(things))
-        return self._lapsing(name, frozenset() if expression == TRUE else things)
-
-    def _lapsing(self, name: str, things: Iterable[str]) -> f.Formula:
-        """A proposition, or that a node is absent of which conditions are true then."""
-        lapses = [f.Not(self.present(node)) for node in sorted(self.absent & set(things))]
-        return f.Or((f.Proposition(name), *lapses)) if lapses else f.Proposition(name)
+        return f.Proposition(name)
 
     def test(self, expression: b.Bound) -> Test:
         """An expression over values of several frames, of any type."""
@@ -375,10 +364,6 @@ def plan_of_steps(query: b.Query, steps: Sequence[BoundStep]) -> Plan:
     return Plan(whole, tuple(nodes))
 
 
-PlannedCheck = tuple[Plan, f.Formula, "f.Formula | None", dict[int, f.Formula]]
-"""The plan of a check, its formula, what resets it, and what restricts quantifiers, by their numbers."""
-
-
 def kept_throughout(check: b.BoundCheck) -> b.Bound | None:
     """The condition that a check wants in every frame, of everybody; ``None``: it is of another form."""
 
@@ -396,34 +381,20 @@ def kept_throughout(check: b.BoundCheck) -> b.Bound | None:
     return lasting(check.formula) if every else None
 
 
-def plan_of_check(check: BoundCheck, *, reset: bool = True) -> PlannedCheck:
-    """Return a check with the formulas that it is made of; ``reset``: whether what resets it matters."""
-    plan = _empty_plan(check)
-    formula = plan.formula(check.formula)
-    resets = plan.formula(check.reset) if reset and check.reset is not None else None
-    guards = {
-        n: plan.formula(q.where) for n, q in enumerate(check.quantifiers) if q.where is not None
-    }
-    return plan, formula, resets, guards
-
-
-def plan_of_margins(check: BoundCheck) -> tuple[Plan, f.Formula]:
-    """Return what a check is met by: the plan, and the formula over margins."""
-    plan = _empty_plan(check)
-    return plan, plan.quantity(check.formula)
-
-
 def plan_of_returned(check: BoundCheck) -> Plan:
     """Return a plan, without questions yet, for the values that a check returns."""
-    return replace(_empty_plan(check), prefix="returned ")
+    return Plan(query_of_check(check), variables_of(check), prefix="returned ")
 
 
-def _empty_plan(check: BoundCheck) -> Plan:
+def query_of_check(check: BoundCheck) -> b.Query:
+    """The settings and nodes of a check as those of a query."""
     about = check.relations, check.injective, check.ego, check.unknown_is_false
-    whole = b.Query(check.scope, b.Result(), *about)
-    variables = tuple(node for q in check.quantifiers for node in q.nodes)
-    absent = frozenset(node for q in check.quantifiers if q.absent for node in q.nodes)
-    return Plan(whole, variables, absent)
+    return b.Query(check.scope, b.Result(), *about)
+
+
+def variables_of(check: BoundCheck) -> tuple[str, ...]:
+    """Keys of the nodes that the quantifiers of a check bind."""
+    return tuple(node for q in check.quantifiers for node in q.nodes)
 
 
 def asks_of_steps(query: b.Query, steps: Sequence[BoundStep], kept: Iterable[str]) -> list[Ask]:
@@ -490,7 +461,7 @@ def _equal(left: b.Bound, right: b.Bound) -> b.Bound:
     return _operation("negative", _apart(left, right))
 
 
-_MARGINS: Final[Mapping[str, Callable[[b.Bound, b.Bound], b.Bound]]] = {
+MARGINS: Final[Mapping[str, Callable[[b.Bound, b.Bound], b.Bound]]] = {
     "<": _less,
     "<=": _less,
     ">": _greater,
@@ -501,11 +472,11 @@ _MARGINS: Final[Mapping[str, Callable[[b.Bound, b.Bound], b.Bound]]] = {
 """Margins of comparisons: how far they hold; below zero how far they fail."""
 
 
-def _has_margin(comparison: b.Operation) -> bool:
+def has_margin(comparison: b.Operation) -> bool:
     """Tell whether a condition compares numbers, not constants alone."""
     constants = b.Value | b.Operation
     return (
-        comparison.word in _MARGINS
+        comparison.word in MARGINS
         and all(operand.type is Type.number for operand in comparison.operands)
         and not all(isinstance(part, constants) for part in b.walk(comparison))
     )

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.lang import value_text
+from sgstore.temporal._check_plan import CheckPlan, base_name
 from sgstore.temporal._formula import (
     TRUE,
     And,
@@ -68,6 +69,8 @@ class Robustness:
         Node ids by variable, of the entities that decide.
     names : mapping of str to str
         Their names.
+    upper : float or None
+        The margin with all unknown values in favour of the check, if it differs; ``value`` is then that with none.
     """
 
     value: float
@@ -77,6 +80,7 @@ class Robustness:
     t: float | None = None
     nodes: Mapping[str, int] = field(default_factory=dict[str, int])
     names: Mapping[str, str] = field(default_factory=dict[str, str])
+    upper: float | None = None
 
 
 # Margins of propositions --------------------------------------------------------------------------
@@ -110,6 +114,10 @@ def margin_of_flags(flags: Bools) -> Floats:
 
 def condition_text(plan: Plan, name: str) -> str:
     """The condition that a proposition of a plan stands for, as text."""
+    name = base_name(name)
+    meanings = plan.meanings if isinstance(plan, CheckPlan) else {}
+    if name in meanings:
+        return value_text(meanings[name]).removeprefix("(").removesuffix(")")
     if name in plan.margins:
         return value_text(plan.margins[name]).removeprefix("(").removesuffix(")")
     if name in plan.tests:

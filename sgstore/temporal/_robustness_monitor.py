@@ -14,12 +14,19 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import reduce
+from functools import partial, reduce
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from sgstore.errors import QueryError
+from sgstore.temporal._check_plan import (
+    FAVOURABLE,
+    SIGNS,
+    UNFAVOURABLE,
+    base_name,
+    plan_of_margins,
+)
 from sgstore.temporal._checks import folded_margins, innermost
 from sgstore.temporal._formula import (
     TRUE,
@@ -37,7 +44,6 @@ from sgstore.temporal._formula import (
     Until,
     propositions,
 )
-from sgstore.temporal._plan import plan_of_margins
 from sgstore.temporal._robustness import Robustness, condition_text, margin_columns
 from sgstore.temporal._signals import NS
 from sgstore.temporal._valuation import BindingTable, Valuation
@@ -85,6 +91,12 @@ def _best_so_far(margins: Margins, *, greatest: bool) -> Margins:
     new[1:] = values[1:] > np.maximum.accumulate(values, axis=0)[:-1]
     places = np.where(new, np.arange(len(values))[:, None, None], 0)
     return np.take_along_axis(margins, np.maximum.accumulate(places, axis=0), axis=0)
+
+
+def _from_a_frame(margins: Margins, others: Margins) -> Margins:
+    """Margins, or equal ones that come from a frame where they do not."""
+    same = (margins["name"] < 0) & (margins["value"] == others["value"])
+    return np.where(same, others, margins)
 
 
 def _constant(value: Any, shape: tuple[int, ...]) -> Margins:
@@ -311,8 +323,8 @@ class MarginStream:
         low, high = self._vertices & ~bit, self._vertices | bit
 
         def shown(old: Margins) -> Margins:
-            least = _better(old[..., high], value, greatest=False)
-            return _better(old[..., low], least, greatest=True)
+            least = _from_a_frame(_better(old[..., high], value, greatest=False), value)
+            return _from_a_frame(_better(old[..., low], least, greatest=True), least)
 
         for part in self._parts:
             part.tape.values = shown(part.tape.values)
@@ -532,7 +544,9 @@ class RobustnessMonitor:
 
     def __init__(self, check: BoundCheck, questions: QueryCache, pulse: StreamClock) -> None:
         self._plan, self._formula = plan_of_margins(check)
-        self._stream, self._pulse = MarginStream(self._formula), pulse
+        self._pulse = pulse
+        signs = SIGNS if self._plan.doubts else (UNFAVOURABLE,)
+        self._streams = {sign: MarginStream(self._formula) for sign in signs}
         bridge = check.gaps == "bridge"
         self._valuation = Valuation(self._plan, self._plan.bound, questions, pulse, bridge=bridge)
         self._memories = BindingTable(self._valuation.lattice, self._valuation.begun)
@@ -545,18 +559,23 @@ class RobustnessMonitor:
         parents = [self._row(one) if self._rows else 0 for one in letters]
         tick = self._pulse.tick
 
-        def flags(name: str) -> Bools:
-            bit = valuation.bits[name]
+        def flags(name: str, counted: str) -> Bools:
+            if name[-1] in SIGNS and name[-1] != counted:
+                return np.zeros((len(letters), 1), np.bool_)
+            bit = valuation.bits[base_name(name)]
             return np.array([bool(letter & bit) for letter in letters.values()])[:, None]
 
         def test(one: Test) -> Column:
             return valuation.columns[one.name]
 
-        columns = margin_columns(self._plan, self._formula, test, flags, tick.tolerance)
-        margins = {
-            name: np.broadcast_to(column[:, 0], len(letters)) for name, column in columns.items()
-        }
-        self._stream.step(margins, tick, np.array(parents))
+        for sign, stream in self._streams.items():
+            about = test, partial(flags, counted=sign), tick.tolerance
+            columns = margin_columns(self._plan, self._formula, *about)
+            margins = {
+                name: np.broadcast_to(column[:, 0], len(letters))
+                for name, column in columns.items()
+            }
+            stream.step(margins, tick, np.array(parents))
         self._rows = {one: row for row, one in enumerate(letters)}
         known.held = {one: memories.get(one, ()) for one in letters}
 
@@ -574,17 +593,21 @@ class RobustnessMonitor:
         names : mapping of str to mapping of int to str
             Names of the entities that each variable may be.
         """
-        bindings, margins = innermost(levels), self._stream.margins()
+        bindings, stream = innermost(levels), self._streams[UNFAVOURABLE]
         rows = np.array([self._row(tuple(key)) for key in bindings.tolist()], np.int64)
+        found = {sign: one.margins() for sign, one in self._streams.items()}
+        margins = found[UNFAVOURABLE]
         value, row = folded_margins(levels, margins["value"][rows])
+        most, _ = folded_margins(levels, found.get(FAVOURABLE, margins)["value"][rows])
+        upper = None if most == value else most
         if row is None:
-            return Robustness(value)
+            return Robustness(value, upper=upper)
         nodes = dict(zip(self._plan.bound, bindings[row].tolist(), strict=True))
         called = {name: names[name][node] for name, node in nodes.items()}
         decisive = margins[rows[row]]
         if decisive["name"] < 0:
-            return Robustness(value, nodes=nodes, names=called)
-        condition = condition_text(self._plan, self._stream.name(int(decisive["name"])))
+            return Robustness(value, nodes=nodes, names=called, upper=upper)
+        condition = condition_text(self._plan, stream.name(int(decisive["name"])))
         time = self._pulse.told(int(decisive["time"]))
         when = int(decisive["frame"]), time, (time - self._pulse.start) / NS
-        return Robustness(value, condition, *when, nodes, called)
+        return Robustness(value, condition, *when, nodes, called, upper)

@@ -30,6 +30,7 @@ from sgstore.lang import (
     value_text,
 )
 from sgstore.lang import ir as b
+from sgstore.temporal._check_plan import CheckPlan
 from sgstore.temporal._formula import (
     Next,
     Previous,
@@ -264,6 +265,8 @@ class QueryCache:
         By the number of the question.
     fresh : set of Kinds
         Of which somebody is in the last frame who was in none before.
+    here : dict of Kinds to int
+        The number of nodes of these kinds in the last frame.
     """
 
     _known: dict[Any, int] = field(default_factory=dict[Any, int])
@@ -271,6 +274,7 @@ class QueryCache:
     _met: dict[b.Kinds, dict[int, str]] = field(default_factory=dict["b.Kinds", dict[int, str]])
     answers: list[Mapping[Key, Any]] = field(default_factory=list["Mapping[Key, Any]"])
     fresh: set[b.Kinds] = field(default_factory=set["b.Kinds"])
+    here: dict[b.Kinds, int] = field(default_factory=dict["b.Kinds", int])
 
     def met(self, kinds: b.Kinds) -> Mapping[int, str]:
         """Return the nodes of some kinds seen so far: node → name; it grows with each frame."""
@@ -312,6 +316,7 @@ class QueryCache:
         self.fresh.clear()
         for kinds, known in self._met.items():
             present = people.of(kinds)
+            self.here[kinds] = len(present)
             if not present <= known.keys():
                 known.update((node, people.name(node)) for node in present - known.keys())
                 self.fresh.add(kinds)
@@ -808,6 +813,8 @@ class Valuation:
         }
         self._atoms = [(self.bits[name], *asked[name]) for name in plan.atoms]
         self._signals = {name: asked[name] for name in plan.signals}
+        self._states = plan.states if isinstance(plan, CheckPlan) else {}
+        self._asked = asked
 
     def read(
         self,
@@ -868,8 +875,24 @@ class Valuation:
     def _told_signals(self) -> Iterator[Partial]:
         for number, places in self._signals.values():
             for key, value in self._questions.answers[number].items():
-                if value is not None:
+                if value is not None or self._states:
                     yield self.lattice.placed(key, places)
+
+    def _state(self, name: str, rows: list[Partial], letters: Mapping[Partial, int]) -> Column:
+        """Where a value is there, 0 if it is known and 1 if it is not."""
+        of, doubt = self._states[name]
+        if of is None:
+            return column_of([0.0] * len(rows))
+        number, places = self._asked[of.name]
+        answers = self._questions.answers[number]
+        bit = 0 if doubt is None else self.bits[doubt]
+        there = (tuple(row[p] for p in places) in answers for row in rows)
+        return column_of(
+            [
+                float(bool(letters[row] & bit)) if t else None
+                for row, t in zip(rows, there, strict=True)
+            ]
+        )
 
     def _measure(
         self,
@@ -888,6 +911,8 @@ class Valuation:
             return columns[name]
 
         def signal(one: Ask) -> Column:
+            if one.name in self._states:
+                return self._state(one.name, rows, letters)
             number, places = self._signals[one.name]
             answers: Mapping[Partial, object] = self._questions.answers[number]  # type: ignore[assignment]
             return column_of([answers.get(tuple(row[p] for p in places)) for row in rows])

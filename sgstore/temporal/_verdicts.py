@@ -9,7 +9,7 @@ frame's answer is wanted: the ends are counted at which some frame shows it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
@@ -210,7 +210,9 @@ Decided = tuple["Places", "Places"]
 """From which frame on it is known of each frame, (F,), that something is true, and that it is not; F: never."""
 
 
-def known(formula: Formula, table: PropositionTable) -> Decided:  # noqa: PLR0911 - a case each
+def known(  # noqa: PLR0911 - a case each
+    formula: Formula, table: PropositionTable, *, ended: int | None = None
+) -> Decided:
     """Return the frame at which the value of a formula at each frame is certain.
 
     Parameters
@@ -218,7 +220,11 @@ def known(formula: Formula, table: PropositionTable) -> Decided:  # noqa: PLR091
     formula : Formula
     table : PropositionTable
         The trace.
+    ended : int, optional
+        If no frame follows: by how much bounds were widened; ns. An operator without an upper bound, or whose
+        bound is over, has then failed with the last frame.
     """
+    again = partial(known, table=table, ended=ended)
     here, frames = table.frames, len(table.times)
     never = np.full_like(here, frames)
     match formula:
@@ -228,49 +234,66 @@ def known(formula: Formula, table: PropositionTable) -> Decided:  # noqa: PLR091
             flags = table.columns[name]
             return np.where(flags, here, never), np.where(flags, never, here)
         case Not(operand=operand):
-            true, false = known(operand, table)
+            true, false = again(operand)
             return false, true
         case And(operands=operands):
-            true, false = zip(*(known(operand, table) for operand in operands), strict=True)
+            true, false = zip(*(again(operand) for operand in operands), strict=True)
             return np.maximum.reduce(true), np.minimum.reduce(false)
         case Or(operands=operands):
-            true, false = zip(*(known(operand, table) for operand in operands), strict=True)
+            true, false = zip(*(again(operand) for operand in operands), strict=True)
             return np.minimum.reduce(true), np.maximum.reduce(false)
         case Next(operand=operand):
-            true, false = known(operand, table)
-            return np.append(true[1:], never[:1]), np.append(false[1:], never[:1])
+            true, false = again(operand)
+            last = never[:1] - 1 if ended is not None and endless(operand) else never[:1]
+            return np.append(true[1:], never[:1]), np.append(false[1:], last)
         case Previous(operand=operand):
-            true, false = known(operand, table)
+            true, false = again(operand)
             true, false = np.append(never[:1], true[:-1]), np.append(here[:1], false[:-1])
             return np.maximum(true, here), np.maximum(false, here)
         case Until():
-            return _known_until(formula, table)
+            return _known_until(formula, table, ended=ended)
         case Since():
-            return _known_since(formula, table)
+            return _known_since(formula, table, ended=ended)
 
 
-def _known_until(formula: Until, table: PropositionTable) -> Decided:
+def endless(formula: Formula) -> bool:
+    """Tell whether a formula waits for something as long as the trace goes on."""
+    return isinstance(formula, Until) and formula.bound.high is None
+
+
+def _known_until(formula: Until, table: PropositionTable, *, ended: int | None) -> Decided:
     here, bound = table.frames, formula.bound
-    left = (None, None) if formula.left == TRUE else known(formula.left, table)
-    right = known(formula.right, table)
+    left = (None, None) if formula.left == TRUE else known(formula.left, table, ended=ended)
+    right = known(formula.right, table, ended=ended)
     true = met(right[0], left[0], bound, table)
     start, end = _asked(bound, table)
     # What is behind the bound is known to be nothing when a frame comes that is behind it.
     closed = np.full_like(here, len(here)) if end is None else end
+    if ended is not None:
+        closed = np.where(_is_over(bound, table, ended), np.minimum(closed, len(here) - 1), closed)
     false = _chained(right[1], left[1], start, end, closed, least=False)
     if left[1] is not None and bound.low:
         false = np.minimum(false, -_most(-left[1], here, start))
     return true, false
 
 
-def _known_since(formula: Since, table: PropositionTable) -> Decided:
+def _is_over(bound: Bound, table: PropositionTable, widened: int) -> Bools:
+    """(F,) whether the bound of an operator that looks ahead is over with the last frame."""
+    if bound.high is None:
+        return np.ones(len(table.times), np.bool_)
+    if bound.frames:
+        return table.frames + bound.high < len(table.times)
+    return table.times[-1] - table.times >= bound.high - 2 * widened
+
+
+def _known_since(formula: Since, table: PropositionTable, *, ended: int | None) -> Decided:
     """The same backwards; at the first frame everything before is known."""
     here, frames = table.frames, len(table.times)
     left = (None, None)
     if formula.left != TRUE:
-        true, false = known(formula.left, table)
+        true, false = known(formula.left, table, ended=ended)
         left = true[::-1], false[::-1]
-    right = [one[::-1] for one in known(formula.right, table)]
+    right = [one[::-1] for one in known(formula.right, table, ended=ended)]
     near, far = table.window(formula.bound, forward=False)
     start = here if near is None else frames - 1 - np.maximum(near, -1)[::-1]
     end = None if far is None else frames - np.maximum(far, 0)[::-1]
@@ -401,10 +424,14 @@ class Settled:
     columns : mapping of str to (F,) bool
     times : (F,) int64
         Ascending; ns. F is at least 1.
+    tolerance : int
+        By how much the bounds of the formula were widened; ns.
     """
 
-    def __init__(self, formula: Formula, columns: Mapping[str, Bools], times: Ints) -> None:
-        self.formula = formula
+    def __init__(
+        self, formula: Formula, columns: Mapping[str, Bools], times: Ints, tolerance: int = 0
+    ) -> None:
+        self.formula, self._tolerance = formula, tolerance
         self._table = PropositionTable(columns, times)
         self._frames = len(times)
 
@@ -421,6 +448,24 @@ class Settled:
         """The frame at which it is certain that the formula is false at ``start``; ``None``: at none."""
         trap = int(self._known[1][start])
         return trap if trap < self._frames else None
+
+    @cached_property
+    def _missed(self) -> Places:
+        """(F,) the frame at which a formula is false as no frame follows, but for bounds that are not over."""
+        return known(self.formula, self._table, ended=self._tolerance)[1]
+
+    def due(self, start: int, end: str) -> bool:
+        """Tell whether a formula that is false at ``start`` is still due at the end of the trace.
+
+        Parameters
+        ----------
+        start : int
+        end : str
+            As :attr:`~sgstore.lang.ir.BoundCheck.end`.
+        """
+        if end == "pending":
+            return True
+        return end == "bounded" and int(self._missed[start]) >= self._frames
 
     def statuses(self) -> NDArray[np.int8]:
         """(F,) what is known, as each frame is read, of the formula at the first: places in :data:`STATUS`."""
@@ -469,6 +514,18 @@ class Settled:
         weak : bool
             Whether what only the end of the trace refutes is forgiven.
         """
+        return self.judged(reset, "weak" if weak else "strong")[0]
+
+    def judged(self, reset: Bools | None, end: str) -> tuple[list[Violation], bool]:
+        """Return the violations of the formula, asked from the first frame on; and whether it is still due.
+
+        Parameters
+        ----------
+        reset : (F,) bool, optional
+            As in :meth:`violations`.
+        end : str
+            What the end of the trace means: see :attr:`~sgstore.lang.ir.BoundCheck.end`.
+        """
         frames = self._frames
         resets = np.flatnonzero(reset) if reset is not None else np.zeros(0, np.int64)
         found: list[Violation] = []
@@ -476,13 +533,14 @@ class Settled:
         while start < frames and not self.value[start]:
             trap = self.trap(start)
             if trap is None:
-                found += [] if weak else [(frames - 1, frames - 1, True)]
-                break
+                due = self.due(start, end)
+                found += [] if due or end == "weak" else [(frames - 1, frames - 1, True)]
+                return found, due
             after = int(np.searchsorted(resets, trap))
-            end = int(resets[after]) if after < len(resets) else frames - 1
-            found.append((trap, end, False))
-            start = end + 1
-        return found
+            last = int(resets[after]) if after < len(resets) else frames - 1
+            found.append((trap, last, False))
+            start = last + 1
+        return found, False
 
 
 def within_bounds(

@@ -1,0 +1,243 @@
+"""Conditions under which a value of one frame is unknown, though its entities are there.
+
+A value is *unknown* where something that is measured (a speed, a size, the weather) is not recorded of an
+entity. A value that does not exist is not unknown: two vehicles that draw apart have no time to collision.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, Final
+
+from sgstore.lang import ir as b
+from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit, Type
+from sgstore.lang._needs import MEASURED, MOTION
+from sgstore.pair_numbers import columns_needed
+from sgstore.vocabulary import normalize_name
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+CONNECTIVES: Final = frozenset({"AND", "OR", "NOT", "XOR", "IMPLIES"})
+"""Words that join conditions."""
+
+_ANSWERS: Final = frozenset({"IS NULL", "IS NOT NULL", "coalesce", "case"})
+"""Operations whose value is known even of unknown operands."""
+
+_FLIPPED: Final = {"<": ">=", "<=": ">", ">": "<=", ">=": "<", "=": "<>", "<>": "="}
+_FALSE: Final = b.Value(value=False, type=Type.boolean)
+_LOOSE: Final = 1 << 20
+"""Added to the number of a block that also has the matches of which too little is known."""
+
+
+def unknown(value: b.Bound) -> b.Bound | None:
+    """Return the condition that a value of one frame is unknown; ``None``: it never is.
+
+    Parameters
+    ----------
+    value : Bound
+        A value or a condition whose entities are in the frame.
+    """
+    found = list({one: None for one in _unknown(value)})
+    return any_of(found) if found else None
+
+
+def any_of(conditions: Iterable[b.Bound]) -> b.Bound:
+    """Return the condition that one of some conditions is true."""
+    found = tuple(conditions)
+    return found[0] if len(found) == 1 else b.Operation("OR", found, Type.boolean)
+
+
+def has_pairs(value: b.Bound) -> bool:
+    """Tell whether a value is made of numbers of pairs, which some pairs do not have."""
+    return any(isinstance(part, b.PairNumber) for part in b.walk(value))
+
+
+def negated(condition: b.Bound) -> b.Bound:
+    """Return the contrary of a condition, with negations before its smallest parts only."""
+    match condition:
+        case b.Operation("NOT", (operand,)):
+            return pushed(operand)
+        case b.Operation("AND" | "OR" as word, operands):
+            other = "OR" if word == "AND" else "AND"
+            return replace(condition, word=other, operands=tuple(map(negated, operands)))
+        case b.Operation("IMPLIES", (left, right)):
+            return b.Operation("AND", (pushed(left), negated(right)), Type.boolean)
+        case b.Operation("XOR", operands):
+            return negated(spelled_out(operands))
+        case b.Operation(word=word) if word in _FLIPPED and has_pairs(condition):
+            return replace(condition, word=_FLIPPED[word])
+        case b.Value(value=value):
+            return replace(condition, value=value is not True)
+        case _:
+            return b.Operation("NOT", (condition,), Type.boolean)
+
+
+def pushed(condition: b.Bound) -> b.Bound:
+    """Return an equal condition with negations before its smallest parts only."""
+    match condition:
+        case b.Operation("NOT", (operand,)):
+            return negated(operand)
+        case b.Operation("AND" | "OR", operands):
+            return replace(condition, operands=tuple(map(pushed, operands)))
+        case b.Operation("IMPLIES", (left, right)):
+            return b.Operation("OR", (negated(left), pushed(right)), Type.boolean)
+        case b.Operation("XOR", operands):
+            return pushed(spelled_out(operands))
+        case _:
+            return condition
+
+
+def spelled_out(operands: tuple[b.Bound, ...]) -> b.Bound:
+    """Exclusive *or* by ``AND``, ``OR`` and ``NOT``."""
+    first, *rest = operands
+    for second in rest:
+        ways = (
+            b.Operation("AND", (first, b.Operation("NOT", (second,), Type.boolean)), Type.boolean),
+            b.Operation("AND", (b.Operation("NOT", (first,), Type.boolean), second), Type.boolean),
+        )
+        first = b.Operation("OR", ways, Type.boolean)
+    return first
+
+
+def certain(condition: b.Bound, *, decided: bool = False) -> b.Bound:
+    """Return the condition that a pushed condition is true, whatever is unknown.
+
+    A comparison without a value is false, and so is its contrary if it is of numbers of pairs.
+
+    Parameters
+    ----------
+    condition : Bound
+    decided : bool
+        Whether unknown values count as values that do not exist.
+    """
+    again = partial(certain, decided=decided)
+    match condition:
+        case b.Operation("AND" | "OR", operands):
+            return replace(condition, operands=tuple(map(again, operands)))
+        case b.BlockValue():
+            return condition
+        case b.Operation("NOT", (operand,)):
+            doubt = None if decided else unknown(operand)
+            if _of_blocks(operand):
+                known = b.Operation("coalesce", (operand, _FALSE), Type.boolean)
+                return _not(known if doubt is None else any_of((known, doubt)))
+            if has_pairs(operand):
+                return condition
+            return _not(b.Operation("coalesce", (operand, doubt or _FALSE), Type.boolean))
+        case b.Operation() if _of_blocks(condition):
+            doubt = None if decided else unknown(condition)
+            return condition if doubt is None else _both(condition, _not(doubt))
+        case _:
+            return condition
+
+
+def possible(condition: b.Bound) -> b.Bound:
+    """Return the condition that a pushed condition may be true, if unknown values allow it."""
+    match condition:
+        case b.Operation("AND" | "OR", operands):
+            return replace(condition, operands=tuple(map(possible, operands)))
+        case b.Operation("NOT", (operand,)):
+            doubt = unknown(operand)
+            return certain(condition) if doubt is None else any_of((certain(condition), doubt))
+        case _:
+            doubt = unknown(condition)
+            return condition if doubt is None else any_of((condition, doubt))
+
+
+def undecided(condition: b.Bound) -> b.Bound | None:
+    """Return the condition that a pushed condition may be true as far as it is known; ``None``: it is known.
+
+    It also holds where the condition is true and one of its parts is unknown.
+    """
+    doubts = [doubt for part in _smallest(condition) if (doubt := unknown(part)) is not None]
+    return _both(any_of(dict.fromkeys(doubts)), possible(condition)) if doubts else None
+
+
+def _smallest(condition: b.Bound) -> Iterable[b.Bound]:
+    if isinstance(condition, b.Operation) and condition.word in CONNECTIVES:
+        for operand in condition.operands:
+            yield from _smallest(operand)
+    else:
+        yield condition
+
+
+def _not(condition: b.Bound) -> b.Bound:
+    return b.Operation("NOT", (condition,), Type.boolean)
+
+
+def _both(one: b.Bound, other: b.Bound) -> b.Bound:
+    return b.Operation("AND", (one, other), Type.boolean)
+
+
+def _of_blocks(condition: b.Bound) -> bool:
+    """Tell whether a condition is of matches in braces, which are counted however much is known of them."""
+    return any(isinstance(part, b.BlockValue) for part in b.walk(condition))
+
+
+def _is_null(value: b.Bound) -> b.Bound:
+    return b.Operation("IS NULL", (value,), Type.boolean)
+
+
+def _unknown(value: b.Bound) -> Iterable[b.Bound]:  # noqa: C901 - a case each
+    match value:
+        case b.Operation(word=word) if word in _ANSWERS:
+            return
+        case b.Operation(operands=operands):
+            for operand in operands:
+                yield from _unknown(operand)
+        case b.NodeAttribute(node=node, attribute=attribute):
+            if attribute.name in MEASURED:
+                yield _unmeasured(node, attribute.name, value)
+        case b.PairNumber(function=function, a=one, b=other):
+            parts = [
+                _unmeasured(node, name, _attribute(node, name))
+                for node, names in zip((one, other), columns_needed(function), strict=True)
+                for name in sorted((names - {"vy", "ay"}) & MEASURED)
+            ]
+            if parts:
+                yield _both(any_of(parts), _is_null(value))
+        case b.FrameAttribute(attribute=attribute):
+            if attribute.unit in {DisplayUnit.weather, DisplayUnit.clock}:
+                yield _is_null(value)
+        case b.Happened(table=()):
+            yield _is_null(value)
+        case b.BlockValue():
+            yield from _of_block(value)
+        case _:
+            return
+
+
+def _attribute(node: str, name: str) -> b.Bound:
+    attribute = NODE_ATTRIBUTES[normalize_name(name)]
+    return b.NodeAttribute(node, attribute, attribute.type)
+
+
+def _unmeasured(node: str, name: str, value: b.Bound) -> b.Bound:
+    """The condition that something measured of a node is not recorded."""
+    if name not in MOTION:
+        return _is_null(value)
+    still = b.Operation("coalesce", (_attribute(node, "is_static"), _FALSE), Type.boolean)
+    return _both(_is_null(value), _not(still))
+
+
+@lru_cache(maxsize=1024)
+def _of_block(block: b.BlockValue) -> tuple[b.Bound, ...]:
+    """The condition that braces have a match of which too little is known, once as one object."""
+    where = tuple(map(pushed, block.scope.where))
+    doubts = [one for part in where for leaf in _smallest(part) for one in _unknown(leaf)]
+    if block.value is not None:
+        doubts += _unknown(block.value)
+    if not doubts:
+        return ()
+    found = (*map(possible, where), any_of(dict.fromkeys(doubts)))
+    exists = replace(
+        block,
+        word="EXISTS",
+        scope=replace(block.scope, where=found),
+        value=None,
+        type=Type.boolean,
+        number=block.number + _LOOSE,
+    )
+    return (exists,)

@@ -1,0 +1,535 @@
+"""Plans of checks: what counts where an entity is absent, or too little is known of it.
+
+A check is evaluated twice by the evaluators of two-valued formulas: once as if all unknown conditions were in its
+favour, and once as if none were. In the formula an unknown condition is a proposition of its own, whose name ends
+in ``+`` where it counts in the first evaluation, and in ``-`` where it counts in the second.
+
+A condition on an entity that is not in the frame, or on a value without a past, does not decide: it counts as true
+for a variable of ``FORALL``, and as false for one of ``FORSOME``; under ``NOT`` the other way round. A condition is
+asked as the frames in which it is true, or, where it counts as true, as those in which its contrary is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import field, replace
+from typing import TYPE_CHECKING, Final
+
+import sgstore.temporal._formula as f
+from sgstore.lang import (
+    CONNECTIVES,
+    Type,
+    any_of,
+    certain,
+    has_pairs,
+    negated,
+    pushed,
+    spelled_out,
+    undecided,
+    unknown,
+    unnumbered_text,
+)
+from sgstore.lang import ir as b
+from sgstore.records import dataclass
+from sgstore.temporal._plan import (
+    FALSE,
+    MARGINS,
+    TRUE,
+    Ask,
+    Plan,
+    Test,
+    has_margin,
+    query_of_check,
+    variables_of,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from sgstore.lang.ir import BoundCheck
+
+STATE: Final = "state"
+"""An operation of no query: 0 if a value is known, 1 if it is unknown; NULL if its entities are absent."""
+
+POSSIBLY: Final = "possibly"
+"""An operation of no query: a condition, unknown parts of it counting as true."""
+
+FAVOURABLE: Final = "+"
+UNFAVOURABLE: Final = "-"
+"""Ends of the names of unknown propositions that count in the first and in the second evaluation."""
+
+SIGNS: Final = (FAVOURABLE, UNFAVOURABLE)
+
+_CONTRARY: Final = {"+": "-", "-": "+", "": "*", "*": ""}
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What counts at a place of a formula.
+
+    Attributes
+    ----------
+    unknown : str
+        When an unknown condition counts as true: ``+``, ``-``, always (``*``) or never (empty).
+    positive : bool
+        Whether the place is under an even number of negations.
+    absent : bool or None
+        What a condition on an absent entity counts as; ``None``: as its quantifier says.
+    """
+
+    unknown: str
+    positive: bool = True
+    absent: bool | None = None
+
+    @property
+    def contrary(self) -> Reading:
+        """The reading under a negation."""
+        absent = None if self.absent is None else not self.absent
+        return Reading(_CONTRARY[self.unknown], not self.positive, absent)
+
+
+WHOLE: Final = Reading(FAVOURABLE)
+"""The reading of a check."""
+
+CERTAIN: Final = Reading("", absent=False)
+"""The reading of what must be known to be true."""
+
+
+def base_name(name: str) -> str:
+    """The name of a proposition without the sign of the evaluation that it counts in."""
+    return name.rstrip("+-")
+
+
+@dataclass(slots=True)
+class CheckPlan(Plan):
+    """Plan of a check.
+
+    Attributes
+    ----------
+    words : tuple of (str, frozenset of str)
+        Quantifiers, outermost first: ``FORALL``, ``FORSOME``, or ``false`` if conditions on absent entities
+        are false, with their variables. The ego is a variable of the first.
+    doubts : dict of str to Bound
+        By the name of an unknown proposition (without its sign) the condition that is unknown.
+    states : dict of str to (Ask or None, str or None)
+        By the name of the signal of a :data:`STATE`, the signal of the value itself (``None``: a constant), and
+        the atom that says where it is unknown.
+    meanings : dict of str to Bound
+        Conditions of the query, by the names of propositions that stand for a part of them.
+    """
+
+    words: tuple[tuple[str, frozenset[str]], ...] = ()
+    doubts: dict[str, b.Bound] = field(default_factory=dict[str, b.Bound])
+    states: dict[str, tuple[Ask | None, str | None]] = field(
+        default_factory=dict[str, "tuple[Ask | None, str | None]"]
+    )
+    meanings: dict[str, b.Bound] = field(default_factory=dict[str, b.Bound])
+
+    def formula(self, expression: b.Bound) -> f.Formula:
+        """The formula of a condition that must be known to be true, as within ``run_length``."""
+        match expression:
+            case b.Operation(word=word, operands=(operand,)) if word == POSSIBLY:
+                return self.read(operand, Reading("*", absent=False))
+            case _:
+                return self.read(expression, CERTAIN)
+
+    def read(self, expression: b.Bound, reading: Reading) -> f.Formula:
+        """The formula of a condition in a reading."""
+        match expression:
+            case b.Tense(word=word, operands=operands):
+                bound = f.Bound(expression.low, expression.high, expression.frames)
+                return f.TEMPORAL[word](*(self.read(one, reading) for one in operands), bound)
+            case b.SignalCall(word="exists_now", operand=operand):
+                return self.present(next(iter(b.nodes_of(operand))))
+            case b.Operation(word=word) if word in CONNECTIVES and b.is_temporal(expression):
+                return self._joined(expression, reading)
+            case _ if b.is_temporal(expression):
+                return self._over_frames(expression, reading)
+            case _:
+                return self._of_frame(expression, reading)
+
+    # Logic
+
+    def _joined(self, expression: b.Operation, reading: Reading) -> f.Formula:
+        things = self._things(expression)
+        if self._is_old(things, reading):
+            return self._as_written(expression, reading)
+        counted = self._counted(things, reading)
+        match pushed(expression):
+            case b.Operation("OR") as found if counted is True:
+                return f.Not(self.read(negated(found), reading.contrary))
+            case b.Operation("AND", operands) if counted is False:
+                parts = self._merged(operands)
+                return f.And(tuple(self.read(one, reading) for one in parts))
+            case b.Operation("AND" | "OR" as word, operands):
+                return f.LOGIC[word](*(self.read(one, reading) for one in operands))
+            case b.Operation("NOT", (operand,)) if b.is_temporal(operand):
+                return f.Not(self.read(operand, reading.contrary))
+            case found:
+                return self.read(found, reading)
+
+    def _guarded(self, expression: b.Bound) -> frozenset[str]:
+        """Return the nodes without which a pushed condition is false, where absence counts as false."""
+        match expression:
+            case b.Operation("AND", operands):
+                return frozenset().union(*map(self._guarded, operands))
+            case b.Operation("OR", operands):
+                return frozenset.intersection(*map(self._guarded, operands))
+            case _:
+                return self._things(expression)
+
+    def _counted(self, things: frozenset[str], reading: Reading) -> bool | None:
+        """What a condition on some nodes is where any of them is absent; ``None``: it depends on which."""
+        if reading.absent is not None:
+            return reading.absent
+        words = {word for word, nodes in self._levels if nodes & things} or {self._levels[0][0]}
+        if len(words) > 1:
+            return None
+        (word,) = words
+        return False if word == "false" else (word == "FORALL") == reading.positive
+
+    @property
+    def _levels(self) -> tuple[tuple[str, frozenset[str]], ...]:
+        bound = frozenset().union(*(nodes for _, nodes in self.words))
+        others = frozenset(self.whole.scope.nodes) - bound
+        if not self.words:
+            return (("FORALL", others),)
+        (first, nodes), *rest = self.words
+        word = "FORALL" if first == "false" else first
+        # The ego of a check that reads its variables in the old way is not one of these.
+        return ((word, others), (first, nodes), *rest) if others else self.words
+
+    # Conditions on one frame
+
+    def _of_frame(self, expression: b.Bound, reading: Reading) -> f.Formula:
+        things = self._things(expression)
+        counted = self._counted(things, reading)
+        if counted is None or self._is_old(things, reading):
+            return self._by_parts(expression, reading, things)
+        wanted = negated(expression) if counted else pushed(expression)
+        if self._guarded(wanted) == things:
+            sign = _CONTRARY[reading.unknown] if counted else reading.unknown
+            found = self._asked(wanted, things, sign)
+            return f.Not(found) if counted else found
+        return self._joined_here(wanted, counted=counted, reading=reading)
+
+    def _joined_here(self, wanted: b.Bound, *, counted: bool, reading: Reading) -> f.Formula:
+        """The formula of logic of one frame whose parts are about different entities."""
+        assert isinstance(wanted, b.Operation)  # noqa: S101 - a part of it is no logic
+        inner = reading.contrary if counted else reading
+        parts = self._merged(wanted.operands) if wanted.word == "AND" else wanted.operands
+        found = f.LOGIC[wanted.word](*(self._of_frame(one, inner) for one in parts))
+        return f.Not(found) if counted else found
+
+    def _is_old(self, things: frozenset[str], reading: Reading) -> bool:
+        old = frozenset().union(*(nodes for word, nodes in self.words if word == "false"))
+        return reading.absent is None and bool(old & things)
+
+    def _by_parts(self, expression: b.Bound, reading: Reading, things: frozenset[str]) -> f.Formula:
+        """The formula of a condition whose smallest parts are asked one by one."""
+        if isinstance(expression, b.Operation) and expression.word in CONNECTIVES:
+            return self._as_written(expression, reading)
+        return self._by_levels(self._asked(expression, things, reading.unknown), things, reading)
+
+    def _as_written(self, expression: b.Operation, reading: Reading) -> f.Formula:
+        """The formula of logic, part by part."""
+        match expression:
+            case b.Operation("NOT", (operand,)):
+                return f.Not(self.read(operand, reading.contrary))
+            case b.Operation("IMPLIES", (left, right)):
+                return f.Or((f.Not(self.read(left, reading.contrary)), self.read(right, reading)))
+            case b.Operation("XOR", operands):
+                return self.read(spelled_out(operands), reading)
+            case b.Operation(word, operands):
+                return f.LOGIC[word](*(self.read(one, reading) for one in operands))
+
+    def _by_levels(self, found: f.Formula, things: frozenset[str], reading: Reading) -> f.Formula:
+        """A formula that is false where something is absent, with what counts there: the outermost decides."""
+        for word, nodes in reversed(self._levels):
+            if nodes & things and word != "false" and (word == "FORALL") == reading.positive:
+                away = [f.Not(self.present(node)) for node in sorted(nodes & things)]
+                found = f.Or((found, *away))
+            elif nodes & things and word != "false":
+                found = f.And((found, *(self.present(node) for node in sorted(nodes & things))))
+        return found
+
+    def _asked(self, wanted: b.Bound, things: frozenset[str], sign: str) -> f.Formula:
+        """That a pushed condition is true, or unknown in the evaluation of that sign."""
+        if isinstance(wanted, b.Value) and not things:
+            return f.TruthConstant(wanted.value is True)
+        found = f.Proposition(self._ask(certain(wanted, decided=self._decided), things))
+        doubt = undecided(wanted) if sign and not self._decided else None
+        if doubt is None:
+            return found
+        name = self._ask(doubt, things)
+        self.doubts.setdefault(name, wanted)
+        return f.Or((found, f.Proposition(name + sign.strip("*"))))
+
+    def _ask(self, condition: b.Bound, things: frozenset[str]) -> str:
+        """The name of the atom of a condition that is asked as it stands."""
+        key = unnumbered_text(condition) + f" of {sorted(things)}"
+        name = self._names.get(key)
+        if name is None:
+            name = self._names[key] = f"{self.prefix}a{len(self.atoms) + 1}"
+            where = tuple(b.conjuncts(condition))
+            self.atoms[name] = Ask(name, self._query(things, where), self._variables(things))
+        return name
+
+    # Conditions on several frames
+
+    def _over_frames(self, expression: b.Bound, reading: Reading) -> f.Formula:
+        """The formula of a comparison, or another smallest condition, of values of several frames."""
+        things = self._things(expression)
+        counted = self._counted(things, reading)
+        state = self._state(expression)
+        known = b.Operation("=", (state, _number(0)), Type.boolean)
+        if counted:
+            found = self._tested(_boolean("AND", known, _contrary(expression)), expression)
+            sign = _CONTRARY[reading.unknown]
+        else:
+            found = self._tested(_boolean("AND", known, expression), expression)
+            sign = reading.unknown
+        doubt = self._doubtful(expression, state) if sign else None
+        whole: f.Formula = f.Proposition(found)
+        if doubt is not None:
+            name = self._tested(doubt, expression)
+            self.doubts.setdefault(name, expression)
+            whole = f.Or((whole, f.Proposition(name + sign.strip("*"))))
+        if counted is None:
+            return self._by_levels(whole, things, reading)
+        return f.Not(whole) if counted else whole
+
+    def _tested(self, condition: b.Bound, meaning: b.Bound) -> str:
+        name = self.test(condition).name
+        self.meanings.setdefault(name, meaning)
+        return name
+
+    def _doubtful(self, expression: b.Bound, state: b.Bound) -> b.Bound | None:
+        """The condition that a smallest condition of several frames is unknown."""
+        ways: list[b.Bound] = []
+        if any(self._may_be_unknown(part) for part in b.walk(state)):
+            ways.append(b.Operation(">", (state, _number(0)), Type.boolean))
+        runs = [p for p in b.walk(expression) if isinstance(p, b.SignalCall) and p.word in _RUNS]
+        if any(self._open(run.operand) for run in runs):
+            there = b.Operation(">=", (state, _number(0)), Type.boolean)
+            other = _with_possible_runs(expression)
+            differ = _case(expression, _case(other, FALSE, TRUE), _case(other, TRUE, FALSE))
+            ways.append(_boolean("AND", there, differ))
+        return any_of(ways) if ways else None
+
+    def _open(self, condition: b.Bound) -> bool:
+        """Tell whether a condition within ``run_length`` may be unknown."""
+        return any(
+            self._unknown(part) is not None
+            for part in b.walk(condition)
+            if not isinstance(part, b.Operation | b.Tense | b.SignalCall)
+        )
+
+    @property
+    def _decided(self) -> bool:
+        """Tell whether unknown values count as values that do not exist."""
+        return self.whole.unknown_is_false
+
+    def _unknown(self, value: b.Bound) -> b.Bound | None:
+        return None if self._decided else unknown(value)
+
+    def _may_be_unknown(self, part: b.Bound) -> bool:
+        return (
+            isinstance(part, b.Operation)
+            and part.word == STATE
+            and self._unknown(part.operands[0]) is not None
+        )
+
+    def _state(self, expression: b.Bound) -> b.Bound:
+        """0 if the values in an expression are known, more if one is unknown; NULL if one is absent."""
+        parts = list(dict.fromkeys(self._states(expression)))
+        now = [part for part in parts if isinstance(part, b.Operation) and part.word == STATE]
+        rest = self._things(expression) - frozenset().union(*map(self._things, now))
+        parts += [_state_of(b.NodeValue(node)) for node in sorted(rest)]
+        whole: b.Bound = _number(0)
+        for part in parts:
+            whole = b.Operation("+", (whole, part), Type.number)
+        return whole
+
+    def _states(self, expression: b.Bound) -> Iterable[b.Bound]:
+        match expression:
+            case b.Operation(word="coalesce" | "case" | "IS NULL" | "IS NOT NULL"):
+                return
+            case b.SignalCall(word="prev", operand=operand):
+                yield b.SignalCall("prev", _state_of(operand))
+            case b.SignalCall(word="delta", operand=operand, by=by, frames=frames):
+                change = b.SignalCall("delta", _state_of(operand), by, frames)
+                yield b.Operation("abs", (change,), Type.number)
+                yield _state_of(operand)
+            case b.SignalCall(word=word, operand=operand, by=by, frames=frames) if (
+                word in b.WINDOWS
+            ):
+                yield b.SignalCall("max_over", _state_of(operand), by, frames)
+                # A window without its whole past has no frame so long ago.
+                back = by - 1 if frames else by
+                if back > 0:
+                    yield b.SignalCall("delta", _state_of(_number(0)), back, frames)
+            case b.SignalCall():
+                return
+            case b.Operation() if b.is_temporal(expression):
+                for operand in expression.operands:
+                    yield from self._states(operand)
+            case b.Value() | b.Choices() | b.StepTime() | b.Tense():
+                return
+            case _:
+                yield _state_of(expression)
+
+    def _signal(self, value: b.Bound) -> Ask:
+        if not (isinstance(value, b.Operation) and value.word == STATE):
+            return super(CheckPlan, self)._signal(value)
+        (operand,) = value.operands
+        things = self._things(operand)
+        if isinstance(operand, b.Value):
+            ask = Ask("state", self._query(things, ()), ())
+            self.states[ask.name] = None, None
+            return ask
+        if isinstance(operand, b.NodeValue):
+            inner = self.atoms[self.presence(operand.node)]
+            ask = replace(inner, name=f"state of {inner.name}")
+            self.states[ask.name] = inner, None
+            return ask
+        inner = super(CheckPlan, self)._signal(operand)
+        doubt = self._unknown(operand)
+        atom = None if doubt is None else self._ask(doubt, things)
+        ask = replace(inner, name=f"state of {inner.name}")
+        self.states[ask.name] = inner, atom
+        return ask
+
+    def _measure(self, expression: b.Bound, test: Test) -> None:
+        match expression:
+            case b.Operation(word=word, operands=operands) if word != STATE and _has_state(
+                expression
+            ):
+                for operand in operands:
+                    self._measure(operand, test)
+            case b.Operation("IS NOT NULL", (b.Operation() as difference,)) if test.signals:
+                self._measure(difference, test)  # the value of a margin, which is asked anyway
+            case _:
+                super(CheckPlan, self)._measure(expression, test)
+
+    def presence(self, node: str) -> str:
+        """The name of the atom that says where a node is."""
+        found = self.present(node)
+        assert isinstance(found, f.Proposition)  # noqa: S101 - it is about a node
+        return found.name
+
+    # Margins
+
+    def margin(self, expression: b.Bound, reading: Reading) -> f.Formula:
+        """The formula over margins of a condition in a reading; see :meth:`Plan.quantity`."""
+        match expression:
+            case b.Tense(word=word, operands=operands):
+                bound = f.Bound(expression.low, expression.high, expression.frames)
+                return f.TEMPORAL[word](*(self.margin(one, reading) for one in operands), bound)
+            case b.Operation("NOT", (operand,)):
+                return f.Not(self.margin(operand, reading.contrary))
+            case b.Operation("IMPLIES", (left, right)):
+                return f.Or(
+                    (f.Not(self.margin(left, reading.contrary)), self.margin(right, reading))
+                )
+            case b.Operation("AND" | "OR" as word, operands):
+                return f.LOGIC[word](*(self.margin(one, reading) for one in operands))
+            case b.Operation("XOR"):
+                return self.margin(pushed(expression), reading)
+            case b.Operation(word=word) if has_margin(expression):
+                return self._margin(expression, reading)
+            case _:
+                return self.read(expression, reading)
+
+    def _margin(self, expression: b.Operation, reading: Reading) -> f.Formula:
+        """The margin of a comparison, with what counts where it has none."""
+        difference = MARGINS[expression.word](*expression.operands)
+        test = self.test(difference)
+        self.margins.setdefault(test.name, expression)
+        things, state = self._things(expression), self._state(expression)
+        known = [b.Operation("=", (state, _number(0)), Type.boolean)]
+        if has_pairs(expression):
+            known.append(_boolean("IS NOT NULL", difference))
+        whole = f.Proposition(
+            self._tested(_boolean("AND", *known) if len(known) > 1 else known[0], expression)
+        )
+        counted = self._counted(things, reading)
+        found: f.Formula = f.And((f.Proposition(test.name), whole))
+        doubt = self._doubtful(expression, state) if reading.unknown else None
+        name = None if doubt is None else self._tested(doubt, expression)
+        if name is not None:
+            self.doubts.setdefault(name, expression)
+        if not counted:
+            if name is not None:
+                found = f.Or((found, f.Proposition(name + reading.unknown.strip("*"))))
+            return self._by_levels(found, things, reading) if counted is None else found
+        sign = _CONTRARY[reading.unknown].strip("*")
+        also = () if name is None else (f.Proposition(name + sign),)
+        return f.Or((found, f.Not(f.Or((whole, *also)))))
+
+
+def _has_state(expression: b.Bound) -> bool:
+    return any(isinstance(part, b.Operation) and part.word == STATE for part in b.walk(expression))
+
+
+_RUNS: Final = frozenset({"run_length", "since_true"})
+
+
+def _with_possible_runs(expression: b.Bound) -> b.Bound:
+    """An expression in which the conditions of runs are true where they may be."""
+    match expression:
+        case b.SignalCall(word=word, operand=operand) if word in _RUNS:
+            return replace(expression, operand=b.Operation(POSSIBLY, (operand,), Type.boolean))
+        case _:
+            return b.with_operands(expression, _with_possible_runs)
+
+
+def _number(value: float) -> b.Value:
+    return b.Value(value, Type.number)
+
+
+def _boolean(word: str, *operands: b.Bound) -> b.Operation:
+    return b.Operation(word, operands, Type.boolean)
+
+
+def _case(condition: b.Bound, then: b.Bound, otherwise: b.Bound) -> b.Operation:
+    return _boolean("case", condition, then, otherwise)
+
+
+def _contrary(condition: b.Bound) -> b.Bound:
+    """The condition that another one of several frames is false; a number of a pair may have no value."""
+    if not has_pairs(condition):
+        return _case(condition, FALSE, TRUE)
+    return _boolean("case", condition, FALSE, _boolean("IS NULL", condition), FALSE, TRUE)
+
+
+def _state_of(value: b.Bound) -> b.Operation:
+    return b.Operation(STATE, (value,), Type.number)
+
+
+PlannedCheck = tuple[CheckPlan, f.Formula, "f.Formula | None", dict[int, f.Formula]]
+"""The plan of a check, its formula, what resets it, and what restricts quantifiers, by their numbers."""
+
+
+def empty_plan(check: BoundCheck) -> CheckPlan:
+    """Return the plan of a check, without questions yet."""
+    words = tuple((q.word if q.absent else "false", frozenset(q.nodes)) for q in check.quantifiers)
+    return CheckPlan(query_of_check(check), variables_of(check), words=words)
+
+
+def plan_of_check(check: BoundCheck, *, reset: bool = True) -> PlannedCheck:
+    """Return a check with the formulas that it is made of; ``reset``: whether what resets it matters."""
+    plan = empty_plan(check)
+    formula = plan.read(check.formula, WHOLE)
+    resets = plan.formula(check.reset) if reset and check.reset is not None else None
+    guards = {
+        n: plan.read(q.where, Reading("-" if q.word == "FORALL" else "+", absent=False))
+        for n, q in enumerate(check.quantifiers)
+        if q.where is not None
+    }
+    return plan, formula, resets, guards
+
+
+def plan_of_margins(check: BoundCheck) -> tuple[CheckPlan, f.Formula]:
+    """Return what a check is met by: the plan, and the formula over margins."""
+    plan = empty_plan(check)
+    return plan, plan.margin(check.formula, WHOLE)
