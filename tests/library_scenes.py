@@ -678,7 +678,7 @@ SLOWLY = Scene(
 CUT_OFF = Scene(
     WAYS,
     ego(along(RIGHT), 15),
-    actor("v", aside(62, LEFT, RIGHT, 10), 5, start=60),
+    actor("v", aside(48, LEFT, RIGHT, 10), 5, start=46),
     seconds=7,
     drawn=(0.0, 5.5),
 )

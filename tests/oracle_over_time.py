@@ -12,6 +12,8 @@ import re
 import sys
 import tempfile
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import lru_cache, partial
 from itertools import pairwise, product
@@ -26,8 +28,10 @@ from sgstore.errors import TextSpan
 from sgstore.graph import SceneGraph
 from sgstore.lang import parse
 from sgstore.lang import syntax as s
+from sgstore.pair_numbers import PAIR_FUNCTIONS
 from sgstore.store import StoreFile
 from sgstore.temporal import Monitor
+from sgstore.vocabulary import normalize_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -46,6 +50,7 @@ WINDOWS = {
     "sum_over": math.fsum,
     "avg_over": lambda values: math.fsum(values) / len(values),
 }
+NUMBERS = {normalize_name(name) for name in PAIR_FUNCTIONS}
 TIMED = {"run_length", "since_true", "age"}
 AHEAD = {"ALWAYS", "EVENTUALLY", "NEXT", "WEAKNEXT", "UNTIL", "RELEASE"}
 
@@ -77,11 +82,29 @@ def is_temporal(expression: Any) -> bool:
     )
 
 
+def parts_within(expression: Any) -> list[Any]:
+    """What stands directly in an expression."""
+    inner: Any = expression if isinstance(expression, tuple) else ()
+    if is_dataclass(expression):
+        inner = [getattr(expression, one.name) for one in fields(expression)]
+    return [one for one in inner if is_dataclass(one) or isinstance(one, tuple)]
+
+
+@remembered
+def has_pairs(expression: Any) -> bool:
+    """Whether numbers of pairs stand in an expression, outside of braces."""
+    if isinstance(expression, s.Block):
+        return False
+    if isinstance(expression, s.Call) and normalize_name(expression.name) in NUMBERS:
+        return True
+    return any(has_pairs(one) for one in parts_within(expression))
+
+
 def once(method: Callable[[Any, Any, int, Binding], T]) -> Callable[[Any, Any, int, Binding], T]:
     """What is told of an expression at a frame, worked out once for each binding."""
 
     def told(self: Told, e: Any, i: int, binding: Binding) -> T:
-        key = method.__name__, id(e), i, *binding.items()
+        key = method.__name__, self.absent, id(e), i, *binding.items()
         if key not in self.known:
             self.known[key] = e, method(self, e, i, binding)
         return self.known[key][1]
@@ -100,6 +123,8 @@ class Told:
     known: dict[Any, Any] = field(default_factory=dict)
     bridge: bool = False
     """Whether a gap between frames ends nothing."""
+    absent: bool | None = None
+    """Of a check: what a condition counts as on an entity that is absent; it changes under NOT."""
     taken: list[s.StepClause] = field(default_factory=list)
     """The steps of the match that :meth:`sequences` told last, in the order of its frames."""
 
@@ -117,9 +142,21 @@ class Told:
     # Conditions
 
     @once
-    def true(self, e: Any, i: int, binding: Binding) -> bool:
+    def true(self, e: Any, i: int, binding: Binding) -> bool:  # noqa: PLR0911 - a case each
         """A condition at a frame, unknown being false where time begins."""
         match e:
+            case s.Logic(word="XOR", operands=(a, b)) if self.absent is not None:
+                one, other = self.true(a, i, binding), self.true(b, i, binding)
+                with self.under_not():
+                    return (one and not self.true(b, i, binding)) or (
+                        other and not self.true(a, i, binding)
+                    )
+            case s.Logic(word="NOT" | "IMPLIES" as word, operands=(first, *rest)) if (
+                self.absent is not None
+            ):
+                with self.under_not():
+                    failed = not self.true(first, i, binding)
+                return failed or any(self.true(one, i, binding) for one in rest)
             case s.Logic(word=word, operands=operands):
                 values = [self.true(operand, i, binding) for operand in operands]
                 return {
@@ -133,6 +170,8 @@ class Told:
                 return self.tense(e, i, binding)
             case s.Call(name="exists_now", arguments=(s.Variable(name=name),)):
                 return binding[name] in self.frames[i].graph
+            case _ if self.absent is not None and self.is_away(e, i, binding):
+                return self.absent
             case _ if is_temporal(e):
                 return self.value(e, i, binding) is True
             case _:
@@ -141,6 +180,55 @@ class Told:
                 here = all(binding[name] in graph for name in spoken & set(binding))
                 ways = self.with_edges(spoken, i, binding) if here else []
                 return any(self.searches[i].value(e, way) is True for way in ways)
+
+    @contextmanager
+    def under_not(self, absent: bool | None = None) -> Iterator[None]:
+        """While the operand of a negation is looked at; or one where absence counts as is said."""
+        before = self.absent
+        self.absent = not before if absent is None else absent
+        yield
+        self.absent = before
+
+    def is_away(self, e: Any, i: int, binding: Binding) -> bool:
+        """Whether a condition is about what is absent, a value without a past, or a pair without one."""
+        graph = self.frames[i].graph
+        if any(binding[name] not in graph for name in named_in(e) & set(binding)):
+            return True
+        if self.lacks_past(e, i, binding):
+            return True
+        return has_pairs(e) and self.value(e, i, binding) is None
+
+    def lacks_past(self, e: Any, i: int, binding: Binding) -> bool:  # noqa: PLR0911 - a case each
+        match e:
+            case s.Call(name="coalesce" | "known") | s.Case() | s.NullTest():
+                return False
+            case s.Call(name="prev", arguments=(inner,)):
+                return i == 0 or self.gap_before(i) or self.was_away(inner, i - 1, binding)
+            case s.Call(name="delta", arguments=(inner, by)):
+                then = self.then(by, i)
+                return then < 0 or self.was_away(inner, then, binding)
+            case s.Call(name=name, arguments=(_, by)) if name in WINDOWS:
+                if by.unit == "frames":
+                    return len(self.last_frames(by, i)) < by.amount
+                return by.ns > 0 and self.then(by, i) < 0
+            case s.Call(name="run_length" | "since_true" | "age" | "robustness"):
+                return False
+            case _:
+                inner = parts_within(e)
+                return any(self.lacks_past(one, i, binding) for one in inner)
+
+    def was_away(self, e: Any, i: int, binding: Binding) -> bool:
+        return any(binding[n] not in self.frames[i].graph for n in named_in(e) & set(binding))
+
+    def then(self, by: s.Duration, i: int) -> int:
+        """The frame so long ago; -1: there is none without a gap."""
+        if by.unit == "frames":
+            then = i - int(by.amount)
+        else:
+            limit = self.times[i] - by.ns + self.slack
+            then = max((j for j in range(i + 1) if self.times[j] <= limit), default=-1)
+        broken = any(self.gap_before(j) for j in range(max(then, 0) + 1, i + 1))
+        return -1 if then < 0 or broken else then
 
     def with_edges(self, spoken: set[str], i: int, binding: Binding) -> list[dict[str, Any]]:
         """A binding with the edges of a frame that its edge variables may be, in the order of the alphabet."""
@@ -192,6 +280,15 @@ class Told:
     def margin(self, e: Any, i: int, binding: Binding) -> float:  # noqa: PLR0911 - a case each
         """By how much a condition holds at a frame: a comparison of numbers by their difference."""
         match e:
+            case s.Logic(word="NOT" | "IMPLIES" | "XOR" as word, operands=operands) if (
+                self.absent is not None
+            ):
+                ahead = [self.margin(operand, i, binding) for operand in operands]
+                with self.under_not():
+                    contrary = [-self.margin(operand, i, binding) for operand in operands]
+                if word == "XOR":
+                    return max(min(ahead[0], contrary[1]), min(contrary[0], ahead[1]))
+                return max(contrary[0], *ahead[1:]) if ahead[1:] else contrary[0]
             case s.Logic(word=word, operands=operands):
                 margins = [self.margin(operand, i, binding) for operand in operands]
                 one, other = margins[0], margins[-1]
@@ -204,6 +301,8 @@ class Told:
                 }[word]
             case s.Temporal():
                 return self.margin_over_time(e, i, binding)
+            case s.Comparison() if self.absent is not None and self.is_away(e, i, binding):
+                return math.inf if self.absent else -math.inf
             case s.Comparison(word=word, left=left, right=right):
                 spoken = named_in(e)
                 graph = self.frames[i].graph
@@ -314,7 +413,8 @@ class Told:
             case s.Call(name="run_length", arguments=(inner,)):
                 return len(self.run_up_to(inner, i, binding))
             case s.Call(name="since_true", arguments=(inner,)):
-                past = [j for j in range(i + 1) if self.true(inner, j, binding)]
+                with self.within_run():
+                    past = [j for j in range(i + 1) if self.true(inner, j, binding)]
                 return (self.times[i] - self.times[past[-1]]) / 1e9 if past else None
             case s.Call(name="age", arguments=(s.Variable(name=name),)):
                 seen = [j for j in range(i + 1) if binding[name] in self.frames[j].graph]
@@ -338,12 +438,17 @@ class Told:
 
     def run_up_to(self, e: Any, i: int, binding: Binding) -> list[int]:
         run: list[int] = []
-        while i >= 0 and self.true(e, i, binding):
-            run.insert(0, i)
-            if self.gap_before(i) or i == 0:
-                break
-            i -= 1
+        with self.within_run():
+            while i >= 0 and self.true(e, i, binding):
+                run.insert(0, i)
+                if self.gap_before(i) or i == 0:
+                    break
+                i -= 1
         return run
+
+    def within_run(self) -> Any:
+        """While a condition of ``run_length`` is looked at: in a check who is absent ends the run."""
+        return nullcontext() if self.absent is None else self.under_not(absent=False)
 
     def last_frames(self, by: s.Duration, i: int) -> list[int]:
         """The frames of a window, back to a gap."""
@@ -388,8 +493,9 @@ class Told:
             domain = [node for node in domain if node != ego]
         asked = {one.word for one in statement.quantifiers}
         bindings = [{"v": v, "ego": ego} for v in domain] if asked else [{"ego": ego}]
-        values = [self.true(statement.formula, 0, binding) for binding in bindings]
-        margins = [self.margin(statement.formula, 0, binding) for binding in bindings]
+        with self.under_not(absent="FORSOME" not in asked):
+            values = [self.true(statement.formula, 0, binding) for binding in bindings]
+            margins = [self.margin(statement.formula, 0, binding) for binding in bindings]
         if "FORSOME" in asked:
             return any(values), max(margins, default=-math.inf)
         return all(values), min(margins, default=math.inf)

@@ -240,7 +240,7 @@ def test_messages_are_held_against_the_lock_by_a_test_that_reads_them(
 RULES = """
 CHECK slow: ALWAYS ego.speed < $limit;
 CHECK moves: EVENTUALLY ego.speed > 1;
-CHECK alone: FORALL (p:Person) ALWAYS dist(ego, p) > 5
+CHECK alone: FORALL (p:Person) ALWAYS dist(ego, p) > 15
 """
 
 

@@ -39,7 +39,7 @@ def unknown(value: b.Bound) -> b.Bound | None:
     value : Bound
         A value or a condition whose entities are in the frame.
     """
-    found = list({one: None for one in _unknown(value)})
+    found = list(dict.fromkeys(_unknown(value)))
     return any_of(found) if found else None
 
 
@@ -54,7 +54,7 @@ def has_pairs(value: b.Bound) -> bool:
     return any(isinstance(part, b.PairNumber) for part in b.walk(value))
 
 
-def negated(condition: b.Bound) -> b.Bound:
+def negated(condition: b.Bound) -> b.Bound:  # noqa: PLR0911 - a case each
     """Return the contrary of a condition, with negations before its smallest parts only."""
     match condition:
         case b.Operation("NOT", (operand,)):
@@ -101,7 +101,9 @@ def spelled_out(operands: tuple[b.Bound, ...]) -> b.Bound:
     return first
 
 
-def certain(condition: b.Bound, *, decided: bool = False) -> b.Bound:
+def certain(  # noqa: PLR0911 - a case each
+    condition: b.Bound, *, decided: bool = False
+) -> b.Bound:
     """Return the condition that a pushed condition is true, whatever is unknown.
 
     A comparison without a value is false, and so is its contrary if it is of numbers of pairs.

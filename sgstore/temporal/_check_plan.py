@@ -1,12 +1,12 @@
 """Plans of checks: what counts where an entity is absent, or too little is known of it.
 
-A check is evaluated twice by the evaluators of two-valued formulas: once as if all unknown conditions were in its
-favour, and once as if none were. In the formula an unknown condition is a proposition of its own, whose name ends
-in ``+`` where it counts in the first evaluation, and in ``-`` where it counts in the second.
+A check is evaluated twice by the evaluators of two-valued formulas: once as if all unknown conditions were in
+its favour, and once as if none were. In the formula an unknown condition is a proposition of its own. Its name
+ends in ``+`` where it counts in the first evaluation, and in ``-`` where it counts in the second.
 
-A condition on an entity that is not in the frame, or on a value without a past, does not decide: it counts as true
-for a variable of ``FORALL``, and as false for one of ``FORSOME``; under ``NOT`` the other way round. A condition is
-asked as the frames in which it is true, or, where it counts as true, as those in which its contrary is.
+A condition on an entity that is not in the frame, or on a value without a past, does not decide. It counts as
+true for a variable of ``FORALL``, and as false for one of ``FORSOME``; under ``NOT`` the other way round. A
+condition is asked as the frames in which it is true. Where absence counts as true, its contrary is asked.
 """
 
 from __future__ import annotations
@@ -380,7 +380,7 @@ class CheckPlan(Plan):
 
     def _signal(self, value: b.Bound) -> Ask:
         if not (isinstance(value, b.Operation) and value.word == STATE):
-            return super(CheckPlan, self)._signal(value)
+            return Plan._signal(self, value)
         (operand,) = value.operands
         things = self._things(operand)
         if isinstance(operand, b.Value):
@@ -392,7 +392,7 @@ class CheckPlan(Plan):
             ask = replace(inner, name=f"state of {inner.name}")
             self.states[ask.name] = inner, None
             return ask
-        inner = super(CheckPlan, self)._signal(operand)
+        inner = Plan._signal(self, operand)
         doubt = self._unknown(operand)
         atom = None if doubt is None else self._ask(doubt, things)
         ask = replace(inner, name=f"state of {inner.name}")
@@ -409,7 +409,7 @@ class CheckPlan(Plan):
             case b.Operation("IS NOT NULL", (b.Operation() as difference,)) if test.signals:
                 self._measure(difference, test)  # the value of a margin, which is asked anyway
             case _:
-                super(CheckPlan, self)._measure(expression, test)
+                Plan._measure(self, expression, test)
 
     def presence(self, node: str) -> str:
         """The name of the atom that says where a node is."""

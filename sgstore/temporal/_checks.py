@@ -35,6 +35,7 @@ from sgstore.temporal._check_plan import (
     plan_of_check,
 )
 from sgstore.temporal._formula import Formula, Proposition, formula_text, propositions, tolerant
+from sgstore.temporal._known_range import ShortRange, short_ranges
 from sgstore.temporal._match_values import AT_FRAME, ReturnedValues, Stretches
 from sgstore.temporal._matches import lacking
 from sgstore.temporal._offline import PlanValues, TraceReader, frame_times, refuse_many, traces
@@ -250,6 +251,11 @@ def doubt_text(condition: Bound, who: Sequence[str], frame: str) -> str:
     """Text of the condition that is unknown, of whom, and in which frame."""
     written = value_text(condition).removeprefix("(").removesuffix(")")
     return f"{written} is unknown{' of ' * bool(who)}{', '.join(who)} in {frame}"
+
+
+def doubted(verdict: Verdict, reason: str) -> Verdict:
+    """A verdict, or that it is unknown for a reason that is not empty."""
+    return replace(verdict, verdict="unknown", reason=reason) if reason else verdict
 
 
 def absence_text(frames: int) -> str:
@@ -634,6 +640,11 @@ class StoreCheck:
     def _lacks(self) -> dict[int, str]:
         """The traces that do not know what the check needs, with the reason."""
         return lacking(self._file, self._catalog, of_check(self._check))
+
+    @cached_property
+    def _short(self) -> Mapping[int, ShortRange]:
+        """The traces that know less of the world around than the check looks."""
+        return short_ranges(self._file, self._catalog, self._check)
 
     @cached_property
     def _knowing(self) -> Catalog:

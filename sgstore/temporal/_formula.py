@@ -369,7 +369,7 @@ class Term:
                 return any(operand.ended for operand in self.operands)
 
 
-def may_end(term: Term, tick: Tick) -> bool:
+def may_end(term: Term, tick: Tick) -> bool:  # noqa: PLR0911 - a case each
     """Tell whether a combination is true, or still due, if the frame of a tick is the last.
 
     An operator that looks ahead is due if its bound is not over, and so is ``NEXT``. One without an upper bound

@@ -14,9 +14,9 @@ A :class:`Plan` has all that an expression, or several of one statement, need of
 
 In a :class:`~sgstore.temporal._formula.Formula` of the plan, a proposition is the name of an atom or of a test.
 
-In steps and values an atom that is NULL is false, and so is one that speaks of an entity that is absent. Logic
-outside of atoms has two values. Which part of a condition becomes an atom is chosen for speed: its value is that
-of its smallest conditions, each being true or false. Checks have plans of their own
+In steps and values an atom that is NULL is false, and so is one that speaks of an entity that is absent.
+Logic outside of atoms has two values. Which part of a condition becomes an atom is chosen for speed: its value
+is that of its smallest conditions, each being true or false. Checks have plans of their own
 (:mod:`sgstore.temporal._check_plan`).
 
 For whoever evaluates a plan frame by frame (a monitor): for each frame, ask each atom for its matches, project
@@ -352,6 +352,7 @@ class Plan:
             self.whole.injective,
             self.whole.ego,
             self.whole.unknown_is_false,
+            world=self.whole.world,
         )
 
 
@@ -389,7 +390,7 @@ def plan_of_returned(check: BoundCheck) -> Plan:
 def query_of_check(check: BoundCheck) -> b.Query:
     """The settings and nodes of a check as those of a query."""
     about = check.relations, check.injective, check.ego, check.unknown_is_false
-    return b.Query(check.scope, b.Result(), *about)
+    return b.Query(check.scope, b.Result(), *about, world=check.world)
 
 
 def variables_of(check: BoundCheck) -> tuple[str, ...]:

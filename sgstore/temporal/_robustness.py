@@ -70,7 +70,7 @@ class Robustness:
     names : mapping of str to str
         Their names.
     upper : float or None
-        The margin with all unknown values in favour of the check, if it differs; ``value`` is then that with none.
+        The margin with all unknown values in favour of the check, if it differs; ``value`` is that with none.
     """
 
     value: float
