@@ -576,7 +576,7 @@ _CARLASGG: Final = Config(
         *("TrafficLight", "StopSign", "YieldSign", "SpeedLimit", "Sign"),
         *("Lane", "Road", "Junction", "OffRoad"),
     ),
-    without=("leads", "follows", "overlaps", "sees"),
+    without=("leads", "follows", "overlaps", "sees", "tows"),
 )
 
 _ROADSCENE2VEC: Final = Config(
@@ -591,7 +591,7 @@ _ROADSCENE2VEC: Final = Config(
         kinds=(("Ego", "Vehicle"), ("Ego", "Person"), ("Ego", "Signal")),
     ),
     sees=False,
-    without=("leads", "follows", "overlaps", "sees"),
+    without=("leads", "follows", "overlaps", "sees", "tows"),
 )
 
 _OF_CARLASGG: Final = """\

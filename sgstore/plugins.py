@@ -131,10 +131,11 @@ RELATIONS: Final = Registry(
         follows="_following:FOLLOWS",
         overlaps="_contact:OVERLAPS",
         sees="_sight:SEES",
+        tows="_hitches:TOWS",
     ),
     "relation",
 )
-"""Relations. The first 23 are those of ``schema.sql``, in its order; a new one comes behind them."""
+"""Relations. The first 24 are those of ``schema.sql``, in its order; a new one comes behind them."""
 
 ABSTRACTIONS: Final = Registry(
     "sgstore.abstractions",

@@ -37,7 +37,7 @@ CREATE TYPE kind AS ENUM (
 CREATE TYPE relation AS ENUM (
   'isIn', 'travelsTo', 'laneChange', 'opposes', 'toLeftOf', 'toRightOf', 'conflictsWith', 'controlsTrafficOf', 'mayAffect',
   'safety_hazard', 'near_coll', 'super_near', 'very_near', 'near', 'visible',
-  'inDFrontOf', 'inSFrontOf', 'atSRearOf', 'atDRearOf', 'leads', 'follows', 'overlaps', 'sees');
+  'inDFrontOf', 'inSFrontOf', 'atSRearOf', 'atDRearOf', 'leads', 'follows', 'overlaps', 'sees', 'tows');
 
 CREATE TYPE light_state AS ENUM ('unknown', 'off', 'red', 'yellow', 'green', 'red_yellow', 'flashing');
 
@@ -119,6 +119,7 @@ CREATE TABLE state (                                           -- ordered by is_
   lights SMALLINT, light_state light_state, steer FLOAT, throttle FLOAT, brake FLOAT,
   gear TINYINT, hand_brake BOOLEAN,                            -- gear: below 0 backwards, 0 neutral
   derived TINYINT,
+  carrier INTEGER,                                             -- node_id of what pulls or carries it
   special VARCHAR, subkind VARCHAR,                            -- as in entity
   repeated BOOLEAN NOT NULL);                                  -- as its row before or after, in a bucket: such rows lie together, and take little space
 
@@ -265,13 +266,13 @@ SELECT s.frame_id, s.node_id, s.kind, s.is_ego, s.kind || ' ' || s.node_id AS na
        (s.lights & 512) <> 0 AS light_special1, (s.lights & 1024) <> 0 AS light_special2, s.steer, s.throttle, s.brake, s.gear, s.hand_brake,
        (s.derived & 1) <> 0 AS derived_velocity, (s.derived & 2) <> 0 AS derived_acceleration, (s.derived & 4) <> 0 AS derived_yaw_rate,
        NULL::VARCHAR AS lane_type, NULL::VARCHAR AS road, NULL::INTEGER AS section, NULL::INTEGER AS lane, NULL::VARCHAR AS junction,
-       NULL::VARCHAR AS turn, NULL::DOUBLE AS speed_limit, NULL::DOUBLE AS curvature, e.ident, e.type_name
+       NULL::VARCHAR AS turn, NULL::DOUBLE AS speed_limit, NULL::DOUBLE AS curvature, e.ident, e.type_name, s.carrier
 FROM inside.state s JOIN inside.entity e ON e.trace_id = s.frame_id >> 24 AND e.node_id = s.node_id JOIN inside.trace t ON t.trace_id = e.trace_id
 UNION ALL
 SELECT f.frame_id, n.node_id, n.kind, false, n.name, n.special, n.subkind, true, n.x, n.y, n.z, degrees(n.heading),
        NULL, NULL, n.still, n.still, n.still, n.still, NULL, NULL, NULL, NULL, NULL, n.length, n.width, n.height,
        NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL,
-       n.lane_type, n.road, n.section, n.lane, n.junction, n.turn, n.speed_limit, n.curvature, n.ident, n.type_name
+       n.lane_type, n.road, n.section, n.lane, n.junction, n.turn, n.speed_limit, n.curvature, n.ident, n.type_name, NULL
 FROM inside.frame f JOIN (
   SELECT k.bucket, k.mask, k.node_id, k.kind, m.name, NULL::VARCHAR AS special, NULL::VARCHAR AS subkind, m.x, m.y, m.z, m.heading,
          m.length, m.width, NULL::FLOAT AS height,
@@ -285,7 +286,7 @@ FROM inside.frame f JOIN (
   FROM inside.node k JOIN inside.trace t ON t.trace_id = k.bucket >> 18 JOIN inside.entity e ON e.trace_id = t.trace_id AND e.node_id = k.node_id
 ) n ON n.bucket = f.bucket AND (n.mask & (1::BIGINT << f.bit)) <> 0;
 
-COMMENT ON VIEW main.nodes IS 'One row a node and frame: entities (node_id 0 and above) and parts of the road map in range (below zero). ident, type_name: of an entity, as the simulator has them; x, y, z, length, width, height in m (a lane: a point of its centre line, its length and mean width); heading, pitch, roll in degrees; speed, vx, vy, vz, speed_limit in m/s (what stands for ever has speed 0); accel (signed, along the heading), ax, ay, az in m/s²; yaw_rate in degrees/s; steer -1 … 1, throttle and brake 0 … 1; gear: 1, 2, …, 0 neutral, below 0 backwards; hand_brake: whether it is on; curvature of a waypoint in 1/m, positive to the left. What is not known is NULL. derived_…: computed by differences, not read from the recording.';
+COMMENT ON VIEW main.nodes IS 'One row a node and frame: entities (node_id 0 and above) and parts of the road map in range (below zero). ident, type_name: of an entity, as the simulator has them; x, y, z, length, width, height in m (a lane: a point of its centre line, its length and mean width); heading, pitch, roll in degrees; speed, vx, vy, vz, speed_limit in m/s (what stands for ever has speed 0); accel (signed, along the heading), ax, ay, az in m/s²; yaw_rate in degrees/s; steer -1 … 1, throttle and brake 0 … 1; gear: 1, 2, …, 0 neutral, below 0 backwards; hand_brake: whether it is on; curvature of a waypoint in 1/m, positive to the left. carrier: node_id of what pulls a trailer or carries a rider. What is not known is NULL. derived_…: computed by differences, not read from the recording.';
 
 CREATE VIEW main.edges AS
 SELECT f.frame_id, e.src, e.relation, e.dst, e.src_kind, e.dst_kind, e.src_is_ego, e.dst_is_ego

@@ -27,6 +27,7 @@ from sgstore.errors import ConfigError
 from sgstore.graph import GraphBlock, LaneStates, StaticPresence
 from sgstore.relations import (
     IS_SIGNAL,
+    IS_UPRIGHT,
     NEAR,
     TOUCHING,
     BlockScene,
@@ -35,6 +36,7 @@ from sgstore.relations import (
     EdgeRoom,
     EgoPoses,
     Extent,
+    Hitches,
     Keeping,
     LaneContact,
     Parking,
@@ -121,6 +123,7 @@ class SceneGraphGenerator:
         self._scenery = States.of(node=np.zeros(0, np.int64))
         self._still = StillPairs(config)
         self._parking = Parking()
+        self._hitches = Hitches()
         self._grounds: MapColumns | None = None
         self._classes = Classes()
         names = self._keeping.names(computed, with_map=road_map is not None)
@@ -193,7 +196,7 @@ class SceneGraphGenerator:
     @np.errstate(over="ignore", invalid="ignore")
     def _views(self, frames: FrameBlock, egos: Sequence[Ints]) -> tuple[list[_View], _World]:
         frames = replace(frames, entities=renamed(frames.entities, self._config.types))
-        self._learn(frames)
+        frames = self._learn(frames)
         views = [self._view(replace(frames, ego=ego)) for ego in egos]
         if len(views) == 1:
             keys = views[0].keys  # ascending
@@ -416,7 +419,8 @@ class SceneGraphGenerator:
         """(n,) int8: kinds of the entities met so far, by node id."""
         return self._kinds
 
-    def _learn(self, frames: FrameBlock) -> None:
+    def _learn(self, frames: FrameBlock) -> FrameBlock:
+        """Take note of what is new in the next frames; return them with what carries what."""
         entities, nodes = frames.entities, frames.states.node
         if len(entities):
             if entities.first != len(self._kinds):
@@ -425,6 +429,7 @@ class SceneGraphGenerator:
             left_out = [ident in self._config.exclude_ids for ident in entities.ident]
             self._left_out = np.append(self._left_out, np.array(left_out, np.bool_))
             self._parking.learn(entities)
+            self._hitches.learn(entities)
             if self._survey is not None:
                 self._survey.learn(entities, frames.scenery)
         if len(frames.scenery):
@@ -438,6 +443,8 @@ class SceneGraphGenerator:
             if len(strange):
                 raise ValueError(f"a state of node {strange[0]}, which no block has introduced")
         self._parking.see(frames.states)
+        carrier = self._hitches.see(frames, partial(self._bodies, frames))
+        return replace(frames, states=replace(frames.states, carrier=carrier))
 
     def _scenery_in_range(self, areas: Areas) -> tuple[Ints, Rows]:
         """Frames and rows of the scenery: all of it where there is no ego."""
@@ -483,10 +490,11 @@ class SceneGraphGenerator:
             np.concatenate([getattr(states, name)[rows], getattr(scenery, name)[row]])
             for name in ("node", "x", "y", "z", "heading", "length", "width", "height")
         )
+        kind = self._kinds[node]
         return Bodies(
             frame=np.concatenate([frames.frame_of[rows], frame]),
             node=node,
-            kind=self._kinds[node],
+            kind=kind,
             moves=np.arange(len(node)) < count,
             x=x,
             y=y,
@@ -494,7 +502,8 @@ class SceneGraphGenerator:
             heading=heading,
             length=length,
             width=width,
-            height=height,
+            height=np.where(IS_UPRIGHT[kind] & (height == 0), np.nan, height),
+            carrier=np.concatenate([states.carrier[rows], scenery.carrier[row]]),
         )
 
 

@@ -88,6 +88,7 @@ class Entity(NamedTuple):
     map_ref: str
     numbers: tuple[float, ...]
     whole: tuple[int, ...]
+    trailer: str = ""
 
     @property
     def constants(self) -> tuple[int, str, str]:
@@ -206,6 +207,7 @@ class Frame:
         type_name: str = "",
         static: bool = False,
         map_ref: str = "",
+        trailer: str | int = "",
     ) -> None:
         """Add an entity.
 
@@ -242,6 +244,8 @@ class Frame:
         map_ref : str
             Id of the OpenDRIVE signal or object that it is; for a traffic light this tells which lanes
             it controls.
+        trailer : str or int
+            Id of the trailer that it pulls when it is added first; empty: none, or not known.
 
         Raises
         ------
@@ -269,6 +273,7 @@ class Frame:
                 map_ref=map_ref,
                 numbers=tuple(map(_inside, NUMBERS, numbers)),
                 whole=(_mask_of(lights), _light_code(light_state), 0),
+                trailer=str(trailer),
             )
         )
 
@@ -366,6 +371,7 @@ class Replay:
 
     def __init__(self) -> None:
         self._known: list[tuple[str, int, str, str, str, bool, str]] = []
+        self._trailers: list[str] = []
 
     def frames(self, block: FrameBlock) -> Iterator[Frame]:
         """The frames of the next block of a trace, exactly: no number changes."""
@@ -373,6 +379,7 @@ class Replay:
         columns = (new.ident, new.kind.tolist(), new.special, new.subkind, new.type_name)
         columns = (*columns, new.static.tolist(), new.map_ref)
         self._known += zip(*columns, strict=True)
+        self._trailers += new.trailer or [""] * len(new)
         standing = self._entities(block.scenery, 0, len(block.scenery))
         for row, (time, ego) in enumerate(
             zip(block.time_ns.tolist(), block.ego.tolist(), strict=True)
@@ -392,7 +399,12 @@ class Replay:
         numbers = np.stack([getattr(states, name)[start:stop] for name in NUMBERS], axis=1)
         whole = np.stack([getattr(states, name)[start:stop] for name in WHOLE], axis=1)
         return [
-            Entity(*self._known[node], numbers=tuple(values), whole=tuple(codes))
+            Entity(
+                *self._known[node],
+                numbers=tuple(values),
+                whole=tuple(codes),
+                trailer=self._trailers[node],
+            )
             for node, values, codes in zip(
                 states.node[start:stop].tolist(), numbers.tolist(), whole.tolist(), strict=True
             )
@@ -516,6 +528,8 @@ class Records:
             known[one].attributes(is_ego=one == ego, is_static=False) | told
             for one, told in zip(node.tolist(), _moving(states), strict=True)
         ]
+        for row in np.flatnonzero(states.carrier >= 0).tolist():
+            moving[row]["carrier"] = int(outer[states.carrier[row]])
         src, dst = _outward(edges.src, outer), _outward(edges.dst, outer)
         columns = SceneColumns(
             trace=TRACE,
@@ -881,4 +895,5 @@ def _entities(first: int, new: list[Entity]) -> Entities:
         type_name=tuple(e.type_name for e in new),
         static=np.array([e.static for e in new], np.bool_),
         map_ref=tuple(e.map_ref for e in new),
+        trailer=tuple(e.trailer for e in new),
     )

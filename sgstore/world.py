@@ -183,6 +183,9 @@ def leaps(away: Floats, seconds: Floats) -> Bools:
     return (seconds > 0) & (away > FASTEST * seconds + LEAP)
 
 
+UNTOLD: Final = -2
+"""Carrier of a state as readers give it: the generator finds it."""
+
 HIGHEST_GEAR: Final = 127
 """A gear beyond it, forwards or backwards, is none; a store keeps 8 bits."""
 
@@ -208,6 +211,8 @@ class Entities:
         does not have: the lanes that it applies to, as :func:`sgstore.roads.lanes_ref` names them.
     lifetime : tuple of int
         1 of the first entity with an id, 2 of the next one with the same id, …; empty: 1 of all.
+    trailer : tuple of str
+        Id of the trailer that it pulls when it is first seen, or the empty string. Left out: not known.
     """
 
     first: int
@@ -219,6 +224,7 @@ class Entities:
     static: Bools
     map_ref: tuple[str, ...]
     lifetime: tuple[int, ...] = ()
+    trailer: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.ident)
@@ -254,6 +260,8 @@ class States:
         1: on, 0: off.
     derived : int64
         Bit 0: velocity, bit 1: acceleration, bit 2: yaw rate was computed by differences, not read.
+    carrier : int64
+        Node id of what pulls or carries it; -1: nothing; :data:`UNTOLD`: to be found.
     """
 
     node: Ints
@@ -281,6 +289,7 @@ class States:
     gear: Floats
     hand_brake: Floats
     derived: Ints
+    carrier: Ints
 
     def __post_init__(self) -> None:
         for column in fields(self):
@@ -303,6 +312,7 @@ class States:
             "lights": np.full(n, -1, np.int64),
             "light_state": np.full(n, -1, np.int8),
             "derived": np.zeros(n, np.int64),
+            "carrier": np.full(n, UNTOLD),
         }
         return cls(
             **{

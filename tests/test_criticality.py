@@ -266,21 +266,21 @@ def approach(a: Mover, b: Mover) -> tuple[float | None, float]:
 
 def drac(a: Mover, b: Mover, after: float = 0) -> float | None:
     d, speed = approach(a, b)
-    if d is None or speed <= 0:
-        return None if d is None else 0
+    if d is None or d <= 1e-4 or speed <= 0:
+        return None if d is None or d <= 1e-4 else 0
     room = d - after * a.along(b.velocity)
     return speed**2 / (2 * room) if room > 0 else None
 
 
 def a_long_req(a: Mover, b: Mover) -> float | None:
     d, speed = approach(a, b)
-    if d is None or speed <= 0:
-        return d if d is None else 0
-    v1, v2, a2 = a.along(a.velocity), a.along(b.velocity), a.along(b.push)
-    if d == 0:
+    if d is None or d <= 1e-4:
         return None
+    if speed <= 0:
+        return 0
+    v1, v2, a2 = a.along(a.velocity), a.along(b.velocity), a.along(b.push)
     needed = a2 - speed**2 / (2 * d)
-    if a2 < 0 < v2 and 2 * d / speed > v2 / -a2:
+    if v1 > 0 and a2 * v2 < 0 and 2 * d / speed > v2 / -a2:
         needed = -(v1**2) / (2 * (d - v2**2 / (2 * a2)))
     return min(needed, 0)
 

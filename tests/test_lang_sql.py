@@ -17,7 +17,14 @@ from sgstore.errors import QueryError
 from sgstore.lang import SqlStatement, Window, compile_query
 from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit
 from sgstore.matches import FIRST_WINDOW, LAST_WINDOW, Windows
-from sgstore.pair_numbers import COLUMNS, PAIR_FUNCTIONS, PairNumbers
+from sgstore.pair_numbers import (
+    COLUMNS,
+    HUNG,
+    PAIR_FUNCTIONS,
+    UPRIGHT,
+    PairNumbers,
+    low_and_high,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -51,14 +58,23 @@ def test_numbers_of_pairs_are_those_of_arrays(world: World) -> None:
     rows = found(world, f"MATCH (a:Entity), (b:Entity) RETURN frame.id, a.id, b.id, {calls}")
     rows = [row for row in rows if (row[0], row[1]) in states and (row[0], row[2]) in states]
 
+    kinds = {
+        (frame.frame_id, n): about["kind"]
+        for frame in world.frames
+        for n, about in frame.trace.entities.items()
+    }
+
     def boxes(side: int) -> np.ndarray:
         chosen = [states[row[0], row[side]] for row in rows]
-        return np.array([[np.nan if s.get(c) is None else s[c] for c in COLUMNS] for s in chosen])
+        wanted = (*COLUMNS, "height")
+        told = np.array([[np.nan if s.get(c) is None else s[c] for c in wanted] for s in chosen])
+        told = told.astype(np.float32).astype(float)  # FLOAT in the tables, as in every store
+        of_kind = [kinds[row[0], row[side]] for row in rows]
+        hung, upright = (np.isin(of_kind, some) for some in (HUNG, UPRIGHT))
+        sides = low_and_high(told[:, 2], told[:, -1], hung, upright)
+        return np.column_stack([told[:, :-1], *sides])
 
-    # FLOAT in the tables, as in every store
-    numbers = PairNumbers(
-        boxes(1).astype(np.float32).astype(float), boxes(2).astype(np.float32).astype(float)
-    )
+    numbers = PairNumbers(boxes(1), boxes(2))
     assert len(rows) > 300
     for column, name in enumerate(NUMBERS, start=3):
         expected = numbers[name]

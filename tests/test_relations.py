@@ -63,8 +63,9 @@ def crowd(seed: int, count: int = 12, size: float = 40) -> list[Thing]:
 
 
 def busy(seed: int) -> list[Thing]:
-    """A crowd in which every relation holds somewhere: a column of cars, two of which touch, and a light."""
+    """A crowd in which every relation holds: a column of cars, two of which touch, a trailer and a light."""
     column = [thing("c1", 10, -2), thing("c2", 13.5, -2.2), thing("c3", 20, -1.9)]
+    column += [thing("c4", -20, -2, length=6), thing("t4", -25, -2, kind="trailer", length=5)]
     light = thing("lamp", 5, 5, 1.0, kind="traffic_light", map_ref="s1")
     return [*crowd(seed, size=20), *column, light]
 
@@ -191,9 +192,9 @@ def test_a_distance_on_a_bound_belongs_to_the_nearer_relation(
 
 
 def test_distance_is_measured_in_space() -> None:
-    of = edges(graph_of(frames([thing("ego"), thing("c", 3, z=0.75 + 4)])))
+    of = edges(graph_of(frames([thing("ego"), thing("c", 6.9, z=0.75 + 1.4)])))
 
-    assert ("c", "super_near", "ego") in of
+    assert ("c", "very_near", "ego") in of
 
 
 @pytest.mark.parametrize("heading", [0, PI / 2, PI, -PI / 2, 3 * PI / 4, 1.0])
@@ -452,7 +453,8 @@ def in_range(t: Thing, ego: Thing, radius: float) -> bool:
 
 
 def distance(a: Thing, b: Thing) -> float:
-    return math.dist((a.x, a.y, a.z), (b.x, b.y, b.z))
+    rise = 0 if math.isnan(a.z - b.z) else b.z - a.z
+    return math.dist((a.x, a.y, 0), (b.x, b.y, rise))
 
 
 def related(a: Thing, b: Thing) -> bool:
@@ -469,10 +471,23 @@ def touching(a: Thing, b: Thing) -> bool:
     known = not any(math.isnan(v) for t in (a, b) for v in (t.heading, t.length, t.width))
     if not known or footprint(a).distance(footprint(b)) > 1e-4:
         return False
+    return not (flat(a) or flat(b) or storeys_apart(a, b))
+
+
+def flat(t: Thing) -> bool:
+    """Whether it is no body: something that may lie on the ground has no height."""
+    return t.height == 0 and t.kind in {"prop", "unknown"} | set(SIGNALS)
+
+
+def storeys_apart(a: Thing, b: Thing) -> bool:
+    """Whether two are apart in height, as far as it is known; signals are on no storey."""
+    if {a.kind, b.kind} & set(SIGNALS):
+        return False
     apart, reach = abs(a.z - b.z), (a.height + b.height) / 2
-    if math.isnan(reach):
-        apart, reach = abs(bottom(a) - bottom(b)), 2.5
-    return math.isnan(apart) or apart <= reach + 1e-4
+    unknown = any(t.height == 0 and t.kind not in {"prop", "unknown"} for t in (a, b))
+    if math.isnan(reach) or unknown:
+        apart, reach = abs(bottom(a) - bottom(b)), 2.5 - 1e-4
+    return apart > reach + 1e-4
 
 
 def footprint(t: Thing) -> Any:
@@ -488,7 +503,8 @@ def seen(a: Thing, b: Thing) -> set[tuple[str, str, str]]:
     """What is said of b as seen from a, and how near they are."""
     of: set[tuple[str, str, str]] = set()
     for name, low, high in zip(PROXIMITY, (-1, *BOUNDS), BOUNDS, strict=False):
-        if low < distance(a, b) <= high:
+        bodies = not (flat(a) or flat(b) or storeys_apart(a, b))
+        if bodies and low < distance(a, b) <= high:
             of.add((a.name, name, b.name))
     if math.isnan(a.heading):
         return of

@@ -11,6 +11,7 @@ import shapely
 from builders import Place, Recording, Thing, edges, frames, graph_of, thing
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_relations import storeys_apart
 
 from sgstore.config import Config, RangeSettings
 from sgstore.sgg import SceneGraphGenerator
@@ -124,7 +125,7 @@ def looked(things: list[Thing], ego: Thing) -> tuple[set[str], set[str]]:
     free, doubtful = set[str](), set[str]()
     eye = ego.z + (0 if math.isnan(ego.height) else ego.height / 2)
     for t in things:
-        if t is ego or math.isnan(t.x + t.y):
+        if t is ego or math.isnan(t.x + t.y) or storeys_apart(t, ego):
             continue
         covers = [c for c in things if c is not t and c is not ego and hides(c, ego)]
         best = max(

@@ -413,7 +413,7 @@ def test_without_a_map_nothing_is_known_of_lanes() -> None:
     without = SceneGraphGenerator(None, Config()).answers
 
     sides = {"toLeftOf", "toRightOf"}
-    assert set(without) == {*PROXIMITY, *DIRECTIONS, *sides, "overlaps", "sees"}
+    assert set(without) == {*PROXIMITY, *DIRECTIONS, *sides, "overlaps", "sees", "tows"}
     graph = graph_of(frames([thing("ego")]))
     assert len(graph.lanes) == len(graph.edges) == len(graph.presence) == 0
 
@@ -435,7 +435,9 @@ def test_relations_that_the_config_leaves_out_are_not_answered() -> None:
 
     answers = SceneGraphGenerator(None, config).answers
 
-    assert set(answers) == {"near", "inDFrontOf", "toLeftOf", "toRightOf", "overlaps", "sees"}
+    assert set(answers) == {
+        *("near", "inDFrontOf", "toLeftOf", "toRightOf", "overlaps", "sees", "tows")
+    }
 
 
 def test_where_no_pairs_are_related_their_relations_are_unknown() -> None:

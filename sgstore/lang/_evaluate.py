@@ -23,10 +23,14 @@ from sgstore.lang._operators import OPERATORS, Column
 from sgstore.pair_numbers import (
     COLUMNS,
     COURSES,
+    HUNG,
     NEXT_PARTS,
+    OPTIONAL,
     PART_DIST,
+    UPRIGHT,
     WAYS,
     PairNumbers,
+    low_and_high,
 )
 from sgstore.records import dataclass
 from sgstore.vocabulary import MAP_KINDS, SIGNALS
@@ -36,6 +40,9 @@ if TYPE_CHECKING:
     from sgstore.lang._catalog import Attribute
     from sgstore.world import Bools, Floats
 
+
+ENTITY: Final = (*COLUMNS, *OPTIONAL)
+"""Columns of an entity that numbers of pairs are made of."""
 
 Attributes = Mapping[str, Any]
 NodePair = tuple["int | None", "int | None"]
@@ -239,12 +246,21 @@ class FrameView:
 
     @cached_property
     def _boxes(self) -> Floats:
-        """(E, 10) what numbers of pairs are made of; what stands for ever has acceleration 0."""
+        """(E, 14) what numbers of pairs are made of; what stands for ever has acceleration 0."""
         rows: list[list[float]] = []
-        for about in map(self.nodes.__getitem__, self.rows):
-            still: Attributes = {"ax": 0.0, "ay": 0.0} if about.get("is_static") else {}
-            rows.append([about.get(name, still.get(name, math.nan)) for name in COLUMNS])
-        boxes = np.array(rows, np.float64).reshape(-1, len(COLUMNS))
+        heights: list[tuple[float, bool, bool]] = []
+        for node in self.rows:
+            about = self.nodes[node]
+            known: Attributes = {"ax": 0.0, "ay": 0.0} if about.get("is_static") else {}
+            known = {**known, **about, "node_id": node}
+            rows.append([known.get(name, math.nan) for name in ENTITY])
+            kind = about["kind"]
+            heights.append((about.get("height", math.nan), kind in HUNG, kind in UPRIGHT))
+        boxes = np.array(rows, np.float64).reshape(-1, len(ENTITY))
+        height, hung, upright = np.array(heights, np.float64).reshape(-1, 3).T
+        sides = low_and_high(boxes[:, COLUMNS.index("z")], height, hung > 0, upright > 0)
+        for name, side in zip(("low", "high"), sides, strict=True):
+            boxes[:, ENTITY.index(name)] = side
         heading = COLUMNS.index("heading")
         boxes[:, heading] = np.radians(boxes[:, heading])
         return boxes

@@ -30,7 +30,7 @@ from sgstore.lang.ir import (
     TraceAttribute,
     Value,
 )
-from sgstore.pair_numbers import pair_sql, stage_of
+from sgstore.pair_numbers import low_and_high_sql, pair_sql, stage_of
 from sgstore.quoting import literal, quoted
 from sgstore.records import dataclass
 from sgstore.vocabulary import MAP_KINDS, VEHICLE_LIGHTS
@@ -182,8 +182,15 @@ def raw_text(name: str, at: Aliases) -> str:
 
     What stands for ever has no states, and velocity and acceleration 0.
     """
+    if name in {"low", "high"}:
+        return _side_text(name, at)
     still = name in {"vx", "vy", "ax", "ay"}
     parts: list[str] = []
+    if name == "carrier":
+        return f"{at.state}.{quoted(name)}" if at.state else "CAST(NULL AS INTEGER)"
+    if name == "node_id":
+        ids = [f"{alias}.{quoted(name)}" for alias in (at.state, at.entity, at.map) if alias]
+        return ids[0] if len(ids) == 1 else f"coalesce({', '.join(ids)})"
     if at.state:
         parts.append(f"CAST({at.state}.{quoted(name)} AS DOUBLE)")
     if at.entity:
@@ -194,6 +201,24 @@ def raw_text(name: str, at: Aliases) -> str:
         value = f'{value} - {at.trace}."origin_{name}"' if name in {"x", "y", "z"} else value
         # Signs and lights of a map are entities; of lanes and roads there are no numbers of pairs.
         parts.append(f'CASE WHEN {at.map}."kind" NOT IN ({PLACES}) THEN {value} END')
+    if not parts:
+        return "CAST(NULL AS DOUBLE)"
+    return parts[0] if len(parts) == 1 else f"coalesce({', '.join(parts)})"
+
+
+def _side_text(name: str, at: Aliases) -> str:
+    """The height of the lower or upper side of a body; of signals, and those of a map, there is none."""
+    parts = [
+        low_and_high_sql(
+            lambda column, alias=alias: (
+                f"{alias}.{quoted(column)}"
+                if column == "kind"
+                else f"CAST({alias}.{quoted(column)} AS DOUBLE)"
+            )
+        )[name]
+        for alias in (at.state, at.entity)
+        if alias
+    ]
     if not parts:
         return "CAST(NULL AS DOUBLE)"
     return parts[0] if len(parts) == 1 else f"coalesce({', '.join(parts)})"

@@ -4,6 +4,13 @@ from ._arrays import COLUMNS as COLUMNS
 from ._arrays import PairNumbers as PairNumbers
 from ._arrays import gap as gap
 from ._declared import PairFunction as PairFunction
+from ._levels import HUNG as HUNG
+from ._levels import OPTIONAL as OPTIONAL
+from ._levels import STOREY as STOREY
+from ._levels import TOUCH as TOUCH
+from ._levels import UPRIGHT as UPRIGHT
+from ._levels import low_and_high as low_and_high
+from ._levels import low_and_high_sql as low_and_high_sql
 from ._table import PAIR_FUNCTIONS as PAIR_FUNCTIONS
 from ._table import columns_needed as columns_needed
 from ._table import needed_for as needed_for
@@ -22,17 +29,24 @@ from ._ways import as_written as as_written
 __all__ = [
     "COLUMNS",
     "COURSES",
+    "HUNG",
     "LANE_DIST",
     "NEXT_PARTS",
     "OF_ONE",
+    "OPTIONAL",
     "PAIR_FUNCTIONS",
     "PART_DIST",
     "PairFunction",
     "PairNumbers",
+    "STOREY",
+    "TOUCH",
+    "UPRIGHT",
     "WAYS",
     "as_written",
     "columns_needed",
     "gap",
+    "low_and_high",
+    "low_and_high_sql",
     "needed_for",
     "pair_sql",
     "pairs_view",

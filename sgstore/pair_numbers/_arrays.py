@@ -9,6 +9,7 @@ from functools import cache, reduce
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from sgstore.arrays import np
+from sgstore.pair_numbers._levels import OPTIONAL
 from sgstore.pair_numbers._table import EXPRESSIONS
 
 if TYPE_CHECKING:
@@ -27,17 +28,21 @@ class PairNumbers(dict[str, "Floats"]):
 
     Parameters
     ----------
-    a, b : (K, 10) float64
+    a, b : (K, 14) float64
         ``x, y, z, heading, length, width, vx, vy, ax, ay`` of the two entities of pair k; m, m, m, rad, m, m,
-        m/s, m/s, m/s², m/s². NaN where one is missing. Accelerations may be left out: (K, 8).
+        m/s, m/s, m/s², m/s²; and heights of the lower and the upper side (:func:`low_and_high`), node id, and
+        that of the carrier. NaN where one is missing. The last ones may be left out: without heights
+        (K, 10) all pairs are on one level, without accelerations (K, 8) they are unknown.
     """
 
     def __init__(self, a: Floats, b: Floats) -> None:
         super().__init__()
         for one, states in (("a", a), ("b", b)):
-            told = dict(zip(COLUMNS, states.T, strict=False))
+            told = dict(zip((*COLUMNS, *OPTIONAL), states.T, strict=False))
             unknown = np.broadcast_to(np.nan, len(states))
-            self.update({f"{one}_{name}": told.get(name, unknown) for name in COLUMNS})
+            self.update(
+                {f"{one}_{name}": told.get(name, unknown) for name in (*COLUMNS, *OPTIONAL)}
+            )
 
     def __missing__(self, name: str) -> Floats:
         with np.errstate(all="ignore"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from sgstore.pair_numbers._declared import PairFunction
+from sgstore.pair_numbers._levels import STOREY, TOUCH
 from sgstore.pair_numbers._ways import LANE_DIST
 
 if TYPE_CHECKING:
@@ -45,7 +46,8 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
     "dist": PairFunction(
         "distance between the centres, in space",
         "m",
-        "sqrt(dx * dx + dy * dy + dz * dz)",
+        "span + level",
+        note="in the plane where a height is not known",
         column="distance",
     ),
     # The distance of b's centre from the Minkowski sum of both boxes, an octagon around a's centre whose edges
@@ -90,10 +92,10 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
         worse="low",
     ),
     "headway": PairFunction(
-        "time until a, at its speed, has come as far as b is now, from bumper to bumper",
+        "time until a, at its speed along its axis, has come as far as b is now: lon_gap over that speed",
         "s",
-        "CASE WHEN lon > 0 AND pace > 0.1 AND la + lb IS NOT NULL THEN greatest(lon - la - lb, 0) / pace END",
-        note="NULL where b is not ahead or a stands",
+        "CASE WHEN lon > 0 AND v1 > 0.1 THEN lon_gap / v1 END",
+        note="NULL where b is not ahead, or a stands or drives backwards",
         alias="thw",
         worse="low",
     ),
@@ -122,8 +124,8 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
     "closing_time": PairFunction(
         "the gap at the closing speed, whether or not the ways meet",
         "s",
-        "gap / nullif(approach, 0)",
-        note="NULL where the centres do not approach",
+        "CASE WHEN approach >= 1e-6 THEN gap / approach END",
+        note="NULL where the centres approach by less than 1e-6 m/s",
         dear=True,
         worse="low",
     ),
@@ -136,8 +138,17 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
 }
 
 PARTS: Final[Mapping[str, str]] = {
-    **{f"d{axis}": f"b_{axis} - a_{axis}" for axis in ("x", "y", "z", "vx", "vy")},
-    **{f"l{one}": f"{one}_length / 2" for one in "ab"},
+    # Two on different storeys, and what pulls or carries the other, are no pair: NULL, else 0.
+    "apart": f"CASE WHEN a_high + b_high IS NULL THEN abs(b_low - a_low) - {STOREY}e0"
+    f" ELSE greatest(b_low - a_high, a_low - b_high) - {TOUCH:.0e} END",
+    "level": "CASE WHEN apart > 0 OR a_carrier = b_node_id OR b_carrier = a_node_id OR a_carrier = b_carrier"
+    " THEN NULL ELSE 0 END",
+    # What is flat is no body: NULL, else 0.
+    "solid": "CASE WHEN a_high <= a_low OR b_high <= b_low THEN NULL ELSE 0 END",
+    **{f"d{axis}": f"b_{axis} - a_{axis} + level" for axis in ("x", "y", "vx", "vy")},
+    "dz": "coalesce(b_z - a_z, 0)",
+    "span": "sqrt((b_x - a_x) * (b_x - a_x) + (b_y - a_y) * (b_y - a_y) + dz * dz)",
+    **{f"l{one}": f"{one}_length / 2 + solid" for one in "ab"},
     **{f"w{one}": f"{one}_width / 2" for one in "ab"},
     **{f"c{one}": f"cos({one}_heading)" for one in "ab"},
     **{f"s{one}": f"sin({one}_heading)" for one in "ab"},
@@ -146,7 +157,7 @@ PARTS: Final[Mapping[str, str]] = {
     # The difference of two angles is exact for the headings that people write (0, π/2, π), where the angle of
     # turned components is not: the cosine of the double nearest to π/2 is 6e-17.
     "course": "CASE WHEN dx = 0 AND dy = 0 THEN 0 * a_heading ELSE degrees(atan2(dy, dx) - a_heading) END",
-    "turned": "degrees(b_heading - a_heading)",
+    "turned": "degrees(b_heading - a_heading) + level",
     "sighted": "degrees(b_heading - atan2(dy, dx))",
     # a's centre in b's axes, with the other sign
     "back": "dx * cb + dy * sb",

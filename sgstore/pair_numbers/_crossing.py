@@ -32,7 +32,7 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
         "scaled predictive encroachment time: how far the squares are apart of the times at which their centres"
         " come to where their straight paths cross",
         "s²",
-        "CASE WHEN cross_a >= 0 AND cross_b >= 0 THEN abs(cross_a * cross_a - cross_b * cross_b) END",
+        "CASE WHEN cross_a >= 0 AND cross_b >= 0 THEN abs(cross_a * cross_a - cross_b * cross_b) + solid END",
         "NULL where directions differ by less than 1°, one stands, or one is past it",
         _WESTHOFEN,
     ),
@@ -56,7 +56,7 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
     "delta_v": measure(
         "change of velocity of each in a collision now, both of one mass, after which they stay together",
         "m/s",
-        "rel_speed / 2",
+        "rel_speed / 2 + solid",
         "",
         "Shelby, Delta-V as a Measure of Traffic Conflict Severity, TRB 2011",
         worse="high",

@@ -28,7 +28,7 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
     "msd": measure(
         "minimum stopping distance: how far a still goes if it brakes by 11.5 m/s²",
         "m",
-        "CASE WHEN lon IS NOT NULL THEN pace * pace / 23e0 END",
+        "CASE WHEN lon IS NOT NULL THEN pace * pace / 23e0 + solid END",
         "whoever b is",
         "Allen, Shin and Cooper, Analysis of Traffic Conflicts and Collisions, 1978",
         worse="high",

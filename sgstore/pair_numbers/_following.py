@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from sgstore.pair_numbers._declared import measure
+from sgstore.pair_numbers._levels import TOUCH
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -62,8 +63,8 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
         "deceleration rate to avoid a crash: that a needs so that it is as slow as b along a's axis when it"
         " reaches it",
         "m/s²",
-        "CASE WHEN closing <= 0 AND lead IS NOT NULL THEN 0"
-        " WHEN lead > 0 THEN closing * closing / (2 * lead) END",
+        "CASE WHEN room > 0 THEN CASE WHEN closing > 0 THEN closing * closing / (2 * room)"
+        " WHEN closing <= 0 THEN 0 END END",
         f"0 where they do not close in; {_AHEAD} or they touch",
         "Almqvist, Hydén and Risser, Use of Speed Limiters in Cars for Increased Safety, TRR 1318, 1991",
         worse="high",
@@ -71,9 +72,9 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
     "decel_to_safety_time": measure(
         "deceleration to safety time: that a needs so that it is as slow as b when it is 2 s behind it",
         "m/s²",
-        "CASE WHEN closing <= 0 AND lead IS NOT NULL THEN 0"
-        " WHEN lead - 2 * v2 > 0 THEN closing * closing / (2 * (lead - 2 * v2)) END",
-        f"0 where they do not close in; {_AHEAD} or the 2 s are lost already",
+        "CASE WHEN closing <= 0 AND room > 0 THEN 0"
+        " WHEN room - 2 * v2 > 0 THEN closing * closing / (2 * (room - 2 * v2)) END",
+        f"0 where they do not close in; {_AHEAD}, they touch, or the 2 s are lost already",
         "Hupfer, Deceleration to Safety Time (DST), 1997",
         worse="high",
     ),
@@ -137,8 +138,11 @@ PARTS: Final[Mapping[str, str]] = {
     "braking": "2 * lead / nullif(closing + sqrt(closing * closing + 2 * lead * brakes), 0)",
     "reached": "CASE WHEN closing > 0 THEN lead / closing END",
     "short_by": "reach2 - abs(lat + drift2 * reached)",
-    "required": "CASE WHEN closing <= 0 AND lead IS NOT NULL AND a2 IS NOT NULL THEN 0 WHEN lead > 0 THEN"
-    " CASE WHEN v2 > 0 AND 2 * lead * brakes > v2 * closing"
-    " THEN -v1 * v1 / (2 * lead + v2 * v2 / brakes) ELSE a2 - closing * closing / (2 * lead) END END",
+    # Two that are no farther apart than the rounding of places touch.
+    "room": f"CASE WHEN lead > {TOUCH:.0e} THEN lead END",
+    # b comes to a stand, whichever way it moves, before a that brakes as hard as it must is as slow as b.
+    "required": "CASE WHEN room > 0 AND a2 IS NOT NULL THEN CASE WHEN closing <= 0 THEN 0"
+    " WHEN v1 > 0 AND v2 * a2 < 0 AND 2 * room * abs(a2) > abs(v2) * closing"
+    " THEN -v1 * v1 / (2 * room - v2 * v2 / a2) ELSE a2 - closing * closing / (2 * room) END END",
     "aside": "lat + drift2 * ttc_accel + (b_ay * ca - b_ax * sa) * ttc_accel * ttc_accel / 2",
 }

@@ -23,7 +23,7 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
         " keep",
         "m",
         "CASE WHEN toward_a + toward_b IS NULL THEN NULL WHEN least(toward_a, toward_b) >= 0 THEN head_on"
-        " WHEN chase > 0 THEN chase ELSE 0 END",
+        " WHEN chase > 0 THEN chase ELSE 0 END + solid",
         "",
         _RSS,
         worse="",
@@ -31,7 +31,7 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
     "rss_lat": measure(
         "safe distance of RSS across a's axis",
         "m",
-        "CASE WHEN abeam < 0 THEN 0.1e0 ELSE abeam + 0.1e0 END",
+        "CASE WHEN abeam < 0 THEN 0.1e0 ELSE abeam + 0.1e0 END + solid",
         "",
         _RSS,
         worse="",

@@ -14,6 +14,7 @@ import sgstore.pair_numbers._evading as evading
 import sgstore.pair_numbers._following as following
 import sgstore.pair_numbers._mild as mild
 import sgstore.pair_numbers._rss as rss
+from sgstore.pair_numbers._levels import OPTIONAL, low_and_high_sql
 from sgstore.pair_numbers._ways import WAYS
 
 if TYPE_CHECKING:
@@ -62,8 +63,9 @@ def needed_for(name: str) -> frozenset[str]:
 
 
 def columns_needed(name: str) -> tuple[frozenset[str], frozenset[str]]:
-    """The columns of a and those of b that a number of a pair is made of."""
+    """The columns of a and those of b without which a number of a pair is unknown."""
     raw = [part for part in needed_for(name) if part not in EXPRESSIONS]
+    raw = [part for part in raw if part[2:] not in {*OPTIONAL, "z"}]
     a, b = (frozenset(part[2:] for part in raw if part[0] == one) for one in "ab")
     return a, b
 
@@ -73,6 +75,10 @@ def columns_needed(name: str) -> tuple[frozenset[str], frozenset[str]]:
 
 _WRITTEN_OUT: Final = 2000
 """Columns that a number may be spelled out to, before DuckDB is kept from it; ``ttc`` has 1,500."""
+
+
+_ONCE: Final = frozenset({"level", "solid"})
+"""Parts that almost all numbers have, so that they are computed once for each pair."""
 
 
 @cache
@@ -88,7 +94,7 @@ def _spelled(name: str) -> int:
 @cache
 def _is_apart(name: str) -> bool:
     """Tell whether conditions on a number are not to be replaced by conditions on its parts."""
-    return _spelled(name) > _WRITTEN_OUT
+    return name in _ONCE or _spelled(name) > _WRITTEN_OUT
 
 
 def pair_sql(name: str, column: Callable[[str], str]) -> str:
@@ -117,7 +123,9 @@ def _is_of(name: str, one: str) -> bool:
 def _side(one: str, names: Sequence[str]) -> str:
     """The states as those of a or b, with functions of it alone: worked out once, not for each of its pairs."""
     made = [f"{pair_sql(name, lambda n: f'{n[2:]}::DOUBLE')} AS {name}" for name in names]
-    return f"(SELECT {', '.join(['*', *made])} FROM inside.state) {one}"  # noqa: S608
+    sides = low_and_high_sql(lambda n: n if n == "kind" else f"{n}::DOUBLE")
+    columns = ", ".join(["*", *made, *(f"{text} AS {n}" for n, text in sides.items())])
+    return f"(SELECT {columns} FROM inside.state) {one}"  # noqa: S608
 
 
 def pairs_view(view: str = "pairs") -> tuple[str, str]:

@@ -141,6 +141,7 @@ class EntityRow(NamedTuple):
     static: bool
     map_ref: str
     lifetime: int = 1
+    trailer: str = ""
 
 
 @dataclass(slots=True)
@@ -191,6 +192,7 @@ class EntityTable:
         type_name: str,
         map_ref: str = "",
         pose: tuple[float, ...] | None = None,
+        trailer: str = "",
     ) -> int:
         """Enter an entity and return its node id.
 
@@ -202,6 +204,8 @@ class EntityTable:
         type_name, map_ref : str
         pose : tuple of float, optional
             Columns :data:`POSE` of an entity that never moves.
+        trailer : str
+            Id of the trailer that it pulls; empty: none, or not known.
         """
         if ident in self._idents:
             ident = f"{ident}:{meaning.kind}"
@@ -222,6 +226,7 @@ class EntityTable:
                 type_name,
                 pose is not None,
                 map_ref,
+                trailer=trailer,
             )
         )
         self.size += 1
@@ -357,6 +362,7 @@ class EntityTable:
             static=np.array(columns[5], np.bool_),
             map_ref=columns[6],
             lifetime=columns[7] if returned else (),
+            trailer=columns[8],
         )
         nodes = [node for node in range(self._taken, upto) if node in self._poses]
         values = np.array([self._poses.pop(node) for node in nodes], np.float64)

@@ -7,6 +7,7 @@ from ._extent import EgoPoses as EgoPoses
 from ._extent import Extent as Extent
 from ._registry import Keeping as Keeping
 from ._registry import renamed as renamed
+from ._hitches import Hitches as Hitches
 from ._following import Parking as Parking
 from ._following import gaps as gaps
 from ._map_context import LaneContact as LaneContact
@@ -24,6 +25,7 @@ from ._registry import as_markdown as as_markdown
 from ._registry import relations as relations
 from ._registry import relations_under as relations_under
 from ._scene import IS_SIGNAL as IS_SIGNAL
+from ._scene import IS_UPRIGHT as IS_UPRIGHT
 from ._scene import BlockScene as BlockScene
 from ._scene import Bodies as Bodies
 from ._scene import EdgeRoom as EdgeRoom
@@ -42,7 +44,9 @@ __all__ = [
     "EdgeRoom",
     "EgoPoses",
     "Extent",
+    "Hitches",
     "IS_SIGNAL",
+    "IS_UPRIGHT",
     "Keeping",
     "LaneContact",
     "MapContext",

@@ -1,9 +1,10 @@
 """Pairs of bodies that touch or overlap: a collision, in a simulator.
 
 Footprints meet where their gap is 0, and boxes meet where they do so in height too: a car under a bridge
-touches nothing. Where a height is missing, what counts is the storey (:data:`sgstore.roads.STOREY`), and where
-the place in height is missing, nothing but the footprints. What has no footprint touches nothing. One of the
-two moves at least, and neither is a signal: signals hang over the road as boxes that mean no body.
+touches nothing. Where a height is missing, what counts is the storey (:data:`sgstore.pair_numbers.STOREY`), and
+where the place in height is missing, nothing but the footprints. What has no footprint, or a height of 0 (paint
+on the road), touches nothing, nor does what is pulled or carried touch its carrier. One of the two moves at
+least, and neither is a signal: signals hang over the road as boxes that mean no body.
 
 It does not depend on how far apart related pairs may be, only on whether pairs that are no ego's are related
 at all.
@@ -16,9 +17,15 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.geometry import offsets
-from sgstore.pair_numbers import gap
-from sgstore.relations._scene import IS_SIGNAL, Relation, edges_between, meeting, relates_pairs
-from sgstore.roads import STOREY
+from sgstore.pair_numbers import TOUCH, gap
+from sgstore.relations._scene import (
+    IS_SIGNAL,
+    Relation,
+    edges_between,
+    meet_as_bodies,
+    meeting,
+    relates_pairs,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -30,10 +37,6 @@ if TYPE_CHECKING:
     from sgstore.world import Bools, Floats
 
     Rows = NDArray[np.intp]
-
-
-TOUCH: Final = 1e-4
-"""Gap that means nothing: rounding of positions far from the origin; m."""
 
 
 SURE: Final = 1e-4
@@ -82,10 +85,7 @@ def _touching(bodies: Bodies, a: Rows, b: Rows) -> tuple[Rows, Rows]:
     """The pairs that touch, in height as far as it is known."""
     close = bodies.moves[a] | bodies.moves[b]
     a, b = a[close], b[close]
-    apart = np.abs(bodies.z[b] - bodies.z[a])
-    reach = (bodies.height[a] + bodies.height[b]) / 2 + TOUCH
-    bottoms = np.abs(bodies.bottom[b] - bodies.bottom[a])
-    level = ~np.where(np.isnan(reach), bottoms > STOREY, apart > reach)
+    level = meet_as_bodies(bodies, a, b)
     a, b = a[level], b[level]
     apart = _separation(bodies, a, b)
     touch = apart < -SURE
@@ -133,7 +133,8 @@ def _edges(scene: BlockScene) -> Edges:
 
 OVERLAPS = Relation(
     name="overlaps",
-    doc="entity ↔ entity: their boxes meet, in the plane and in height: a collision, in a simulator",
+    doc="entity ↔ entity: their boxes meet, in the plane and in height: a collision, in a simulator;"
+    " of nothing flat, and of no trailer or rider with its vehicle",
     edges=_edges,
     symmetric=True,
     settings=relates_pairs,

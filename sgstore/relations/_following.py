@@ -3,7 +3,8 @@
 Who drives behind whom along the lanes: ``leads``, from the next one ahead, and ``follows``, to it.
 
 What takes part are vehicles, parked ones too, on lanes for traffic, which face along their lane (by less than
-a right angle: who comes towards one leads nobody). Who never moves follows nobody.
+a right angle: who comes towards one leads nobody). Who never moves follows nobody, and a trailer does not
+follow what pulls it.
 
 *Its own lanes* are the primary lane of an entity and, in a junction, where lanes lie on one another, every
 other lane of the same junction that its centre is in and, if it is a vehicle, that runs its way
@@ -31,7 +32,15 @@ import numpy as np
 
 from sgstore.compiled import worth
 from sgstore.graph import Edges, LaneGaps
-from sgstore.relations._scene import IS_SIGNAL, IS_VEHICLE, Relation, edges_between, parts, spread
+from sgstore.relations._scene import (
+    IS_SIGNAL,
+    IS_VEHICLE,
+    Relation,
+    carried_by,
+    edges_between,
+    parts,
+    spread,
+)
 from sgstore.vocabulary import RELATION_CODE, TRAFFIC
 
 if TYPE_CHECKING:
@@ -368,7 +377,7 @@ def next_ahead(net: LaneNet, bodies: Bodies, standing: Standing, limit: float) -
     parts += _beyond(net, own, limit)
     behind, ahead, distance = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     a, b = own.row[behind], own.row[ahead]
-    kept = np.flatnonzero((distance <= limit) & bodies.moves[a])
+    kept = np.flatnonzero((distance <= limit) & bodies.moves[a] & ~carried_by(bodies, a, b))
     order = kept[np.lexsort((distance[kept], b[kept], a[kept]))]
     a, b, distance = a[order], b[order], distance[order]
     first = np.ones(len(a), np.bool_)

@@ -47,6 +47,8 @@ def near_pairs(
             dx, dy, dz = x[other] - x[one], y[other] - y[one], z[other] - z[one]
             if dx * dx > limit:
                 break
+            if math.isnan(dz):
+                dz = 0.0
             if dx * dx + dy * dy + dz * dz <= limit:
                 a[count] = one
                 b[count] = other
@@ -61,18 +63,26 @@ def rungs(
     b: Ints,
     ends: tuple[Nodes, Nodes],
     place: tuple[Floats, Floats, Floats],
+    wanted: Bools,
     bounds: Floats,
     codes: Codes,
     columns: Columns,
 ) -> int:
-    """Fill in the edges of pairs whose squared distance is within a bound, both ways; return how many."""
+    """Fill in the edges of pairs whose squared distance is within a bound, both ways; return how many.
+
+    ``wanted``: of which pairs; empty: of all.
+    """
     x, y, z = place
     frame, node = ends
     of, relation, src, dst = columns
     at = 0
     for i in range(len(a)):
+        if len(wanted) and not wanted[i]:
+            continue
         one, other = a[i], b[i]
         dx, dy, dz = x[other] - x[one], y[other] - y[one], z[other] - z[one]
+        if math.isnan(dz):
+            dz = 0.0
         span = dx * dx + dy * dy + dz * dz
         if span <= bounds[-1]:
             rung = 0

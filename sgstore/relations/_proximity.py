@@ -1,7 +1,9 @@
 """Distance of related bodies from one another: one relation of a ladder of distances, or none.
 
-The distance is between the centres of the boxes, in space. Rungs are half-open, ``(lo, hi]``, as in CARLASGG's
-code (its documentation leaves the bounds open), and the nearest holds its lower bound too.
+The distance is between the centres of the boxes, in space; in the plane where a height is not known. There is
+none between storeys, to what is flat, and between what is carried and its carrier. Rungs are half-open,
+``(lo, hi]``, as in CARLASGG's code (its documentation leaves the bounds open), and the nearest holds its
+lower bound too.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ def _edges(scene: BlockScene) -> Edges:
         from sgstore.relations import _loops
 
         columns = scene.room.rest(len(pairs))
-        many = _loops.rungs(*pairs.for_loops[:4], np.array(bounds), codes, columns)
+        many = _loops.rungs(*pairs.for_loops[:4], pairs.of_bodies, np.array(bounds), codes, columns)
         return scene.room.filled(columns, many)
     found, holds = np.zeros(len(pairs.span), np.int8), np.zeros(len(pairs.span), np.bool_)
     for part in even_parts(len(found) if bounds else 0):
@@ -44,6 +46,8 @@ def _edges(scene: BlockScene) -> Edges:
             rung += span > bound
         found[part] = codes[rung]
         holds[part] = span <= bounds[-1]  # what has no distance is in no rung
+    if bounds and len(pairs.of_bodies):
+        holds &= pairs.of_bodies
     found, holds = np.concatenate([found, found]), np.concatenate([holds, holds])
     if settings.kinds:
         holds &= are_of_kinds(scene.bodies, scene.ego, (pairs.a, pairs.b), settings.kinds)

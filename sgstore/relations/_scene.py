@@ -16,7 +16,7 @@ from sgstore.columns import taken
 from sgstore.compiled import worth
 from sgstore.geometry import bearings
 from sgstore.graph import Edges
-from sgstore.pair_numbers import gap
+from sgstore.pair_numbers import STOREY, TOUCH, UPRIGHT, gap, low_and_high
 from sgstore.vocabulary import KIND_CODE, MOST_KINDS, RELATION_CODE, SIGNALS, VEHICLES
 
 if TYPE_CHECKING:
@@ -109,7 +109,9 @@ class Bodies:
     moves : bool
         False for scenery.
     x, y, z, heading, length, width, height : float64
-        The box; m, m, m, rad, m, m, m.
+        The box; m, m, m, rad, m, m, m. The height of what stands upright is missing where it is 0.
+    carrier : int64
+        Node id of what pulls or carries it; below 0: nothing.
     """
 
     frame: Ints
@@ -123,6 +125,7 @@ class Bodies:
     length: Floats
     width: Floats
     height: Floats
+    carrier: Ints
 
     def __len__(self) -> int:
         return len(self.node)
@@ -135,6 +138,11 @@ class Bodies:
     def bottom(self) -> Floats:
         """(N,): height of the lower side of the box; m. What has no height is all at ``z``."""
         return self.z - np.nan_to_num(self.height) / 2
+
+    @property
+    def low_and_high(self) -> tuple[Floats, Floats]:
+        """(N,): heights of the lower and the upper side; see :func:`sgstore.pair_numbers.low_and_high`."""
+        return low_and_high(self.z, self.height, IS_SIGNAL[self.kind], IS_UPRIGHT[self.kind])
 
     @property
     def boxes(self) -> Floats:
@@ -236,6 +244,16 @@ class BodyPairs:
             self._turns,
         )
 
+    @cached_property
+    def of_bodies(self) -> Bools:
+        """(K / 2,): which pairs of the first half :func:`meet_as_bodies`; empty: all of them."""
+        of = self._bodies
+        plain = not (of.carrier >= 0).any() and not (of.height == 0).any()
+        levels = of.low_and_high
+        if plain and _all_level(*levels):
+            return np.zeros(0, np.bool_)
+        return meet_as_bodies(of, *self._halves)
+
     @property
     def in_loops(self) -> bool:
         """Return whether loops tell of them, which know nothing of footprints."""
@@ -257,6 +275,15 @@ class BodyPairs:
             np.concatenate([one, other]),
             np.concatenate([other, one]),
         )
+
+
+def _all_level(low: Floats, high: Floats) -> bool:
+    """Return whether for certain no two bodies are on different storeys."""
+    known = low[~np.isnan(low)]
+    if not len(known):
+        return True
+    least = np.where(np.isnan(high), STOREY, high - low)[~np.isnan(low)].min()
+    return bool(np.ptp(known) <= least)
 
 
 MOST_TURNED: Final = 1e3
@@ -301,7 +328,29 @@ def spans(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
         return gap(boxes[a], boxes[b])
     places = (bodies.x, bodies.y, levels(bodies, between))
     dx, dy, dz = (of[b] - of[a] for of in places)
+    dz = np.where(np.isnan(dz), 0.0, dz)  # in the plane where a height is not known
     return dx * dx + dy * dy + dz * dz
+
+
+def on_one_level(bodies: Bodies, a: Rows, b: Rows) -> Bools:
+    """Mask of the pairs of bodies that are not on different storeys; where it is not known, they are not."""
+    low, high = bodies.low_and_high
+    reach = np.fmax(low[b] - high[a], low[a] - high[b])
+    unknown = np.isnan(high[a] + high[b])
+    return ~np.where(unknown, np.abs(low[b] - low[a]) > STOREY, reach > TOUCH)
+
+
+def meet_as_bodies(bodies: Bodies, a: Rows, b: Rows) -> Bools:
+    """Mask of the pairs of bodies on one level of which neither is flat, nor carries the other."""
+    flat = ~IS_UPRIGHT[bodies.kind] & (bodies.height == 0)
+    return ~(flat[a] | flat[b] | carried_by(bodies, a, b)) & on_one_level(bodies, a, b)
+
+
+def carried_by(bodies: Bodies, a: Rows, b: Rows) -> Bools:
+    """Mask of the pairs of which one pulls or carries the other, or that have one carrier."""
+    carrier, node = bodies.carrier, bodies.node
+    bound = (carrier[a] == node[b]) | (carrier[b] == node[a])
+    return bound | (carrier[a] >= 0) & (carrier[a] == carrier[b])
 
 
 def levels(bodies: Bodies, between: str) -> Floats:
@@ -612,6 +661,7 @@ def kinds_mask(names: tuple[str, ...]) -> Bools:
 
 IS_SIGNAL: Final = kinds_mask(SIGNALS)
 IS_VEHICLE: Final = kinds_mask(VEHICLES)
+IS_UPRIGHT: Final = kinds_mask(UPRIGHT)
 
 
 def spread(starts: Ints, counts: Ints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

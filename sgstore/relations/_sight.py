@@ -9,6 +9,7 @@ hides the car behind it, not the traffic light above, and a bridge hides nothing
   within, a box says nothing of what is around. The ego hides nothing, and nobody hides itself.
 * Where the height of the eye or of what is looked at is missing, the plane alone counts. What has no footprint
   is looked at by its centre; what has no place is not seen.
+* What is on another storey (as of ``overlaps``) is not seen; signals are on none.
 * A line along a side, or through a corner, is free. There is no limit but the range of the graph, and neither
   the direction in which the ego looks nor the weather counts: those are a matter of sensors.
 """
@@ -28,6 +29,7 @@ from sgstore.relations._scene import (
     by_frame,
     edges_between,
     meeting,
+    on_one_level,
     turns,
 )
 
@@ -218,6 +220,7 @@ def _within(
 def _edges(scene: BlockScene) -> Edges:
     bodies, ego = scene.bodies, scene.ego
     rows = seen(bodies, ego) if scene.config.sees else np.zeros(0, np.intp)
+    rows = rows[on_one_level(bodies, ego[bodies.frame[rows]], rows)]
     return edges_between(scene, "sees", ego[bodies.frame[rows]], rows)
 
 

@@ -61,7 +61,7 @@ SELECT frame_id, seq, time_ns, log_time_ns, coalesce(ego, -1) AS ego FROM frame
 WHERE frame_id >= $low << 6 AND frame_id < $high << 6 ORDER BY frame_id
 """
 _STATES: Final = f"""
-SELECT frame_id, node_id, coalesce(lights, -1) AS lights, derived,
+SELECT frame_id, node_id, coalesce(lights, -1) AS lights, derived, coalesce(carrier, -1) AS carrier,
        coalesce(enum_code(light_state)::INTEGER, -1) AS light_state, {", ".join(_NUMBERS)}
 FROM state WHERE frame_id >= $low << 6 AND frame_id < $high << 6 ORDER BY frame_id, node_id
 """
@@ -425,6 +425,7 @@ class _StateReader:
                 lights=states["lights"].astype(np.int64),
                 light_state=np.append(self._lights, np.int8(-1))[states["light_state"]],
                 derived=states["derived"].astype(np.int64),
+                carrier=states["carrier"].astype(np.int64),
                 **self._placed(states, _NUMBERS),
             ),
             ego=frames["ego"].astype(np.int64),

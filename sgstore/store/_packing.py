@@ -201,6 +201,7 @@ def state_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds, origin: Or
         "lights": unless(states.lights, states.lights < 0),
         "light_state": unless(states.light_state, states.light_state < 0),
         "derived": states.derived,
+        "carrier": unless(states.carrier, states.carrier < 0),
     }
 
 

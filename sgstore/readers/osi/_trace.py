@@ -449,9 +449,19 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
         if meaning.kind == "vehicle" and not meaning.subkind:
             self.roster.count_unknown(type_name)
         ident = self._idents.get(thing.id.value, str(thing.id.value))
-        node = self.roster.enter(ident, meaning, type_name)
+        node = self.roster.enter(ident, meaning, type_name, trailer=self._trailer(thing))
         self._codes[node] = code_of(thing)
         return node
+
+    def _trailer(self, thing: Any) -> str:
+        """The id of the trailer that a vehicle pulls, or the empty string."""
+        vehicle = getattr(thing, "vehicle_classification", None)
+        if vehicle is None or not has_field(type(vehicle), "trailer_id"):
+            return ""
+        if not vehicle.HasField("trailer_id"):
+            return ""
+        number = vehicle.trailer_id.value
+        return self._idents.get(number, str(number))
 
     def _called(self, thing: Any) -> Called:
         """What a moving object is, and its type.

@@ -1,0 +1,72 @@
+"""Heights between which a body is: what tells storeys, and flat things, from bodies.
+
+Signals hang over the road and belong to no storey: they have no such heights. What by its kind stands upright
+has no height of 0: there 0 means that it was not recorded, as in recordings that never give heights.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from sgstore.arrays import np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Bools = NDArray[np.bool_]
+
+HUNG: Final = ("traffic_light", "stop_sign", "yield_sign", "speed_limit", "sign")
+"""Kinds that belong to no storey: the signals of the vocabulary."""
+
+UPRIGHT: Final = (
+    *("car", "truck", "van", "bus", "motorcycle", "bicycle", "trailer", "train", "vehicle"),
+    *("person", "animal", "building", "pole", "barrier", "vegetation"),
+)
+"""Kinds that have a height, recorded or not: the vehicles of the vocabulary, and more."""
+
+OPTIONAL: Final = ("low", "high", "node_id", "carrier")
+"""Columns of an entity without which a number of a pair has a value all the same.
+
+Heights of its lower and upper side (m), node id, and that of its carrier.
+"""
+
+TOUCH: Final = 1e-4
+"""Distances that mean nothing: rounding of positions far from the origin; m."""
+
+STOREY: Final = 2.5
+"""Difference of the lower sides from which on storeys differ, where a height is not known; m."""
+
+
+def low_and_high(z: Floats, height: Floats, hung: Bools, upright: Bools) -> tuple[Floats, Floats]:
+    """Heights of the lower and the upper side of bodies.
+
+    Parameters
+    ----------
+    z, height : (N,) float64
+        Of the centre of the box, and its extent; m.
+    hung, upright : (N,) bool
+        Whether the kind is one of :data:`HUNG`, and one of :data:`UPRIGHT`.
+
+    Returns
+    -------
+    low, high : (N,) float64
+        Metres; NaN of signals, and where the place is not known; ``high`` also where the height is not known.
+    """
+    half = np.where(upright & (height == 0), np.nan, height / 2)
+    low = np.where(hung, np.nan, z - np.where(np.isnan(half), 0.0, half))
+    return low, np.where(hung, np.nan, z + half)
+
+
+def low_and_high_sql(column: Callable[[str], str]) -> dict[str, str]:
+    """Return the same as SQL, given the SQL of the columns ``z``, ``height`` and ``kind``."""
+    z, height, kind = (column(name) for name in ("z", "height", "kind"))
+    hung, upright = (", ".join(f"'{kind}'" for kind in kinds) for kinds in (HUNG, UPRIGHT))
+    solid = f"{kind} NOT IN ({hung})"
+    half = f"CASE WHEN {height} <> 0 OR {kind} NOT IN ({upright}) THEN {height} / 2 END"
+    return {
+        "low": f"CASE WHEN {solid} THEN {z} - coalesce({half}, 0) END",
+        "high": f"CASE WHEN {solid} THEN {z} + {half} END",
+    }

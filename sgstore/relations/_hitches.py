@@ -1,0 +1,187 @@
+"""What pulls or carries what: trailers and riders, and the relation ``tows``.
+
+A trailer and its tractor touch for ever, and so do a rider and the bicycle: that is no collision, and neither
+follows the other. So they are no pair: no other relation holds between them but those of direction and sight,
+and the numbers of the pair are unknown.
+
+*Who is carried* is said by the recording (:attr:`sgstore.world.Entities.trailer`) or seen: a trailer that
+touches a vehicle ahead of it, or a person whose centre is within the footprint of a two-wheeler and who faces
+its way, in the first frame that has both. What touches later has come there. A pair ends for good where the
+two are farther apart than :data:`APART`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.geometry import offsets
+from sgstore.pair_numbers import gap
+from sgstore.relations._contact import contacts
+from sgstore.relations._scene import (
+    IS_VEHICLE,
+    Relation,
+    edges_between,
+    joined,
+    kinds_mask,
+    relates_pairs,
+)
+from sgstore.vocabulary import KIND_CODE, SUPER_KINDS
+from sgstore.world import UNTOLD
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from sgstore.graph import Edges
+    from sgstore.relations._scene import BlockScene, Bodies
+    from sgstore.world import Bools, Codes, Entities, FrameBlock, Ints
+
+    Rows = NDArray[np.intp]
+
+
+APART: Final = 5.0
+"""Gap from which on a trailer is no longer hitched; m."""
+
+_FACES: Final = 0.7
+"""Cosine of the angle to which a rider faces along the bicycle."""
+
+_TRAILER: Final = KIND_CODE["trailer"]
+_PERSON: Final = KIND_CODE["person"]
+_IS_TWO_WHEELER: Final = kinds_mask(tuple(SUPER_KINDS["two_wheeler"]))
+
+
+class Hitches:
+    """Record of what is carried in a trace so far; it grows with the number of entities, not with time."""
+
+    def __init__(self) -> None:
+        self._kind: Codes = np.zeros(0, np.int8)
+        self._seen: Bools = np.zeros(0, np.bool_)
+        self._carrier: Ints = np.zeros(0, np.int64)
+        self._trailers: dict[str, int] = {}
+        self._said: dict[str, int] = {}
+
+    def learn(self, entities: Entities) -> None:
+        """Take note of entities that appear for the first time."""
+        count = len(entities)
+        self._kind = np.append(self._kind, entities.kind)
+        self._seen = np.append(self._seen, np.zeros(count, np.bool_))
+        self._carrier = np.append(self._carrier, np.full(count, -1))
+        for row in np.flatnonzero(entities.kind == _TRAILER).tolist():
+            self._trailers[entities.ident[row]] = entities.first + row
+        for row, trailer in enumerate(entities.trailer):
+            if trailer:
+                self._said[trailer] = entities.first + row
+        for trailer in [ident for ident in self._said if ident in self._trailers]:
+            self._carrier[self._trailers[trailer]] = self._said.pop(trailer)
+
+    def see(self, frames: FrameBlock, bodies: Callable[[Rows], Bodies]) -> Ints:
+        """Carrier of each state of the next block: node id, or -1.
+
+        Parameters
+        ----------
+        frames : FrameBlock
+        bodies : function
+            Some of the states as bodies.
+        """
+        states = frames.states
+        carrier = states.carrier
+        untold = carrier == UNTOLD
+        if not untold.any():
+            return carrier
+        kind = self._kind[states.node]
+        trailer, person = kind == _TRAILER, kind == _PERSON
+        apt = IS_VEHICLE[kind] if trailer.any() else _IS_TWO_WHEELER[kind]
+        apt = apt | trailer | person
+        new = apt & ~self._seen[states.node]
+        if new.any() and (trailer | person).any():
+            self._meet(bodies, np.flatnonzero(apt & new_frames(frames, new)), states.node)
+        self._seen[states.node] = True
+        found = np.where(untold, self._carrier[states.node], carrier)
+        rows = np.flatnonzero(found >= 0)
+        return self._parted(bodies, frames, rows, found) if len(rows) else found
+
+    def _meet(self, bodies: Callable[[Rows], Bodies], rows: Rows, node: Ints) -> None:
+        """Find pairs that touch in the first frame that has both."""
+        of = bodies(rows)
+        first = _first(of.node, of.frame, len(self._seen))
+        first[self._seen] = -1
+        for a, b in contacts(of, np.zeros(int(of.frame.max(initial=0)) + 1, np.bool_)):
+            one, other = np.concatenate([a, b]), np.concatenate([b, a])
+            begins = np.maximum(first[of.node[one]], first[of.node[other]]) == of.frame[one]
+            begins &= self._carrier[of.node[one]] < 0
+            fits = begins & self._fits(of, one, other)
+            one, other = one[fits], other[fits]
+            away = np.hypot(of.x[other] - of.x[one], of.y[other] - of.y[one])
+            order = np.argsort(-away, kind="stable")  # the nearest is written last
+            self._carrier[of.node[one[order]]] = of.node[other[order]]
+
+    def _fits(self, of: Bodies, one: Rows, other: Rows) -> Bools:
+        """Mask of pairs of which one can be carried by the other."""
+        dx, dy = of.x[other] - of.x[one], of.y[other] - of.y[one]
+        ahead, _ = offsets(dx, dy, of.heading[one])
+        pulled = (of.kind[one] == _TRAILER) & IS_VEHICLE[of.kind[other]] & (ahead > 0)
+        onward, aside = offsets(dx, dy, of.heading[other])
+        within = np.abs(onward) <= of.length[other] / 2
+        within &= np.abs(aside) <= of.width[other] / 2
+        faces = np.cos(of.heading[one] - of.heading[other]) > _FACES
+        ridden = (of.kind[one] == _PERSON) & _IS_TWO_WHEELER[of.kind[other]] & within & faces
+        return pulled | ridden
+
+    def _parted(
+        self, bodies: Callable[[Rows], Bodies], frames: FrameBlock, rows: Rows, carrier: Ints
+    ) -> Ints:
+        """The carriers of a block, without those that are left behind in it."""
+        states, frame = frames.states, frames.frame_of
+        count = len(self._seen)
+        key = frame * count + states.node
+        order = np.argsort(key, kind="stable")
+        one, place = joined(key[order], frame[rows] * count + carrier[rows])
+        a, b = rows[one], order[place]
+        parted = gap(bodies(a).boxes, bodies(b).boxes) > APART
+        for row in a[parted].tolist():
+            node = states.node[row]
+            if self._carrier[node] >= 0:
+                self._carrier[node] = -1
+                carrier = np.where((states.node == node) & (frame >= frame[row]), -1, carrier)
+        return carrier
+
+
+def new_frames(frames: FrameBlock, new: Bools) -> Bools:
+    """Mask of the states in frames in which something is seen for the first time."""
+    first = _first(frames.states.node[new], frames.frame_of[new], int(frames.states.node.max()) + 1)
+    wanted = np.zeros(len(frames), np.bool_)
+    wanted[first[first >= 0]] = True
+    return wanted[frames.frame_of]
+
+
+def _first(node: Ints, frame: Ints, count: int) -> Ints:
+    """(count,): the first frame of each node; -1 of those that are in none."""
+    first = np.full(count, -1)
+    order = np.lexsort((-frame, node))
+    first[node[order]] = frame[order]
+    return first
+
+
+def _edges(scene: BlockScene) -> Edges:
+    bodies = scene.bodies
+    pulled = np.flatnonzero((bodies.carrier >= 0) & (bodies.kind != _PERSON))
+    if not len(pulled):
+        return edges_between(scene, "tows", pulled, pulled)
+    count = int(max(bodies.node.max(), bodies.carrier.max())) + 1
+    key = bodies.frame * count + bodies.node
+    order = np.argsort(key, kind="stable")
+    one, place = joined(key[order], bodies.frame[pulled] * count + bodies.carrier[pulled])
+    return edges_between(scene, "tows", order[place], pulled[one])
+
+
+TOWS = Relation(
+    name="tows",
+    doc="vehicle → trailer: it pulls the trailer; the two are no pair for `overlaps`, proximity, `leads`"
+    " and numbers",
+    edges=_edges,
+    settings=relates_pairs,
+    legend="trailer",
+)
