@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sgstore.collection._place import ABOUT, MissingObjectError, digest_of_file
 from sgstore.errors import ExportError, StoreError
 from sgstore.files import working_folder
-from sgstore.lang import Catalog, RelationScope, TraceFacts, Type
+from sgstore.lang import Catalog, RelationScope, TraceFacts, Type, own_type
 from sgstore.store import (
     CATALOGUE,
     SCHEMA_VERSION,
@@ -176,12 +176,14 @@ class Snapshot:
     @cached_property
     def own(self) -> dict[str, dict[str, Type]]:
         """``own`` and ``own_edges`` → attributes of a client's own, with their types over all bundles."""
-        found: dict[str, dict[str, Type]] = {"own": {}, "own_edges": {}}
+        found: dict[str, dict[str, set[Type]]] = {"own": {}, "own_edges": {}}
         for _, what, word, kind, _ in self.facts["word"]:
             if what in found:
-                known = found[what].setdefault(word, Type(kind))
-                found[what][word] = known if known is Type(kind) else Type.text
-        return found
+                found[what].setdefault(word, set()).add(Type(kind))
+        return {
+            what: {word: own_type(types) for word, types in words.items()}
+            for what, words in found.items()
+        }
 
     @cached_property
     def classed(self) -> tuple[str, ...]:

@@ -39,7 +39,7 @@ from sgstore.vocabulary import (
     type_meanings,
     vague_kind,
 )
-from sgstore.world import HIGHEST_GEAR, INPUTS, POSE
+from sgstore.world import HIGHEST_GEAR, INPUTS, POSE, is_plausible, without_implausible
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -471,7 +471,22 @@ def state_of(
         else:
             own[name] = value
     _speed(attributes, found, lost)
+    _drop_implausible(found, lost)
     return found, own
+
+
+def _drop_implausible(found: dict[str, float], lost: dict[str, int]) -> None:
+    """Leave out the sizes and velocities that no body has."""
+    row = [found.get(name, math.nan) for name in POSE]
+    if is_plausible(*row[6:9], *row[13:]):
+        return
+    kept, faults = without_implausible(np.array([row]))
+    for name, value in zip(POSE, kept[0].tolist(), strict=True):
+        if math.isnan(value):
+            found.pop(name, None)
+    for _, words in faults:
+        what = f"{words}: it"
+        lost[what] = lost.get(what, 0) + 1
 
 
 def _speed(attributes: Mapping[str, Any], found: dict[str, float], lost: dict[str, int]) -> None:

@@ -19,6 +19,7 @@ from ._catalog import TraceFacts as TraceFacts
 from ._catalog import Triple as Triple
 from ._catalog import attributes_of as attributes_of
 from ._catalog import Type as Type
+from ._catalog import own_type as own_type
 from ._notes import Compared as Compared
 from ._notes import compared_in_check as compared_in_check
 from ._notes import compared_in_query as compared_in_query
@@ -174,6 +175,7 @@ __all__ = [
     "TraceFacts",
     "Triple",
     "Type",
+    "own_type",
     "UnionParts",
     "WhyNot",
     "WhyNotSteps",

@@ -35,7 +35,7 @@ from sgstore.vocabulary import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
     from typing import Self
 
 
@@ -111,6 +111,9 @@ class Type(StrEnum):
     """Types of values in expressions."""
 
     number = "number"
+    whole = (
+        "whole number"  # of an attribute of a client's own, in a catalog: a number in expressions
+    )
     text = "text"
     boolean = "boolean"
     node = "node"
@@ -155,6 +158,8 @@ class Attribute:
         The user's own table that it is a column of, or whose frames it is about; empty for all others.
     traces : tuple of int
         Ids of the traces that it is about.
+    whole : bool
+        Whether all its values are whole numbers, some of which no float is equal to.
     """
 
     name: str
@@ -168,6 +173,7 @@ class Attribute:
     traces: tuple[int, ...] = ()
     enum: str = ""
     given: str = ""
+    whole: bool = False
 
     @property
     def kinds(self) -> frozenset[str]:
@@ -385,7 +391,20 @@ NODE_ATTRIBUTES: Final = _named(
 @cache
 def own_attribute(name: str, kind: Type) -> Attribute:
     """Return an attribute of a client's own, which nodes of any kind, or edges of any relation, may have."""
-    return Attribute(name, kind, {}, "of a client's own", DisplayUnit.own)
+    whole = kind is Type.whole
+    kind = Type.number if whole else kind
+    return Attribute(name, kind, {}, "of a client's own", DisplayUnit.own, whole=whole)
+
+
+def own_type(types: Collection[Type]) -> Type:
+    """Return the type of an attribute of a client's own, by its types in each of several traces.
+
+    What is a number in one trace is a number everywhere. A text of another trace is then no value.
+    """
+    for kind in (Type.number, Type.whole):
+        if kind in types:
+            return kind
+    return Type.boolean if set(types) == {Type.boolean} else Type.text
 
 
 def _of_lane(name: str, kind: Type, column: str, meaning: str, unit: DisplayUnit) -> Attribute:
@@ -758,7 +777,10 @@ class Catalog:
 
 def attributes_of(catalog: Catalog) -> dict[str, list[Attribute]]:
     """All attributes that a query can ask for, by what has them; a client's own among those of nodes."""
-    own = [Attribute(name, type_, {}, "of your own") for name, type_ in catalog.own.items()]
+    own = [
+        replace(own_attribute(name, kind), meaning="of your own")
+        for name, kind in catalog.own.items()
+    ]
     return {
         "node": [*NODE_ATTRIBUTES.values(), *own],
         "edge": [*EDGE_ATTRIBUTES.values()],

@@ -316,8 +316,9 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
             if attribute is NODE_ATTRIBUTES["type"]:
                 return lambda at: _type_of(at.view.nodes[at.nodes[node]])
             name = attribute.name
-            if attribute.unit is DisplayUnit.own and attribute.type is Type.text:
-                return lambda at: _text_of(at.view.nodes[at.nodes[node]].get(name))
+            if attribute.unit is DisplayUnit.own:
+                of = _OWN[attribute.type]
+                return lambda at: of(at.view.nodes[at.nodes[node]].get(name))
             return lambda at: at.view.nodes[at.nodes[node]].get(name)
         case b.LabelTest(node=node, kinds=kinds):
             return lambda at: at.view.is_one(at.nodes[node], kinds)
@@ -325,8 +326,9 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
             return lambda at: at.edges[edge][0]
         case b.EdgeAttribute(edge=edge, attribute=attribute):
             name = attribute.name
-            if attribute.unit is DisplayUnit.own and attribute.type is Type.text:
-                return lambda at: _text_of(at.edges[edge][1].get(name))
+            if attribute.unit is DisplayUnit.own:
+                of = _OWN[attribute.type]
+                return lambda at: of(at.edges[edge][1].get(name))
             return lambda at: at.edges[edge][1].get(name)
         case b.FrameAttribute(attribute=attribute) if attribute.unit is DisplayUnit.classed:
             (name,) = attribute.columns.values()
@@ -366,6 +368,19 @@ def _text_of(value: Any) -> str | None:
     if value is None or isinstance(value, str):
         return value
     return json.dumps(value, ensure_ascii=False, separators=(",", ":"))
+
+
+def _number_of(value: Any) -> Any:
+    """A value of JSON if it is a number; another trace may have texts."""
+    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+_OWN: Final[Mapping[Type, Callable[[Any], Any]]] = {
+    Type.number: _number_of,
+    Type.text: _text_of,
+    Type.boolean: lambda value: value if isinstance(value, bool) else None,
+}
+"""Type of an attribute of a client's own → what makes the value of one of JSON."""
 
 
 def _type_of(attributes: Attributes) -> Any:
@@ -548,9 +563,9 @@ def _of_crowd(part: b.Bound, key: str) -> Columns[Asked] | None:
 
 
 def _is_derived(attribute: Attribute) -> bool:
-    """Tell whether an attribute is not told with the node."""
+    """Tell whether an attribute is not told with the node as a float, or as true or false."""
     return (
-        attribute.unit in {DisplayUnit.binding, DisplayUnit.role}
+        attribute.unit in {DisplayUnit.binding, DisplayUnit.role, DisplayUnit.own}
         or attribute is NODE_ATTRIBUTES["injunction"]
     )
 

@@ -247,7 +247,13 @@ def own_text(attribute: Attribute, frame: str, node: str, edge: Sequence[str] = 
     It is one of a node, or of the edge from there whose relation and other end are given.
     """
     told = 'json_extract_string(":o"."value", \'$\')'
-    value = told if attribute.type is Type.text else f"CAST({told} AS {_NATIVE[attribute.type]})"
+    value = told
+    if attribute.type is Type.number:  # another trace may have texts
+        native = "HUGEINT" if attribute.whole else _NATIVE[attribute.type]
+        numbers = "'BIGINT', 'UBIGINT', 'HUGEINT', 'DOUBLE'"
+        value = f'CASE WHEN json_type(":o"."value") IN ({numbers}) THEN TRY_CAST({told} AS {native}) END'
+    elif attribute.type is not Type.text:
+        value = f"CAST({told} AS {_NATIVE[attribute.type]})"
     on = [f'":o"."frame_id" = {frame}', f'":o"."node_id" = {node}']
     ends = [
         f'":o"."{name}" = {text}' for name, text in zip(("relation", "dst"), edge, strict=False)

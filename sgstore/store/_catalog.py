@@ -11,7 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.abstractions import SUBSETS
-from sgstore.lang import Catalog, RelationScope, TraceFacts, Type
+from sgstore.lang import Catalog, RelationScope, TraceFacts, Type, own_type
 from sgstore.quoting import literal
 from sgstore.store._schema import others_of
 from sgstore.store._traces import stored_traces
@@ -93,19 +93,31 @@ def _sets(connection: DuckDBPyConnection) -> tuple[DerivedSet, ...]:
 
 
 def _own(connection: DuckDBPyConnection, whose: str) -> dict[str, Type]:
-    """Attributes of a client's own of nodes or edges: numbers or truth values if all values are, else texts."""
+    """Attributes of a client's own of nodes or edges, with their types: see :func:`sgstore.lang.own_type`.
+
+    In a trace they are numbers or truth values if all values are, else texts.
+    """
     types = "list(DISTINCT json_type(value)) FILTER (json_type(value) <> 'NULL')"
+    whole = "bool_and(regexp_full_match(value::VARCHAR, '-?[0-9]+'))"
+    large = f"coalesce(max(abs(TRY_CAST(value::VARCHAR AS DOUBLE))), 0) >= {2**53}"
     rows = connection.execute(
-        f"SELECT attribute, {types} FROM attribute WHERE {whose} GROUP BY ALL ORDER BY ALL"
+        f"SELECT attribute, {types}, {whole}, {large} FROM attribute WHERE {whose}"
+        " GROUP BY attribute, frame_id >> 24 ORDER BY ALL"
     ).fetchall()
-    return {
-        name: Type.boolean
-        if told == ["BOOLEAN"]
-        else Type.number
-        if told and _NUMBERS.issuperset(told)
-        else Type.text
-        for name, told in rows
-    }
+    found: dict[str, list[tuple[Type, bool, bool]]] = {}
+    for name, told, is_whole, is_large in rows:
+        number = bool(told) and _NUMBERS.issuperset(told)
+        kind = Type.boolean if told == ["BOOLEAN"] else Type.number if number else Type.text
+        found.setdefault(name, []).append((kind, is_whole, is_large))
+    return {name: _type_of(traces) for name, traces in found.items()}
+
+
+def _type_of(traces: list[tuple[Type, bool, bool]]) -> Type:
+    """The type of an attribute: of each trace its type, and whether its values are whole, and some large."""
+    kind = own_type([one for one, _, _ in traces])
+    numbers = [flags for one, *flags in traces if one is Type.number]
+    exact = all(whole for whole, _ in numbers) and any(large for _, large in numbers)
+    return Type.whole if kind is Type.number and exact else kind
 
 
 def _counted(connection: DuckDBPyConnection, table: str) -> dict[Triple, int]:
