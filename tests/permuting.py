@@ -9,7 +9,6 @@ from __future__ import annotations
 import random
 from contextlib import closing
 from dataclasses import dataclass, fields
-from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -86,11 +85,18 @@ class Recorded:
                 found[at] = number
         return [self.messages[number] for number in found]
 
-    def write(self, path: Path, draw: random.Random) -> Path:
+    def write(
+        self,
+        path: Path,
+        draw: random.Random,
+        *,
+        size: int | None = None,
+        chunking: bool | None = None,
+    ) -> Path:
         """Write them into a file: in chunks of any size and compression, or without chunks."""
-        size = draw.choice((300, 3000, 100_000, 1 << 20))
+        size = size or draw.choice((300, 3000, 100_000, 1 << 20))
         compression = draw.choice([*CompressionType])
-        chunking = draw.random() < 0.85
+        chunking = draw.random() < 0.85 if chunking is None else chunking
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("wb") as stream:
             writer = Writer(stream, size, compression, use_chunking=chunking)
@@ -118,13 +124,12 @@ class Recorded:
         return path
 
     def bag(self, folder: Path, draw: random.Random) -> Path:
-        """Write them into a bag of three files, each message into any of them that keeps the order."""
+        """Write them into a bag of three files: those of one channel and log time into any of them."""
         parts: list[list[Message]] = [[], [], []]
-        for _, group in groupby(self.messages, key=lambda one: (one.channel_id, one.log_time)):
-            parts[draw.randrange(3)] += group
-        order = {id(one): i for i, one in enumerate(self.messages)}
-        for part in parts:
-            part.sort(key=lambda one: order[id(one)])
+        chosen: dict[tuple[int, int], int] = {}
+        for one in self.messages:
+            instant = one.channel_id, one.log_time
+            parts[chosen.setdefault(instant, draw.randrange(3))].append(one)
         names = [f"{folder.name}_{i}.mcap" for i in range(3)]
         for name, messages in zip(names, parts, strict=True):
             some = Recorded(self.profile, self.schemas, self.channels, messages, self.metadata)
