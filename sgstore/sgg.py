@@ -336,8 +336,8 @@ class SceneGraphGenerator:
         Raises
         ------
         ValueError
-            Two entities of the frame share an id, or one has become of another kind; the frame is as if it
-            had not been given.
+            Two entities of the frame share an id, or what was static moves or the other way round; the frame
+            is as if it had not been given.
 
         Notes
         -----

@@ -568,7 +568,7 @@ def _numbers(objects: Floats, base: Pose | None) -> tuple[Floats, Bools]:
     values[moving, 12] = objects[moving, 10]
     values[:, 9:12] = (turns @ objects[:, 11:14, None])[:, :, 0]
     sizes = objects[:, 14:17]
-    values[:, 13:16] = np.where((sizes > 0) & (sizes < FAR), sizes, np.nan)
+    values[:, 13:16] = np.where((sizes != 0) & np.isfinite(sizes), sizes, np.nan)
     with np.errstate(invalid="ignore"):
         near: Bools = np.abs(values[:, :3]) < FAR
     return values, np.all(near, axis=1, keepdims=True)[:, 0]
