@@ -111,12 +111,19 @@ class RangeSettings:
     height_of_entities: bool = setting(
         default=True, comment="whether height holds for entities, too, or only for parts of the map"
     )
+    world: float = setting(
+        200.0,
+        "how far from the ego's centre entities are known beyond its graph: states and places in lanes, no "
+        "edges; m. 0: the graph alone; inf: all of the recording",
+    )
 
     def __post_init__(self) -> None:
         check(self.shape in SHAPES, "range.shape", self.shape, one_of(SHAPES))
         for name in ("radius", "width", "length"):
             value = getattr(self, name)
             _check_length(value > 0, f"range.{name}", value, "a length above 0, in metres")
+        check(self.world >= 0, "range.world", self.world, "a length of 0 or more, in metres, or inf")
+        object.__setattr__(self, "world", min(self.world, MOST_LENGTH))  # beyond it there is nothing
         for name in ("front", "rear", "side"):
             value = getattr(self, name)
             _check_length(value >= 0, f"range.{name}", value, "a length of 0 or more, in metres")
@@ -131,6 +138,15 @@ class RangeSettings:
         check(band and finite, "range.height", self.height, "nothing, or [lowest, highest]")
         if self.polygon or self.shape == "polygon":
             check_polygon("range.polygon", self.polygon)
+
+    def beyond(self) -> RangeSettings | None:
+        """The range of what is known beyond graphs: a circle; ``None`` where nothing is."""
+        return replace(self, shape="radius", radius=self.world) if self.world else None
+
+    @property
+    def boundless(self) -> bool:
+        """Return whether all of the recording is known."""
+        return self.world >= MOST_LENGTH
 
 
 @dataclass(frozen=True, slots=True)

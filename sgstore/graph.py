@@ -166,6 +166,25 @@ class LaneStates:
 
 
 @dataclass(frozen=True, slots=True)
+class WorldBlock:
+    """What is known beyond the graphs of a block: in range of ``[range] world``, and in no graph of its frame.
+
+    Attributes
+    ----------
+    frames : FrameBlock
+        The frames, with these states only.
+    presence : StaticPresence
+        Static entities, and parts of the map.
+    lanes : LaneStates
+        How entities lie in lanes.
+    """
+
+    frames: FrameBlock
+    presence: StaticPresence
+    lanes: LaneStates
+
+
+@dataclass(frozen=True, slots=True)
 class GraphBlock:
     """Scene graphs of the frames of a block.
 
@@ -184,6 +203,8 @@ class GraphBlock:
     crowded : tuple of (str, int, int)
         Frames, counted in the block, whose pairs are too many (:mod:`sgstore.relations._pairs`): what the pairs
         are, the frame, and how many bodies it has.
+    world : WorldBlock or None
+        What is known beyond the graphs; ``None`` where the settings want nothing of it.
     """
 
     frames: FrameBlock
@@ -192,6 +213,7 @@ class GraphBlock:
     lanes: LaneStates
     gaps: LaneGaps
     crowded: tuple[tuple[str, int, int], ...] = ()
+    world: WorldBlock | None = None
 
     def __len__(self) -> int:
         return len(self.frames)

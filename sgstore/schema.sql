@@ -1,4 +1,4 @@
--- sgstore: what is in a store, version 4.
+-- sgstore: what is in a store, version 5.
 --
 -- Users' SQL sees the VIEWS at the end of this file: frames, nodes, edges, pairs, lanes, entities, payloads.
 -- They are public and keep their columns. The TABLES are in the schema "inside" and may change with the version.
@@ -17,6 +17,9 @@
 -- state of lights, or can answer a relation, that the type does not have, it is added behind the others, in place.
 --
 -- Changes
+--   * Version 5: what is known beyond the graphs, out to [range] world: world_state, world_lane_single, world_lane_repeated, world_node;
+--     known_state, known_lane_state, known_node: both together. The views world_nodes, world_pairs, world_lane_states, world_lane_dists.
+--     entity.world_parked, entity.lifetime.
 --   * Version 4: map_place, map_course. recordings, with a row for each however many egos were seen in it; maps and settings by their digests; gear and hand brake.
 --     Tables are in a schema of their own. Kinds and states of lights are open, as relations are; attributes of a client's own. The kind 'vehicle'. pairs.ttc: first contact; pairs.closing_time: what it was. What stands for ever has velocity 0.
 --     The view criticality. Columns that are always known are NOT NULL; store_info holds a digest of these statements.
@@ -98,6 +101,8 @@ CREATE TABLE context (                                         -- messages that 
 CREATE TABLE entity (                                          -- what does not change about an entity of a trace
   trace_id BIGINT NOT NULL, node_id INTEGER NOT NULL, kind kind NOT NULL, ident VARCHAR, special VARCHAR, subkind VARCHAR, type_name VARCHAR,
   is_static BOOLEAN NOT NULL, map_ref VARCHAR, parked BOOLEAN, -- parked: of vehicles, NULL where it is not known
+  world_parked BOOLEAN,                                        -- the same, as far as what is known beyond the graphs says
+  lifetime SMALLINT,                                           -- 2, 3, …: an id of the simulator that came back as somebody else; NULL: the first
   x FLOAT, y FLOAT, z FLOAT, heading FLOAT, length FLOAT, width FLOAT, height FLOAT);   -- pose of the static ones, else NULL
 
 -- Frames ----------------------------------------------------------------------------------------------------------
@@ -149,6 +154,17 @@ CREATE TABLE gap_single (                                      -- attribute of t
 
 CREATE TABLE gap_repeated (
   bucket BIGINT NOT NULL, mask BIGINT NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL, gap FLOAT);
+
+-- Beyond the graphs: what is in range of [range] world (a circle around the ego), and not in the graph of a frame. Nothing that reads graphs
+-- reads these tables. The views known_… are both together. Each has the columns of a table of graphs (store/_schema.py puts them in).
+
+CREATE TABLE world_state ({{columns of state}});                 -- is_ego: never; ordered by repeated, kind, bucket, node_id, frame_id
+
+CREATE TABLE world_node ({{columns of node}});
+
+CREATE TABLE world_lane_single ({{columns of lane_single}});
+
+CREATE TABLE world_lane_repeated ({{columns of lane_repeated}});
 
 CREATE TABLE frame_class (                                     -- ordered by all columns; made at ingest
   abstraction VARCHAR NOT NULL, class UUID, bucket BIGINT NOT NULL, mask BIGINT NOT NULL); -- class: NULL where too symmetric to be told
@@ -240,6 +256,22 @@ CREATE VIEW inside.lane_gap AS
 SELECT bucket * 64 + bit AS frame_id, bucket, bit, src, dst, gap FROM inside.gap_single
 UNION ALL
 SELECT r.bucket * 64 + b.bit, r.bucket, b.bit, r.src, r.dst, r.gap FROM inside.gap_repeated r JOIN inside.bits b ON (r.mask & b.m) <> 0;
+
+CREATE VIEW inside.known_state AS
+SELECT *, true AS in_graph FROM inside.state UNION ALL SELECT *, false FROM inside.world_state;
+
+CREATE VIEW inside.known_node AS
+SELECT *, true AS in_graph FROM inside.node UNION ALL SELECT *, false FROM inside.world_node;
+
+CREATE VIEW inside.known_lane_state AS
+SELECT *, true AS in_graph FROM inside.lane_state
+UNION ALL
+SELECT kind, bucket * 64 + bit, bucket, bit, node_id, lane, overlap, lane_offset, heading_error, is_primary, along, is_own, is_ego, false
+FROM inside.world_lane_single
+UNION ALL
+SELECT r.kind, r.bucket * 64 + b.bit, r.bucket, b.bit, r.node_id, r.lane, r.overlap, r.lane_offset, r.heading_error, r.is_primary, r.along,
+       r.is_own, r.is_ego, false
+FROM inside.world_lane_repeated r JOIN inside.bits b ON (r.mask & b.m) <> 0;
 
 -- The public views -------------------------------------------------------------------------------------------------
 --
@@ -358,6 +390,27 @@ FROM (
   GROUP BY ALL);
 
 COMMENT ON VIEW main.lane_dists IS 'How far it is along the lanes: one row for each ordered pair of entities, lights and signs aside, that a way of at most 200 m joins (lane changes are none). lane_dist: from centre to centre, positive where one drives from src to dst, negative where one drives from dst to src; the shorter one counts, m.';
+
+-- The same views of what is known beyond the graphs: the statements of nodes, lane_states and lane_dists over the other tables
+-- (store/_schema.py puts them in), and that of pairs over both.
+
+CREATE VIEW main.world_nodes AS
+SELECT *, true AS in_graph FROM main.nodes UNION ALL SELECT *, false FROM ({{world_nodes}});
+
+COMMENT ON VIEW main.world_nodes IS 'The columns of nodes, and of what is known beyond the graphs, too: one row a frame and entity, or part of the road map, within [range] world of the ego. in_graph: whether it is in the graph of the frame, so that nodes has the row, too. Edges and classes are of graphs alone.';
+
+CREATE VIEW main.world_lane_states AS
+SELECT *, true AS in_graph FROM main.lane_states UNION ALL SELECT *, false FROM ({{world_lane_states}});
+
+COMMENT ON VIEW main.world_lane_states IS 'The columns of lane_states, and how entities beyond the graphs lie in lanes, too. in_graph: whether the entity is in the graph of the frame.';
+
+CREATE VIEW main.world_pairs AS {{world_pairs}};
+
+COMMENT ON VIEW main.world_pairs IS 'The columns of pairs, for each ordered pair of entities that move, in the same frame, as world_nodes has them: beyond the graphs, too.';
+
+CREATE VIEW main.world_lane_dists AS {{world_lane_dists}};
+
+COMMENT ON VIEW main.world_lane_dists IS 'The columns of lane_dists, for each ordered pair of entities as world_nodes has them: beyond the graphs, too.';
 
 CREATE VIEW main.classes AS
 SELECT f.frame_id, c.abstraction, replace(c.class::VARCHAR, '-', '') AS class

@@ -488,7 +488,9 @@ class SegmentReader:
                 self._append(generator, block, group, segments)
                 tally.see(block)
                 self._on_block(tally.frames, _reached(block, trace.info.size), trace.info.size)
-            self._seal(trace, group, segments, tally, generator.parked)
+            self._seal(
+                trace, group, segments, tally, (generator.parked, generator.world_parked)
+            )
 
     def _append(
         self,
@@ -518,7 +520,7 @@ class SegmentReader:
         group: list[_EgoView],
         segments: list[Segment],
         tally: TraceTally,
-        parked: Codes,
+        parked: Sequence[Codes],
     ) -> None:
         report, told = trace.report, tally.as_dict()
         moot = report.about_ego if self._job.config.egos else []

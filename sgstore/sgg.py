@@ -8,6 +8,9 @@ an ego. Parts of the map are present as :meth:`sgstore.relations._map_context.La
 static edges among them are the map's own. What the client does not want (:mod:`sgstore.relations._registry`)
 is as if it were not there.
 
+Beyond a graph. What is within ``[range] world`` of the ego and not in its graph is known all the same: states,
+static entities, parts of the map and places in lanes, by the same functions, but no edges.
+
 A relation that cannot be computed, because a heading or a position is missing, is absent; what a trace cannot
 answer at all is said by :attr:`SceneGraphGenerator.answers`.
 """
@@ -24,7 +27,7 @@ from sgstore import compiled
 from sgstore.abstractions import Classes, GraphColumns, MapColumns, abstraction_named, lane_roles
 from sgstore.columns import chained
 from sgstore.errors import ConfigError
-from sgstore.graph import GraphBlock, LaneStates, StaticPresence
+from sgstore.graph import GraphBlock, LaneStates, StaticPresence, WorldBlock
 from sgstore.relations import (
     IS_SIGNAL,
     IS_UPRIGHT,
@@ -117,6 +120,8 @@ class SceneGraphGenerator:
         self._others = not own.issuperset(self._functions)
         self._of_pairs = frozenset(one.name for one in computed if one.of_pairs)
         self._extent = Extent(config.range, road_map)
+        beyond = config.range.beyond()
+        self._outer = None if beyond is None else Extent(beyond, road_map)
         self._keeping = Keeping(config, road_map)
         self._kinds: Codes = np.zeros(0, np.int8)
         self._left_out: Bools = np.zeros(0, np.bool_)
@@ -135,8 +140,13 @@ class SceneGraphGenerator:
 
     @property
     def parked(self) -> Codes:
-        """(n,) int8: of each entity whether it is parked, as all blocks so far tell: 1 or 0; -1: not known."""
+        """(n,) int8: of each entity whether it is parked, as all graphs so far tell: 1 or 0; -1: not known."""
         return self._parking.parked
+
+    @property
+    def world_parked(self) -> Codes:
+        """(n,) int8: the same, as all that is known beyond the graphs tells, too."""
+        return self._parking.world_parked
 
     def pieces(self, frames: FrameBlock, egos: int = 1) -> Iterator[FrameBlock]:
         """The next frames as blocks whose graphs fit into memory, however crowded they are.
@@ -198,38 +208,61 @@ class SceneGraphGenerator:
         frames = replace(frames, entities=renamed(frames.entities, self._config.types))
         frames = self._learn(frames)
         views = [self._view(replace(frames, ego=ego)) for ego in egos]
-        if len(views) == 1:
-            keys = views[0].keys  # ascending
-        else:
-            keys = np.unique(
-                np.concatenate([view.keys for view in views] or [np.zeros(0, np.int64)])
-            )
-        return views, self._world(frames, keys)
+        keys = _united([view.keys for view in views])
+        beyond = [view.beyond.keys for view in views if view.beyond is not None]
+        return views, self._world(frames, keys, _united([keys, *beyond]))
 
     def _view(self, frames: FrameBlock) -> _View:
         ego, states = _ego_rows(frames), len(frames.states)
-        areas = self._extent.areas(_places(frames, ego))
-        frame, row = self._scenery_in_range(areas)
-        reduced, kept, here = self._in_range(frames, ego, areas)
-        still = states + frame * len(self._scenery) + row
-        return _View(reduced, here, areas, np.concatenate([kept, still]))
+        poses = _places(frames, ego)
+        areas = self._extent.areas(poses)
+        still = self._scenery_in_range(areas)
+        held = self._held(frames, areas)
+        named = frames.states.node == np.repeat(frames.ego, np.diff(frames.offsets))
+        kept = np.flatnonzero(held | named)
+        here = np.where(ego < 0, -1, np.searchsorted(kept, ego))
+        # An ego that is named but has no state is no node of its graph.
+        seen = np.zeros(len(frames), np.bool_)
+        seen[frames.frame_of[named]] = True
+        frames = replace(frames, ego=np.where(seen, frames.ego, -1))
+        keys = np.concatenate([kept, states + still])
+        beyond = None
+        if self._outer is not None:
+            beyond = self._beyond(frames, poses, self._outer, keys)
+        return _View(_reduced(frames, kept), here, areas, keys, beyond)
 
-    def _world(self, frames: FrameBlock, keys: Ints) -> _World:
-        bodies = self._bodies(frames, keys)
+    def _beyond(self, frames: FrameBlock, poses: EgoPoses, outer: Extent, keys: Ints) -> _Beyond:
+        """What is known beyond the graph of one ego, of which ``keys`` are."""
+        if self._config.range.boundless:
+            nowhere = np.full(len(frames), np.nan)
+            poses = EgoPoses(nowhere, nowhere, nowhere, nowhere)
+        areas = outer.areas(poses)
+        kept, still = np.flatnonzero(self._held(frames, areas)), self._scenery_in_range(areas)
+        every = np.concatenate([kept, len(frames.states) + still])
+        others = every[~_in_ascending(keys, every)]
+        kept = others[: np.searchsorted(others, len(frames.states))]
+        return _Beyond(_reduced(frames, kept), areas, others)
+
+    def _world(self, frames: FrameBlock, keys: Ints, every: Ints) -> _World:
+        """Part of the world in graphs, which ``keys`` are, and all that is known: ``every``."""
+        bodies = self._bodies(frames, every)
+        rows = every, len(frames.states), len(self._scenery)
+        standing = None if self._survey is None else self._survey.standing(bodies)
+        none = np.zeros(0, np.intp), np.zeros(0, np.intp)
+        nothing = none, np.zeros(len(frames), np.bool_)
+        whole = _World(every, bodies, rows, nothing, nothing, standing)
+        part = whole.of(keys)
+        bodies = part.bodies
         if len(frames) > 1:  # nobody who waits for a frame is to wait for a compiler
             compiled.count(int((np.bincount(bodies.frame) ** 2).sum()))
-        rows = keys, len(frames.states), len(self._scenery)
-        standing = None
-        if self._survey is not None:
-            standing = self._survey.standing(bodies)
-            self._parking.stand(bodies, standing, self._survey.driving)
-        return _World(
-            keys=keys,
-            bodies=bodies,
-            rows=rows,
-            near=self._near(bodies, rows, len(frames)),
+        if self._survey is not None and part.standing is not None and standing is not None:
+            self._parking.stand(bodies, part.standing, self._survey.driving)
+            self._parking.stand(whole.bodies, standing, self._survey.driving, beyond=True)
+        return replace(
+            part,
+            near=self._near(bodies, part.rows, len(frames)),
             contacts=gathered(partial(contacts, bodies), bodies.frame, len(frames)),
-            standing=standing,
+            whole=whole,
         )
 
     def _near(self, bodies: Bodies, rows: tuple[Ints, int, int], frames: int) -> Gathered:
@@ -283,9 +316,30 @@ class SceneGraphGenerator:
             frames=view.frames,
             presence=_presence(bodies, ground and self._keeping.present(ground.present)),
             edges=edges,
-            lanes=self._keeping.lane_states(_lane_states(bodies, ground)),
+            lanes=self._keeping.lane_states(_lane_states(bodies, standing)),
             gaps=self._keeping.gaps(gaps(bodies, ground)),
             crowded=self._crowded(bodies, {NEAR: over_near, TOUCHING: over_touching}),
+            world=self._world_of(view, world.whole, ground),
+        )
+
+    def _world_of(
+        self, view: _View, whole: _World | None, ground: MapContext | None
+    ) -> WorldBlock | None:
+        """What is known beyond the graphs of one ego, whose map is ``ground``."""
+        beyond = view.beyond
+        if beyond is None or whole is None:
+            return None
+        part, present = whole.of(beyond.keys), None
+        every = whole.of(_united([view.keys, beyond.keys]))
+        if self._survey is not None and every.standing is not None and ground is not None:
+            present = self._survey.present(
+                every.bodies, every.standing, beyond.areas, self._keeping.parts
+            )
+            present = self._keeping.present(present) & ~self._keeping.present(ground.present)
+        return WorldBlock(
+            frames=beyond.frames,
+            presence=_presence(part.bodies, present),
+            lanes=self._keeping.lane_states(_lane_states(part.bodies, part.standing)),
         )
 
     def _refuse_undeclared(self, edges: Edges) -> None:
@@ -446,39 +500,24 @@ class SceneGraphGenerator:
         carrier = self._hitches.see(frames, partial(self._bodies, frames))
         return replace(frames, states=replace(frames.states, carrier=carrier))
 
-    def _scenery_in_range(self, areas: Areas) -> tuple[Ints, Rows]:
-        """Frames and rows of the scenery: all of it where there is no ego."""
+    def _scenery_in_range(self, areas: Areas) -> Ints:
+        """What of the scenery is in range, numbered frame by frame: all of it where there is no ego."""
         scenery = self._scenery
         if not len(scenery):
-            return np.zeros(0, np.int64), np.zeros(0, np.intp)
+            return np.zeros(0, np.int64)
         frame, row = areas.near(scenery.x, scenery.y, np.hypot(scenery.length, scenery.width) / 2)
         kind = self._kinds[scenery.node][row]
         boxes, bottom = _boxes(scenery)[row], _bottom(scenery)[row]
         held = areas.hold(frame, boxes, bottom, static=True, hung=IS_SIGNAL[kind])
         held &= self._keeping.entities(kind) & ~self._left_out[scenery.node[row]]
-        return frame[held], row[held]
+        return frame[held] * len(scenery) + row[held]
 
-    def _in_range(
-        self, frames: FrameBlock, ego: Rows, areas: Areas
-    ) -> tuple[FrameBlock, Rows, Rows]:
-        """The frames with only the states in range, the rows of these, and those of the egos among them."""
-        frame, states = frames.frame_of, frames.states
+    def _held(self, frames: FrameBlock, areas: Areas) -> Bools:
+        """Mask of the states that are in range."""
+        states = frames.states
         kind = self._kinds[states.node]
-        held = areas.hold(frame, _boxes(states), _bottom(states), hung=IS_SIGNAL[kind])
-        held &= self._keeping.entities(kind) & ~self._left_out[states.node]
-        named = states.node == np.repeat(frames.ego, np.diff(frames.offsets))
-        kept = np.flatnonzero(held | named)
-        here = np.where(ego < 0, -1, np.searchsorted(kept, ego))
-        # An ego that is named but has no state is no node of its graph.
-        seen = np.zeros(len(frames), np.bool_)
-        seen[frame[named]] = True
-        reduced = replace(
-            frames,
-            offsets=np.searchsorted(kept, frames.offsets),
-            states=states if len(kept) == len(states) else states.take(kept),
-            ego=np.where(seen, frames.ego, -1),
-        )
-        return reduced, kept, here
+        held = areas.hold(frames.frame_of, _boxes(states), _bottom(states), hung=IS_SIGNAL[kind])
+        return held & self._keeping.entities(kind) & ~self._left_out[states.node]
 
     def _bodies(self, frames: FrameBlock, keys: Ints) -> Bodies:
         """The states of a block and the scenery that stands in it, as rows of one table."""
@@ -530,17 +569,32 @@ class _View:
         What its range covers.
     keys : int64
         What is in range, ascending: rows of the block's states, and beyond them the scenery, frame by frame.
+    beyond : _Beyond or None
+        What is known beyond it.
     """
 
     frames: FrameBlock
     ego: Rows
     areas: Areas
     keys: Ints
+    beyond: _Beyond | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Beyond:
+    """What is known beyond the graphs of one ego: ``frames`` with its states, what it is in, and its keys."""
+
+    frames: FrameBlock
+    areas: Areas
+    keys: Ints
 
 
 @dataclass(frozen=True, slots=True)
 class _World:
-    """Part of the world in the range of any ego, and all of it that does not depend on the ego."""
+    """Part of the world in the range of any ego, and all of it that does not depend on the ego.
+
+    ``whole``: the same of what is known beyond the graphs, too, but without its pairs.
+    """
 
     keys: Ints
     bodies: Bodies
@@ -548,6 +602,7 @@ class _World:
     near: Gathered
     contacts: Gathered
     standing: Standing | None
+    whole: _World | None = None
 
     def of(self, keys: Ints) -> _World:
         """The part of it that is in the range of one ego."""
@@ -564,6 +619,30 @@ class _World:
             contacts=(_among(place, self.contacts[0]), self.contacts[1]),
             standing=None if self.standing is None else self.standing.take(place),
         )
+
+
+def _united(keys: Sequence[Ints]) -> Ints:
+    """All keys of several ascending ones, ascending, each once."""
+    if len(keys) == 1:
+        return keys[0]
+    return np.unique(np.concatenate([np.zeros(0, np.int64), *keys]))
+
+
+def _in_ascending(keys: Ints, some: Ints) -> Bools:
+    """Mask of those that are among keys, which ascend."""
+    if not len(keys):
+        return np.zeros(len(some), np.bool_)
+    return keys[np.minimum(np.searchsorted(keys, some), len(keys) - 1)] == some
+
+
+def _reduced(frames: FrameBlock, kept: Rows) -> FrameBlock:
+    """The frames with some of their states only."""
+    states = frames.states
+    return replace(
+        frames,
+        offsets=np.searchsorted(kept, frames.offsets),
+        states=states if len(kept) == len(states) else states.take(kept),
+    )
 
 
 def _among(place: Rows, pairs: tuple[Rows, Rows]) -> tuple[Rows, Rows]:
@@ -610,13 +689,13 @@ def _presence(bodies: Bodies, present: Bools | None) -> StaticPresence:
     )
 
 
-def _lane_states(bodies: Bodies, ground: MapContext | None) -> LaneStates:
-    if ground is None:
+def _lane_states(bodies: Bodies, standing: Standing | None) -> LaneStates:
+    if standing is None:
         none = np.zeros(0, np.int64)
         empty = np.zeros(0)
         false = np.zeros(0, np.bool_)
         return LaneStates(none, none, none, empty, empty, empty, false, empty, false)
-    hits = ground.standing.hits
+    hits = standing.hits
     return LaneStates(
         frame=bodies.frame[hits.row],
         node=bodies.node[hits.row],
@@ -625,6 +704,6 @@ def _lane_states(bodies: Bodies, ground: MapContext | None) -> LaneStates:
         offset=hits.offset,
         heading_error=hits.heading_error,
         primary=hits.primary,
-        along=ground.standing.along,
-        own=ground.standing.own,
+        along=standing.along,
+        own=standing.own,
     )

@@ -478,8 +478,9 @@ class Parking:
         self._vehicle: Bools = np.zeros(0, np.bool_)
         self._static: Bools = np.zeros(0, np.bool_)
         self._moved: Bools = np.zeros(0, np.bool_)
-        self._stood: Bools = np.zeros(0, np.bool_)
-        self._drove: Bools = np.zeros(0, np.bool_)
+        # In graphs, and in all that is known.
+        self._stood: Bools = np.zeros((2, 0), np.bool_)
+        self._drove: Bools = np.zeros((2, 0), np.bool_)
         self._place: Floats = np.zeros((0, 2))
 
     def learn(self, entities: Entities) -> None:
@@ -488,7 +489,10 @@ class Parking:
         self._vehicle = np.append(self._vehicle, IS_VEHICLE[entities.kind])
         self._static = np.append(self._static, entities.static)
         self._moved = np.append(self._moved, no)
-        self._stood, self._drove = np.append(self._stood, no), np.append(self._drove, no)
+        both = np.stack([no, no])
+        self._stood, self._drove = (
+            np.concatenate([known, both], axis=1) for known in (self._stood, self._drove)
+        )
         self._place = np.concatenate([self._place, np.full((len(entities), 2), np.nan)])
 
     def see(self, states: States) -> None:
@@ -502,16 +506,29 @@ class Parking:
         away = np.hypot(*(place - self._place[node]).T) > MOVED
         self._moved[node[away]] = True
 
-    def stand(self, bodies: Bodies, standing: Standing, driving: Bools) -> None:
-        """Take note of what things stand on; ``driving``: which nodes of the map are lanes for driving."""
+    def stand(
+        self, bodies: Bodies, standing: Standing, driving: Bools, *, beyond: bool = False
+    ) -> None:
+        """Take note of what things stand on; ``driving``: which nodes of the map are lanes for driving.
+
+        ``beyond``: they are all that is known, not only those in graphs.
+        """
         hits = standing.hits
         primary = hits.primary & driving[-1 - hits.lane]
-        self._drove[bodies.node[hits.row[primary]]] = True
-        self._stood[bodies.node] = True
+        self._drove[int(beyond), bodies.node[hits.row[primary]]] = True
+        self._stood[int(beyond), bodies.node] = True
 
     @property
     def parked(self) -> Codes:
-        """(n,): 1: parked, 0: not, -1: not known, or no vehicle."""
-        known = self._stood | self._moved | self._static
-        parked = self._static | ~(self._moved | self._drove)
+        """(n,): 1: parked, 0: not, -1: not known, or no vehicle; as graphs tell."""
+        return self._parked(0)
+
+    @property
+    def world_parked(self) -> Codes:
+        """(n,): the same, as all that is known tells."""
+        return self._parked(1)
+
+    def _parked(self, row: int) -> Codes:
+        known = self._stood[row] | self._moved | self._static
+        parked = self._static | ~(self._moved | self._drove[row])
         return np.where(self._vehicle & known, parked, -1).astype(np.int8)

@@ -317,11 +317,25 @@ class LaneContact:
         Returns
         -------
         MapContext
-            A lane or crosswalk that a body is in is present even if it begins just out of range, and so are
-            the road and the junction it belongs to. ``off_road`` is present where a body is in it. A signal or
-            object of the map is not present where an entity of the trace that stands for it is.
         """
-        present = areas.parts(self._map)
+        present = self.present(bodies, standing, areas, kept)
+        return MapContext(
+            standing,
+            present,
+            self._controls,
+            self._affects,
+            self._reach.of_map(present),
+            next_ahead(self._net, bodies, standing, self._ahead),
+        )
+
+    def present(self, bodies: Bodies, standing: Standing, areas: Areas, kept: Bools) -> Bools:
+        """(F, K): which nodes of the map are in which graph; see :meth:`ground`.
+
+        A lane or crosswalk that a body is in is present even if it begins just out of range, and so are the
+        road and the junction it belongs to. ``off_road`` is present where a body is in it. A signal or object
+        of the map is not present where an entity of the trace that stands for it is.
+        """
+        present: Bools = areas.parts(self._map)
         present[:, -1 - OFF_ROAD] = False
         doubled, index = joined(self._twins[0], bodies.node)
         present[bodies.frame[doubled], self._twins[1][index]] = False
@@ -333,15 +347,7 @@ class LaneContact:
             present[frame, column] = True
             column = self._parent[column]
             frame, column = frame[column >= 0], column[column >= 0]
-        present &= kept
-        return MapContext(
-            standing,
-            present,
-            self._controls,
-            self._affects,
-            self._reach.of_map(present),
-            next_ahead(self._net, bodies, standing, self._ahead),
-        )
+        return present & kept
 
 
 def _appended(table: tuple[Ints, Ints], lines: list[tuple[int, int]]) -> tuple[Ints, Ints]:

@@ -17,7 +17,7 @@ import duckdb
 import sgstore.store._schema as shape
 from sgstore.errors import StoreError
 from sgstore.quoting import literal, quoted
-from sgstore.store._columns import MASKS, ORDERS, REPEATED, types_of
+from sgstore.store._columns import MASKS, ORDERS, REPEATED, STATES, types_of
 from sgstore.store._locking import Access, default_memory, spill_folder, translated
 from sgstore.store._packing import BUCKET_BITS, SEQ_BITS
 from sgstore.store._publish import SHARED
@@ -49,7 +49,7 @@ _TRACE_OF: Final = {
 _AS_MADE: Final = frozenset({"store_info", "bits"})
 """Tables that every new store has filled."""
 
-_SORTED: Final = frozenset({"state", *REPEATED, *REPEATED.values(), "frame", *MASKS, "derived_gap"})
+_SORTED: Final = frozenset({*STATES, *REPEATED, *REPEATED.values(), "frame", *MASKS, "derived_gap"})
 """The large tables."""
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.graph import Edges, GraphBlock
+    from sgstore.graph import Edges, GraphBlock, WorldBlock
     from sgstore.world import Bools, Codes, Entities, Ints, MessageRefs, Origin
 
 
@@ -180,7 +180,9 @@ def frame_columns(graph: GraphBlock, trace_id: int) -> Columns:
     }
 
 
-def state_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds, origin: Origin) -> Columns:
+def state_columns(
+    graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds, origin: Origin
+) -> Columns:
     """States in each frame, but for the constants of entities; kinds and states of lights as codes."""
     frames, states = graph.frames, graph.frames.states
     row = frames.frame_of
@@ -205,7 +207,9 @@ def state_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds, origin: Or
     }
 
 
-def node_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds) -> Columns:
+def node_columns(
+    graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds
+) -> Columns:
     """Table ``node``; kinds as codes."""
     seq = graph.frames.seq[graph.presence.frame]
     kind, bucket, node = (
@@ -254,7 +258,9 @@ def _edge_columns(graph: GraphBlock, edges: Edges, trace_id: int, kinds: NodeKin
     }
 
 
-def lane_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds) -> Columns:
+def lane_columns(
+    graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds
+) -> Columns:
     """Places in lanes in each frame; kinds as codes."""
     lanes = graph.lanes
     seq = graph.frames.seq[lanes.frame]

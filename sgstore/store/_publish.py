@@ -19,6 +19,7 @@ from sgstore.store._columns import (
     MASKS,
     ORDERS,
     REPEATED,
+    STATES,
     TEXTS,
     Checksum,
     blank,
@@ -323,7 +324,7 @@ def _delete(connection: DuckDBPyConnection, trace_id: int) -> None:
         )
 
 
-_SCATTERED: Final = ("state", *REPEATED, *REPEATED.values(), "frame", *MASKS, "derived_gap")
+_SCATTERED: Final = (*STATES, *REPEATED, *REPEATED.values(), "frame", *MASKS, "derived_gap")
 """The large tables, sorted over all traces: then a scan for one relation or kind skips all else."""
 
 

@@ -22,6 +22,7 @@ from sgstore.errors import StoreError
 from sgstore.records import dataclass
 from sgstore.store._columns import (
     REPEATED,
+    STATES,
     TEXTS,
     Checksum,
     as_summed,
@@ -278,6 +279,7 @@ MERGE_ROWS: Final = 1 << 19
 
 _GROWING: Final = (
     *("state", "lane_single", "gap_single", "node", "edge", "frame_class", "lane_role"),
+    *("world_state", "world_lane_single", "world_node"),
     *("later_class", "derived_node", "derived_edge", "derived_gap", "message"),
 )
 """The tables that grow with a trace."""
@@ -454,7 +456,7 @@ class Staging:
             single, repeated = parted(self._gathered(table))
             self._put(table, single, texts)
             self._put(REPEATED[table], repeated, texts)
-        elif self._waiting[table] and table == "state":
+        elif self._waiting[table] and table in STATES:
             self._put(table, marked(self._gathered(table)), texts)
         elif self._waiting[table]:
             self._put(table, self._gathered(table), texts)

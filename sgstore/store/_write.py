@@ -217,7 +217,7 @@ class Segment:
         self,
         report: TraceReport,
         more: Mapping[str, Any] | None = None,
-        parked: Codes | None = None,
+        parked: Sequence[Codes] = (),
     ) -> Sealed:
         """Complete the files of the trace, so that any process can publish them; nothing can be added then.
 
@@ -226,8 +226,8 @@ class Segment:
         report : TraceReport
         more : mapping, optional
             What else the report in the store is to say, as plain values.
-        parked : (n,) int8, optional
-            Of each entity whether it is parked: 1 or 0; -1: not known.
+        parked : sequence of (n,) int8
+            Of each entity whether it is parked: 1 or 0; -1: not known; as graphs tell, and as all that is known.
 
         Raises
         ------
@@ -241,8 +241,8 @@ class Segment:
         staging, identity = self._staging, self._identity
         time_ns, log_time_ns = np.concatenate(self._times, axis=1)
         staging.insert("event", self._owned(self._happenings.rest()))
-        if parked is not None:
-            staging.mark("entity", "parked", self._parked(parked))
+        for name, known in zip(("parked", "world_parked"), parked, strict=False):
+            staging.mark("entity", name, self._parked(known))
         for columns in payloads.joined(
             FrameTimes(log_time_ns),
             staging.messages,
@@ -341,11 +341,17 @@ class Segment:
         entities = packing.entity_columns(graph, origin)
         insert("entity", self._owned(entities))
         states = packing.state_columns(graph, trace_id, kinds, origin)
-        insert("state", states | self._constants_of(entities, graph.frames.states.node))
+        known = self._learned(entities)
+        insert("state", states | self._constants_of(known, graph.frames.states.node))
         insert("node", packing.node_columns(graph, trace_id, kinds))
         for columns in packing.edge_columns(graph, trace_id, kinds):
             insert("edge", columns)
         insert("lane_single", packing.lane_columns(graph, trace_id, kinds))
+        if (world := graph.world) is not None:
+            states = packing.state_columns(world, trace_id, kinds, origin)
+            insert("world_state", states | self._constants_of(known, world.frames.states.node))
+            insert("world_node", packing.node_columns(world, trace_id, kinds))
+            insert("world_lane_single", packing.lane_columns(world, trace_id, kinds))
         insert("gap_single", packing.gap_columns(graph, trace_id))
         insert("event", self._owned(self._happenings.of(graph.frames)))
         for table, columns in abstracted.items():
@@ -358,14 +364,15 @@ class Segment:
         for number in np.unique(channel).tolist():
             self._periods.see(number, messages["log_time_ns"][channel == number])
 
-    def _constants_of(self, entities: Columns, node: Ints) -> Columns:
-        """Columns of states that are constants of their entities, where any entity so far has one."""
-        found: Columns = {}
+    def _learned(self, entities: Columns) -> Columns:
+        """Constants of all entities so far, which states repeat, where any of them has one."""
         for name, known in self._constants.items():
             known[:] = [np.concatenate([*known, entities[name]])]
-            if any(known[0]):
-                found[name] = known[0][node]
-        return found
+        return {name: known[0] for name, known in self._constants.items() if any(known[0])}
+
+    @staticmethod
+    def _constants_of(known: Columns, node: Ints) -> Columns:
+        return {name: values[node] for name, values in known.items()}
 
     def _owned(self, columns: Columns) -> Columns:
         """The columns, and whose they are."""
