@@ -175,13 +175,20 @@ class WorldBlock:
         The frames, with these states only.
     presence : StaticPresence
         Static entities, and parts of the map.
+    edges : Edges
+        In which edges ``isIn``, ``controlsTrafficOf``, ``leads`` and ``follows`` all that is known differs from
+        the graphs: it has those that these have not, and not those that they have.
     lanes : LaneStates
         How entities lie in lanes.
+    gaps : LaneGaps
+        Along the lanes, of the edges that it has more.
     """
 
     frames: FrameBlock
     presence: StaticPresence
+    edges: Edges
     lanes: LaneStates
+    gaps: LaneGaps
 
 
 @dataclass(frozen=True, slots=True)

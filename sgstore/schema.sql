@@ -166,6 +166,14 @@ CREATE TABLE world_lane_single ({{columns of lane_single}});
 
 CREATE TABLE world_lane_repeated ({{columns of lane_repeated}});
 
+-- In which edges isIn, controlsTrafficOf, leads and follows all that is known differs from the graphs: it has those that these have not. It has
+-- not those leads and follows that they have, where the next one ahead is out of range.
+CREATE TABLE world_edge ({{columns of edge}});
+
+CREATE TABLE world_gap_single ({{columns of gap_single}});
+
+CREATE TABLE world_gap_repeated ({{columns of gap_repeated}});
+
 CREATE TABLE frame_class (                                     -- ordered by all columns; made at ingest
   abstraction VARCHAR NOT NULL, class UUID, bucket BIGINT NOT NULL, mask BIGINT NOT NULL); -- class: NULL where too symmetric to be told
 
@@ -262,6 +270,23 @@ SELECT *, true AS in_graph FROM inside.state UNION ALL SELECT *, false FROM insi
 
 CREATE VIEW inside.known_node AS
 SELECT *, true AS in_graph FROM inside.node UNION ALL SELECT *, false FROM inside.world_node;
+
+CREATE VIEW inside.known_edge AS
+SELECT * FROM inside.edge WHERE relation <> 'leads' AND relation <> 'follows'
+UNION ALL
+SELECT * FROM inside.world_edge WHERE relation <> 'leads' AND relation <> 'follows'
+UNION ALL
+SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, bit_xor(mask) AS mask
+FROM (SELECT * FROM inside.edge UNION ALL SELECT * FROM inside.world_edge)
+WHERE relation = 'leads' OR relation = 'follows'
+GROUP BY relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst;
+
+CREATE VIEW inside.known_lane_gap AS
+SELECT * FROM inside.lane_gap
+UNION ALL
+SELECT bucket * 64 + bit, bucket, bit, src, dst, gap FROM inside.world_gap_single
+UNION ALL
+SELECT r.bucket * 64 + b.bit, r.bucket, b.bit, r.src, r.dst, r.gap FROM inside.world_gap_repeated r JOIN inside.bits b ON (r.mask & b.m) <> 0;
 
 CREATE VIEW inside.known_lane_state AS
 SELECT *, true AS in_graph FROM inside.lane_state
@@ -407,6 +432,10 @@ COMMENT ON VIEW main.world_lane_states IS 'The columns of lane_states, and how e
 CREATE VIEW main.world_pairs AS {{world_pairs}};
 
 COMMENT ON VIEW main.world_pairs IS 'The columns of pairs, for each ordered pair of entities that move, in the same frame, as world_nodes has them: beyond the graphs, too.';
+
+CREATE VIEW main.world_criticality AS {{world_criticality}};
+
+COMMENT ON VIEW main.world_criticality IS 'The columns of criticality, for each ordered pair of entities that move, in the same frame, as world_nodes has them: beyond the graphs, too.';
 
 CREATE VIEW main.world_lane_dists AS {{world_lane_dists}};
 

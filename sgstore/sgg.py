@@ -25,9 +25,9 @@ import numpy as np
 
 from sgstore import compiled
 from sgstore.abstractions import Classes, GraphColumns, MapColumns, abstraction_named, lane_roles
-from sgstore.columns import chained
+from sgstore.columns import chained, taken
 from sgstore.errors import ConfigError
-from sgstore.graph import GraphBlock, LaneStates, StaticPresence, WorldBlock
+from sgstore.graph import Edges, GraphBlock, LaneStates, StaticPresence, WorldBlock
 from sgstore.relations import (
     IS_SIGNAL,
     IS_UPRIGHT,
@@ -35,6 +35,7 @@ from sgstore.relations import (
     TOUCHING,
     BlockScene,
     Bodies,
+    BodyPairs,
     Crowds,
     EdgeRoom,
     EgoPoses,
@@ -58,7 +59,7 @@ from sgstore.relations import (
     waypoints_of,
 )
 from sgstore.step import Stepper
-from sgstore.vocabulary import OWN_RELATIONS, RELATIONS
+from sgstore.vocabulary import BEYOND, OWN_RELATIONS, RELATION_CODE, RELATIONS
 from sgstore.world import States
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.config import Config
-    from sgstore.graph import Edges, SceneGraph
+    from sgstore.graph import LaneGaps, SceneGraph
     from sgstore.mcap import Loss
     from sgstore.relations import Areas, MapContext, Standing
     from sgstore.roads import RoadMap
@@ -118,6 +119,8 @@ class SceneGraphGenerator:
         self._functions = [*dict.fromkeys(one.edges for one in computed if one.edges is not None)]
         own = {one.edges for one in computed if one.name in OWN_RELATIONS}
         self._others = not own.issuperset(self._functions)
+        beyond = (one.edges for one in computed if one.name in BEYOND and one.edges is not None)
+        self._beyond_functions = [*dict.fromkeys(beyond)]
         self._of_pairs = frozenset(one.name for one in computed if one.of_pairs)
         self._extent = Extent(config.range, road_map)
         beyond = config.range.beyond()
@@ -319,28 +322,52 @@ class SceneGraphGenerator:
             lanes=self._keeping.lane_states(_lane_states(bodies, standing)),
             gaps=self._keeping.gaps(gaps(bodies, ground)),
             crowded=self._crowded(bodies, {NEAR: over_near, TOUCHING: over_touching}),
-            world=self._world_of(view, world.whole, ground),
+            world=self._world_of(view, world.whole, ground, edges),
         )
 
     def _world_of(
-        self, view: _View, whole: _World | None, ground: MapContext | None
+        self, view: _View, whole: _World | None, ground: MapContext | None, edges: Edges
     ) -> WorldBlock | None:
-        """What is known beyond the graphs of one ego, whose map is ``ground``."""
+        """What is known beyond the graphs of one ego, whose map is ``ground``, and whose edges are these."""
         beyond = view.beyond
         if beyond is None or whole is None:
             return None
         part, present = whole.of(beyond.keys), None
-        every = whole.of(_united([view.keys, beyond.keys]))
+        every, around = whole.of(_united([view.keys, beyond.keys])), None
         if self._survey is not None and every.standing is not None and ground is not None:
-            present = self._survey.present(
-                every.bodies, every.standing, beyond.areas, self._keeping.parts
-            )
-            present = self._keeping.present(present) & ~self._keeping.present(ground.present)
+            bodies, kept = every.bodies, self._keeping.parts
+            around = self._survey.ground(bodies, every.standing, beyond.areas, kept)
+            present = self._keeping.present(around.present)
+            present &= ~self._keeping.present(ground.present)
+        others, following = self._beyond_edges(every.bodies, around, edges)
         return WorldBlock(
             frames=beyond.frames,
             presence=_presence(part.bodies, present),
+            edges=others,
             lanes=self._keeping.lane_states(_lane_states(part.bodies, part.standing)),
+            gaps=following,
         )
+
+    def _beyond_edges(
+        self, bodies: Bodies, around: MapContext | None, edges: Edges
+    ) -> tuple[Edges, LaneGaps]:
+        """In which edges all that is known differs from the graph, and the gaps of those that it has more."""
+        if around is None:
+            return Edges.chained([]), gaps(bodies, None)
+        none = np.zeros(0, np.intp)
+        pairs = BodyPairs(bodies, none, none, self._config.proximity.between)
+        scene = BlockScene(self._config, bodies, none, pairs, (none, none), around)
+        known = Edges.chained([function(scene) for function in self._beyond_functions])
+        known, drawn = (
+            _of_codes(one, _BEYOND_CODES) for one in (self._keeping.edges(known), edges)
+        )
+        fresh, gone = _rows_apart(known, drawn)
+        fresh = taken(known, fresh)
+        following = self._keeping.gaps(gaps(bodies, around))
+        follows = _of_codes(fresh, (RELATION_CODE["follows"],))
+        keys = _keys(*((of.frame, of.src, of.dst) for of in (following, follows)))
+        here = np.flatnonzero(np.isin(*keys))
+        return Edges.chained([fresh, taken(drawn, gone)]), taken(following, here)
 
     def _refuse_undeclared(self, edges: Edges) -> None:
         """Refuse edges of another package that no relation asked for declares: no store has room for them."""
@@ -643,6 +670,29 @@ def _reduced(frames: FrameBlock, kept: Rows) -> FrameBlock:
         offsets=np.searchsorted(kept, frames.offsets),
         states=states if len(kept) == len(states) else states.take(kept),
     )
+
+
+_BEYOND_CODES: Final = tuple(RELATION_CODE[name] for name in BEYOND)
+
+
+def _of_codes(edges: Edges, codes: tuple[int, ...]) -> Edges:
+    return taken(edges, np.flatnonzero(np.isin(edges.relation, codes)))
+
+
+def _rows_apart(one: Edges, other: Edges) -> tuple[Rows, Rows]:
+    """Rows of edges of the first that the second has not, and of the second that the first has not."""
+    a, b = _keys(*((of.frame, of.relation, of.src, of.dst) for of in (one, other)))
+    return np.flatnonzero(~np.isin(a, b)), np.flatnonzero(~np.isin(b, a))
+
+
+def _keys(one: tuple[Ints, ...], other: tuple[Ints, ...]) -> tuple[Ints, Ints]:
+    """A number for each row of two tables of the same columns, the same where all of them are."""
+    keys = np.zeros(len(one[0]) + len(other[0]), np.int64)
+    for columns in zip(one, other, strict=True):
+        column = np.concatenate(columns, dtype=np.int64)
+        least = column.min(initial=0)
+        keys = keys * (column.max(initial=0) - least + 1) + (column - least)
+    return keys[: len(one[0])], keys[len(one[0]) :]
 
 
 def _among(place: Rows, pairs: tuple[Rows, Rows]) -> tuple[Rows, Rows]:

@@ -92,6 +92,9 @@ PROXIMITY: Final = _declared_in("_proximity")
 DIRECTIONS: Final = tuple(name for name in _declared_in("_bearing") if name not in SIDES)
 """Sectors of bearing by their usual names, from ahead to behind."""
 
+BEYOND: Final = ("isIn", "controlsTrafficOf", "leads", "follows")
+"""Relations of entities that are known beyond the graphs, too."""
+
 MAP_ONLY: Final = _declared_in("_map")
 """Relations that hold among parts of a map alone: they come with the map and cannot be left out."""
 

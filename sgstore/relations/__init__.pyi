@@ -28,6 +28,7 @@ from ._scene import IS_SIGNAL as IS_SIGNAL
 from ._scene import IS_UPRIGHT as IS_UPRIGHT
 from ._scene import BlockScene as BlockScene
 from ._scene import Bodies as Bodies
+from ._scene import BodyPairs as BodyPairs
 from ._scene import EdgeRoom as EdgeRoom
 from ._scene import MapContext as MapContext
 from ._scene import Relation as Relation
@@ -40,6 +41,7 @@ __all__ = [
     "Areas",
     "BlockScene",
     "Bodies",
+    "BodyPairs",
     "Crowds",
     "EdgeRoom",
     "EgoPoses",

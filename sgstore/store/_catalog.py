@@ -15,7 +15,7 @@ from sgstore.lang import Catalog, RelationScope, TraceFacts, Type, own_type
 from sgstore.quoting import literal
 from sgstore.store._schema import others_of
 from sgstore.store._traces import stored_traces
-from sgstore.vocabulary import NAMES, RELATIONS
+from sgstore.vocabulary import BEYOND, NAMES, RELATIONS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -67,6 +67,7 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
         names={enum: others_of(connection, enum) for enum in NAMES},
         own=_own(connection, "relation IS NULL"),
         own_edges=_own(connection, "relation IS NOT NULL"),
+        **_beyond(connection),
     )
     sets = subset_catalogs()
     derived: dict[str, list[DerivedSet]] = {}
@@ -90,6 +91,24 @@ def _sets(connection: DuckDBPyConnection) -> tuple[DerivedSet, ...]:
     from sgstore.store._derive import sets_of
 
     return sets_of(connection)
+
+
+_KNOWN: Final = ("state", "node", "lane_state", "lane_gap")
+"""Tables of graphs that ``known_…`` has with what is known beyond them."""
+
+
+def _beyond(connection: DuckDBPyConnection) -> dict[str, Any]:
+    """Fields of the catalog about what is known beyond the graphs; none where nothing is."""
+    tables = ("world_state", "world_node", "world_edge")
+    there = " UNION ALL ".join(f"(SELECT 1 FROM {table} LIMIT 1)" for table in tables)
+    if connection.execute(there).fetchone() is None:
+        return {}
+    beyond = {table: f"SELECT * FROM inside.known_{table}" for table in _KNOWN}
+    beyond["entity"] = "SELECT * REPLACE (world_parked AS parked) FROM inside.entity"
+    beyond["graph_node"] = "SELECT * FROM inside.node"
+    beyond["known_edge"] = "SELECT * FROM inside.known_edge"
+    edges = _counted(connection, "world_edge")
+    return {"beyond": tuple(beyond.items()), "beyond_edges": edges}
 
 
 def _own(connection: DuckDBPyConnection, whose: str) -> dict[str, Type]:
@@ -144,6 +163,12 @@ def _narrowed(whole: Catalog, name: str, of: Subset) -> Catalog:
         for table in ("node", "state")
     ]
 
+    beyond = dict(whole.beyond)
+    for table in beyond.keys() & {"state", "node", "graph_node"}:
+        beyond[table] += f" WHERE kind IN ({among})"
+    if beyond:
+        beyond["known_edge"] += f" WHERE relation IN ({_words(of.moving)}) AND {ends}"
+
     def held(edges: dict[Triple, int], relations: frozenset[str]) -> dict[Triple, int]:
         return {
             (r, a, b): n for (r, a, b), n in edges.items() if r in relations and {a, b} <= kinds
@@ -159,6 +184,8 @@ def _narrowed(whole: Catalog, name: str, of: Subset) -> Catalog:
         moving=whole.moving & kinds,
         fixed=whole.fixed & kinds,
         mapped=whole.mapped & kinds,
+        beyond=tuple(beyond.items()),
+        beyond_edges=held(dict(whole.beyond_edges), of.moving),
     )
 
 
@@ -194,6 +221,7 @@ def _derived(
         "name": name,
         "relations": _relations(connection, whole, of),
         "shadows": tuple(shadows.items()),
+        "beyond": tuple(_beyond_derived(dict(whole.beyond), shadows, word).items()),
         "edges": _counted(connection, f"({shadows['edge']})"),
         "traces": tuple(
             replace(trace, answers=answers[trace.trace_id], reach=reaches[trace.trace_id])
@@ -201,6 +229,23 @@ def _derived(
             if trace.trace_id in answers
         ),
     }
+
+
+def _beyond_derived(beyond: dict[str, str], shadows: dict[str, str], word: str) -> dict[str, str]:
+    """Tables in scope ``world`` under a derived set: all that is known, and its edges for those of graphs."""
+    if not beyond:
+        return {}
+    traces = f"(SELECT d.trace_id FROM derived AS d WHERE d.name = {word})"
+    for table, trace in (("state", "frame_id >> 24"), ("node", "bucket >> 18")):
+        beyond[table] += f" WHERE {trace} IN {traces}"
+    beyond["graph_node"] = shadows["node"]
+    columns = "relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst"
+    beyond["known_edge"] = (
+        f"SELECT {columns}, bit_or(mask) AS mask FROM ({shadows['edge']} UNION ALL"
+        f" SELECT {columns}, mask FROM inside.known_edge WHERE bucket >> 18 IN {traces}"
+        f" AND relation IN ({_words(BEYOND)})) GROUP BY {columns}"
+    )
+    return beyond
 
 
 def _relations(

@@ -128,6 +128,8 @@ ORDERS: Final = {
     "world_state": "repeated, kind, frame_id >> 6, node_id, frame_id",
     "world_lane_single": "kind, bucket, node_id, lane, bit",
     "world_lane_repeated": "kind, bucket, node_id, lane, mask",
+    "world_gap_single": "bucket, src, dst, bit",
+    "world_gap_repeated": "bucket, src, dst, mask",
     "gap_single": "bucket, src, dst, bit",
     "gap_repeated": "bucket, src, dst, mask",
     "derived_gap": "set_name, bucket, src, dst, bit",
@@ -139,7 +141,17 @@ ORDERS: Final = {
 """Order of the rows of tables, in a trace and in a store that is written anew; others go by all columns."""
 
 MASKS: Final = (
-    *("node", "world_node", "edge", "frame_class", "lane_role", "later_class", "derived_node", "derived_edge"),
+    *(
+        "node",
+        "world_node",
+        "edge",
+        "world_edge",
+        "frame_class",
+        "lane_role",
+        "later_class",
+        "derived_node",
+        "derived_edge",
+    ),
 )
 """Tables with a mask: rows that differ in nothing else are one."""
 
@@ -150,6 +162,7 @@ STATES: Final = ("state", "world_state")
 REPEATED: Final = {
     "lane_single": "lane_repeated",
     "world_lane_single": "world_lane_repeated",
+    "world_gap_single": "world_gap_repeated",
     "gap_single": "gap_repeated",
 }
 """Tables with a row a frame, and those with a row for several frames of a bucket."""

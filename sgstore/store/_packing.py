@@ -207,9 +207,7 @@ def state_columns(
     }
 
 
-def node_columns(
-    graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds
-) -> Columns:
+def node_columns(graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds) -> Columns:
     """Table ``node``; kinds as codes."""
     seq = graph.frames.seq[graph.presence.frame]
     kind, bucket, node = (
@@ -221,7 +219,9 @@ def node_columns(
     return {"kind": kind[first], "bucket": bucket[first], "node_id": node[first], "mask": mask}
 
 
-def edge_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds) -> Iterator[Columns]:
+def edge_columns(
+    graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds
+) -> Iterator[Columns]:
     """Table ``edge``, in pieces of about :data:`EDGE_ROWS`; relations and kinds as codes."""
     edges = graph.edges
     count = -(-len(edges) // EDGE_ROWS)
@@ -234,7 +234,9 @@ def edge_columns(graph: GraphBlock, trace_id: int, kinds: NodeKinds) -> Iterator
         yield _edge_columns(graph, taken(edges, rows), trace_id, kinds)
 
 
-def _edge_columns(graph: GraphBlock, edges: Edges, trace_id: int, kinds: NodeKinds) -> Columns:
+def _edge_columns(
+    graph: GraphBlock | WorldBlock, edges: Edges, trace_id: int, kinds: NodeKinds
+) -> Columns:
     seq, ego = graph.frames.seq, graph.frames.ego
     # Without an ego it is -1, and so is a node of the map.
     of = np.where(ego < 0, MISSING, ego).astype(edges.src.dtype)[edges.frame]
@@ -258,9 +260,7 @@ def _edge_columns(graph: GraphBlock, edges: Edges, trace_id: int, kinds: NodeKin
     }
 
 
-def lane_columns(
-    graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds
-) -> Columns:
+def lane_columns(graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds) -> Columns:
     """Places in lanes in each frame; kinds as codes."""
     lanes = graph.lanes
     seq = graph.frames.seq[lanes.frame]
@@ -280,7 +280,7 @@ def lane_columns(
     }
 
 
-def gap_columns(graph: GraphBlock, trace_id: int) -> Columns:
+def gap_columns(graph: GraphBlock | WorldBlock, trace_id: int) -> Columns:
     """Gaps along the lanes in each frame."""
     gaps = graph.gaps
     seq = graph.frames.seq[gaps.frame]

@@ -279,7 +279,7 @@ MERGE_ROWS: Final = 1 << 19
 
 _GROWING: Final = (
     *("state", "lane_single", "gap_single", "node", "edge", "frame_class", "lane_role"),
-    *("world_state", "world_lane_single", "world_node"),
+    *("world_state", "world_lane_single", "world_gap_single", "world_node", "world_edge"),
     *("later_class", "derived_node", "derived_edge", "derived_gap", "message"),
 )
 """The tables that grow with a trace."""

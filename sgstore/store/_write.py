@@ -351,7 +351,10 @@ class Segment:
             states = packing.state_columns(world, trace_id, kinds, origin)
             insert("world_state", states | self._constants_of(known, world.frames.states.node))
             insert("world_node", packing.node_columns(world, trace_id, kinds))
+            for columns in packing.edge_columns(world, trace_id, kinds):
+                insert("world_edge", columns)
             insert("world_lane_single", packing.lane_columns(world, trace_id, kinds))
+            insert("world_gap_single", packing.gap_columns(world, trace_id))
         insert("gap_single", packing.gap_columns(graph, trace_id))
         insert("event", self._owned(self._happenings.of(graph.frames)))
         for table, columns in abstracted.items():
