@@ -1,0 +1,291 @@
+"""``USING SCOPE``: what is known of the world beyond the graphs, in patterns, checks and rules."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any, Final
+
+import pytest
+from scenes import Scene, actor, along, crossroads, ego, light, path, store_of, street, through
+from thorough import LONG
+
+from sgstore.config import Config, RangeSettings
+from sgstore.demo import RECORDING
+from sgstore.ingest import ingest
+from sgstore.lang import patterns
+from sgstore.query import Store
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+WAYS: Final = street("driving", "driving")
+"""Two lanes of one direction: y = -1.75 and -5.25."""
+RIGHT, LEFT = -1.75, -5.25
+
+FAST: Final = Scene(
+    WAYS, ego(along(RIGHT), 33), actor("v", along(RIGHT), 33, start=64.5), seconds=4
+)
+BLOCKED: Final = Scene(
+    WAYS, ego(along(RIGHT), 33), actor("v", (64.5, RIGHT), heading=0.0), seconds=0.4
+)
+STANDING: Final = Scene(
+    WAYS,
+    ego(along(RIGHT), [(0, 8), (2, 0), (8, 0)]),
+    actor("v", (70, RIGHT), heading=0.0),
+    actor("w", along(LEFT), 12, start=30),
+)
+SIGNALS: Final = Scene(
+    crossroads("light"),
+    ego(through("s", "n"), 8, start=20),
+    actor("v", through("w", "e"), 8, start=70),
+    actor("w", through("n", "s"), 8, start=90),
+    light("light-s", (5.0, 12.5), (0, "red")),
+    light("light-w", (12.5, 5.0), (0, "green")),
+    seconds=10,
+)
+BENT: Final = Scene(
+    WAYS,
+    ego(along(RIGHT), 12),
+    actor("v", path((0, LEFT), (90, LEFT), (130, RIGHT), (400, RIGHT)), 14, start=40),
+    actor("w", along(RIGHT), 9, start=150),
+    actor("u", along(LEFT), 20),
+    seconds=10,
+)
+SCENES: Final = {
+    "fast": [FAST],
+    "blocked": [BLOCKED],
+    "standing": [STANDING],
+    "signals": [SIGNALS],
+    "bent": [BENT],
+}
+
+
+def ranged(radius: float, world: float) -> Config:
+    return Config(range=RangeSettings(radius=radius, world=world))
+
+
+def stored(path: Path, radius: float, world: float) -> Store:
+    config = ranged(radius, world)
+    return store_of(path, SCENES, dict.fromkeys(SCENES, config))
+
+
+@pytest.fixture(scope="module")
+def near(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """Graphs of 50 m, and the world out to 200 m."""
+    return stored(tmp_path_factory.mktemp("near") / "s.sgstore", 50, 200)
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """Graphs of 50 m, and nothing else."""
+    return stored(tmp_path_factory.mktemp("alone") / "s.sgstore", 50, 0)
+
+
+@pytest.fixture(scope="module")
+def wide(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """Graphs of 200 m."""
+    return stored(tmp_path_factory.mktemp("wide") / "s.sgstore", 200, 0)
+
+
+def verdicts(store: Store, text: str) -> dict[str, Any]:
+    """Verdict, first violation and witnesses of each trace."""
+    found: dict[str, Any] = {}
+    for one in store.check(text):
+        first = one.first_violation
+        witnesses = sorted(
+            (tuple(w.nodes.items()), w.holds, tuple((i.start_seq, i.end_seq) for i in w.violations))
+            for w in one.witnesses
+        )
+        found[one.check, one.trace] = (
+            one.verdict,
+            first and (first.start_seq, first.end_seq),
+            witnesses,
+        )
+    return found
+
+
+def verdict(store: Store, trace: str, text: str) -> str:
+    name = text.partition("CHECK ")[2].partition(":")[0]
+    return verdicts(store, text)[name, trace][0]
+
+
+# Rules about what is beyond the graph --------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "trace"),
+    [
+        ("rss_distance", "fast"),
+        ("rss_distance", "blocked"),
+        ("r_g1_safe_distance", "blocked"),
+    ],
+)
+def test_a_safe_distance_is_violated_60_m_ahead(near: Store, name: str, trace: str) -> None:
+    (found,) = (one for one in near.check(patterns()[name].text) if one.trace == trace)
+    assert found.verdict == "false"
+    assert found.first_violation is not None
+    assert found.first_violation.start_seq == 0
+    graph = patterns()[name].text.replace("CHECK", "USING SCOPE graph CHECK")
+    (found,) = (one for one in near.check(graph) if one.trace == trace)
+    assert found.first_violation is None or found.first_violation.start_seq > 0
+
+
+def test_who_stops_behind_a_car_60_m_ahead_may(near: Store) -> None:
+    text = patterns()["r_i1_stopping"].text
+    assert verdict(near, "standing", text) == "true"
+    graph = text.replace("CHECK", "USING SCOPE graph CHECK")
+    assert verdict(near, "standing", graph) == "false"
+
+
+CHECKS: Final = sorted(one.name for one in patterns().values() if one.is_check)
+
+
+@pytest.mark.parametrize("name", CHECKS)
+def test_rules_say_the_same_of_a_world_and_of_a_graph_as_wide(
+    near: Store, wide: Store, name: str
+) -> None:
+    text = patterns()[name].text
+    assert verdicts(near, text) == verdicts(wide, text)
+
+
+# Patterns ------------------------------------------------------------------------------------------
+
+ASKED: Final = (
+    "(v:Vehicle) WHERE dist(ego, v) > 55",
+    "(e:Ego), (v:Vehicle) WHERE lead(e, v)",
+    "(e:Ego), (v:Vehicle) WHERE same_lane(e, v)",
+    "(v:Vehicle), (w:Vehicle) WHERE lead(v, w) AND gap(v, w) > 10",
+    "(e:Ego), (v:Vehicle) WHERE NOT same_lane(e, v)",
+    "(v:Vehicle), (w:Vehicle) WHERE next_lane(v, w)",
+    "(v:Vehicle) WHERE in_junction(v)",
+    "(v:Vehicle) WHERE red_for(v)",
+    "(v:Vehicle) WHERE off_road(v) OR right_most(v)",
+    "(v:Vehicle) WHERE COUNT {(v)-[:isIn]->(:Lane)<-[:isIn]-(w:Vehicle)} >= 1",
+    "(v:Vehicle) WHERE MAX {(v)-[at:isIn]->(l:Lane) | at.along} > 100",
+    "(v:Vehicle) WHERE EXISTS {(v)-[:isIn*3]->(:Junction)}",
+    "(v:Vehicle) WHERE EXISTS {(v)-[:isIn]->(:Lane)-[:travelsTo*1..3]->(:Lane)}",
+    "(v:Vehicle), (w:Vehicle) WHERE lane_dist(v, w) > 30",
+    "(e:Ego), (v:Vehicle) WHERE ttc(e, v) < 9 OR rss_margin(e, v) < 0",
+    "(v:Vehicle) WHERE to_junction(v) < 60 AND curvature(v) IS KNOWN",
+    "(t:TrafficLight) WHERE t.light_state = 'red'",
+    "(e:Ego), (t:TrafficLight) WHERE lane_dist(e, t) > 0 AND t.light_state IS KNOWN",
+    "(l:Lane) WHERE l.width > 3",
+    "(v:Vehicle) WHERE NOT v.parked",
+    "(e:Ego), (v:Vehicle) WHERE lead(e, v) AND prev(gap(e, v)) > 40",
+)
+SHOWN: Final = {"v": "v.name", "w": "w.name", "t": "t.name", "l": "l.name"}
+
+
+def rows(store: Store, text: str) -> list[tuple[Any, ...]]:
+    return sorted(map(tuple, store.find(text)), key=repr)
+
+
+@pytest.mark.parametrize("asked", ASKED)
+def test_a_pattern_finds_in_the_world_what_it_finds_in_a_graph_as_wide(
+    near: Store, wide: Store, asked: str
+) -> None:
+    bound = re.findall(r"\((\w):", asked.partition(" WHERE ")[0])
+    named = ", ".join(SHOWN[one] for one in bound if one in SHOWN)
+    found = rows(near, f"USING SCOPE world MATCH {asked} RETURN {named}, FRAMES")
+    assert found == rows(wide, f"MATCH {asked} RETURN {named}, FRAMES")
+
+
+def test_patterns_find_something_beyond_graphs(near: Store) -> None:
+    for asked in ASKED[:3]:
+        assert rows(near, f"USING SCOPE world MATCH {asked}") != rows(near, f"MATCH {asked}")
+
+
+@pytest.mark.parametrize("asked", ASKED)
+def test_the_scope_of_a_pattern_is_the_graph(near: Store, alone: Store, asked: str) -> None:
+    text = f"MATCH {asked}"
+    assert rows(near, text) == rows(alone, text) == rows(near, f"USING SCOPE graph {text}")
+
+
+def test_a_pattern_in_the_graph_is_the_same_statement_as_without_a_world(
+    near: Store, alone: Store
+) -> None:
+    for asked in ASKED[:-1]:
+        text = f"MATCH {asked}"
+        emitted = (store.explain(text).partition("---- emit")[2] for store in (near, alone))
+        assert len(set(emitted)) == 1
+    world = f"USING SCOPE world MATCH {ASKED[1]}"
+    assert "known_edge" in near.explain(world)
+    assert "known_" not in alone.explain(world)
+
+
+@pytest.mark.parametrize(
+    "edges",
+    [
+        "(e:Ego)-[:isIn]->(l:Lane)<-[:isIn]-(v:Vehicle)",
+        "(v:Vehicle)-[:isIn]->(l:Lane)",
+        "(l:Lane)-[:toLeftOf|toRightOf]-(m:Lane)",
+        "(v:Vehicle)-[:leads]->(w:Vehicle)",
+        "(v:Vehicle)-[:isIn*1..3]->(x)",
+        "(l:Lane)-[:travelsTo*1..2]->(m:Lane)",
+        "(v:Vehicle)-[:isIn]->(l:Lane)-[:travelsTo]->(m:Lane)",
+    ],
+)
+def test_an_edge_of_a_pattern_is_one_of_the_graph_in_both_scopes(near: Store, edges: str) -> None:
+    text = f"MATCH {edges}"
+    assert rows(near, text)
+    assert rows(near, f"USING SCOPE world {text}") == rows(near, text)
+
+
+def test_who_is_asked_for_by_every_may_be_beyond_the_graph(near: Store) -> None:
+    text = "CHECK c: FORALL (v:Vehicle) ALWAYS NOT dist(ego, v) > 60"
+    assert verdict(near, "fast", text) == "false"
+    assert verdict(near, "fast", f"USING SCOPE graph {text}") == "true"
+
+
+def test_relations_that_end_do_not_hold_beyond_the_graph(near: Store) -> None:
+    text = (
+        "MATCH (e:Ego), (v:Vehicle) WHERE dist(e, v) > 55 AND NOT EXISTS {(v)-[:near|overlaps]-(e)}"
+    )
+    assert rows(near, f"USING SCOPE world {text}")
+
+
+def test_an_abstraction_has_a_world_around_it(near: Store, wide: Store) -> None:
+    asked = "MATCH (e:Ego), (v:Vehicle) WHERE dist(e, v) > 55 RETURN v.name, FRAMES"
+    text = f"USING SCOPE world, ABSTRACTION ER {asked}"
+    found = rows(near, text)
+    assert found
+    assert found == rows(wide, text)
+
+
+# Recordings ----------------------------------------------------------------------------------------
+
+
+def _same_rules(recording: Path, folder: Path, names: list[str]) -> int:
+    """How many verdicts of rules are the same with 50 m and a world of 200 m as with graphs of 200 m."""
+    told: list[Store] = []
+    for radius, world in ((50, 200), (200, 0)):
+        where = folder / f"{recording.stem}-{radius}.sgstore"
+        (found,) = ingest(where, [recording], config=ranged(radius, world))
+        assert found.error is None
+        told.append(Store(where))
+    for name in names:
+        near, wide = (verdicts(store, patterns()[name].text) for store in told)
+        assert near == wide, name
+    return len(names)
+
+
+SEEN: Final = {name for name in CHECKS if "[:sees]" in patterns()[name].query}
+"""Rules about what the ego sees, which is computed within graphs alone."""
+
+
+def test_rules_say_the_same_of_the_bundled_recording(tmp_path: Path) -> None:
+    assert _same_rules(RECORDING, tmp_path, sorted({*CHECKS} - SEEN)) > 40
+
+
+RECORDINGS: Final = (
+    *("sumo/Town10HD_sumo_osi", "esmini/swarm_Town04", "esmini/highway_merge", "esmini/cut-in"),
+    *("esmini/pedestrian", "esmini/traffic_lights", "omega_prime/osi_centerline_example"),
+    *("carla/Town01.carla", "osi_converter/disappearingVehicle"),
+)
+
+
+@pytest.mark.parametrize("name", RECORDINGS if LONG else RECORDINGS[:1])
+def test_rules_say_the_same_of_shared_recordings(data: Path, tmp_path: Path, name: str) -> None:
+    names = sorted({*CHECKS} - SEEN)
+    names = names if LONG else ["yield_821", "turn_lanes_846", "rss_distance", "r_i1_stopping"]
+    assert _same_rules(data / "traces" / f"{name}.mcap", tmp_path, names)
