@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise, starmap
 from operator import eq, itemgetter
@@ -61,12 +61,13 @@ class Edges:
 
     def distinct(self) -> Edges:
         """Each edge once, by frame, and in it in the order of source, relation and destination."""
-        order = np.lexsort((self.dst, self.relation, self.src, self.frame))
-        every = taken(self, order)
-        columns = (every.frame, every.src, every.relation, every.dst)
-        new = np.ones(len(order), np.bool_)
-        new[1:] = np.logical_or.reduce([column[1:] != column[:-1] for column in columns])
+        every, new = _ordered(self)
         return taken(every, new)
+
+    def differing(self, other: Edges) -> Edges:
+        """The edges that only one of both has, in that order."""
+        every, new = _ordered(Edges.chained([self.distinct(), other.distinct()]))
+        return taken(every, new & np.append(new[1:], True)[: len(new)])
 
     @classmethod
     def chained(cls, parts: Sequence[Edges]) -> Edges:
@@ -80,6 +81,16 @@ class Edges:
             for name in ("frame", "src", "dst")
         )
         return cls(frame, np.concatenate([part.relation for part in parts]), src, dst)
+
+
+def _ordered(edges: Edges) -> tuple[Edges, NDArray[np.bool_]]:
+    """All edges in order, and which are not as the one before."""
+    order = np.lexsort((edges.dst, edges.relation, edges.src, edges.frame))
+    every = taken(edges, order)
+    columns = (every.frame, every.src, every.relation, every.dst)
+    new = np.ones(len(order), np.bool_)
+    new[1:] = np.logical_or.reduce([column[1:] != column[:-1] for column in columns])
+    return every, new
 
 
 @dataclass(frozen=True, slots=True)
@@ -494,6 +505,8 @@ class SceneGraph:
     events : mapping of str to sequence of pairs
         What has happened in the frame: kind → to whom, and with whom. Of a kind that is missing the trace does
         not say whether it has.
+    around : callable, optional
+        Gives the same with all that is known beyond it; see :meth:`known`.
     """
 
     frame_id: int
@@ -509,6 +522,14 @@ class SceneGraph:
         compare=False,
         repr=False,
     )
+    around: Callable[[], SceneGraph] | None = field(default=None, compare=False, repr=False)
+
+    def known(self) -> SceneGraph:
+        """All that is known of the world around: this graph, and what lies beyond it, out to ``[range] world``.
+
+        Beyond it there are edges ``isIn``, ``controlsTrafficOf``, ``leads``, ``follows``, and those of the map.
+        """
+        return self if self.around is None else replace(self.around(), events=self.events)
 
     def __repr__(self) -> str:
         size = f"{len(self.nodes)} nodes, {len(self.edges)} edges"

@@ -811,15 +811,17 @@ class Store:
         whole |= {"duration": (trace.end_ns - trace.start_ns) / 1e9}
         classes = partial(self.file.abstracted.class_of, frame.frame_id)
         roles = partial(self.file.abstracted.roles_of, frame.frame_id)
-        graph = self.file.graph(frame.frame_id)
-        constants = self.file.rows(CONSTANTS, [frame.trace_id])
+        drawn = self.file.graph(frame.frame_id)
+        graph = drawn.known() if query.world else drawn
+        parked = "world_parked" if query.world else "parked"
+        constants = self.file.rows(CONSTANTS.format(parked=parked), [frame.trace_id])
         for node, *values in constants.values:
             if node in graph.nodes:
                 graph.nodes[node].update(zip(constants.columns[1:], values, strict=True))
         events = events_in(query, frame.frame_id, lambda sql, at: self.file.rows(sql, at).values)
         later = partial(measured, self.file.rows, frame.trace_id)
-        view = FrameView(graph, about, whole, classes, roles, events, later)
-        return view.in_world() if query.world else view
+        drawn = drawn if query.world else None
+        return FrameView(graph, about, whole, classes, roles, events, later, drawn)
 
 
 def matches_of(

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
+from sgstore.columns import chained
 from sgstore.geometry import wrapped
 from sgstore.graph import (
     Edges,
@@ -57,7 +58,7 @@ from sgstore.world import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-    from sgstore.graph import GraphBlock, LaneGaps, LaneStates, SceneGraph, Whole
+    from sgstore.graph import GraphBlock, LaneGaps, LaneStates, SceneGraph, Whole, WorldBlock
     from sgstore.roads import RoadMap
     from sgstore.vocabulary import TypeMeaning
     from sgstore.world import Codes, Event, Floats, Ints
@@ -521,7 +522,28 @@ class Records:
         known : dict
             Node id of the records → entity, of all that move in the frame.
         """
-        frames, states, edges = graph.frames, graph.frames.states, graph.edges
+        found = self._graph(graph, (graph,), graph.edges, outer, known)
+        if (world := graph.world) is None:
+            return found
+
+        def around() -> SceneGraph:
+            edges = graph.edges.differing(world.edges)
+            return self._graph(graph, (graph, world), edges, outer, known)
+
+        return replace(found, around=cache(around))
+
+    def _graph(
+        self,
+        graph: GraphBlock,
+        parts: Sequence[GraphBlock | WorldBlock],
+        edges: Edges,
+        outer: Ints,
+        known: dict[int, EntityConstants],
+    ) -> SceneGraph:
+        """A graph of what some parts have: the graph, and what is known beyond it."""
+        frames = graph.frames
+        states = chained([part.frames.states for part in parts])
+        presence = chained([part.presence for part in parts])
         ego = int(outer[frames.ego[0]]) if frames.ego[0] >= 0 else None
         node = outer[states.node]
         moving = [
@@ -538,10 +560,13 @@ class Records:
             time_ns=frames.time_ns,
             ego=[ego],
             moving=(np.zeros_like(node), node, moving),
-            presence=StaticPresence(graph.presence.frame, _outward(graph.presence.node, outer)),
+            presence=StaticPresence(presence.frame, _outward(presence.node, outer)),
             standing=self._standing,
             edges=Edges(edges.frame, edges.relation, src, dst),
-            about=edge_attributes(_lanes(graph.lanes, outer), _gaps(graph.gaps, outer)),
+            about=edge_attributes(
+                chain.from_iterable(_lanes(part.lanes, outer) for part in parts),
+                chain.from_iterable(_gaps(part.gaps, outer) for part in parts),
+            ),
             map=self._map,
         )
         return next(columns.graphs())

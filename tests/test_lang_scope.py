@@ -12,8 +12,10 @@ from thorough import LONG
 from sgstore.config import Config, RangeSettings
 from sgstore.demo import RECORDING
 from sgstore.ingest import ingest
-from sgstore.lang import patterns
+from sgstore.lang import Binding, ScopeSearch, compile_query, patterns
 from sgstore.query import Store
+from sgstore.step import replayed
+from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -167,13 +169,13 @@ ASKED: Final = (
     "(v:Vehicle), (w:Vehicle) WHERE lane_dist(v, w) > 30",
     "(e:Ego), (v:Vehicle) WHERE ttc(e, v) < 9 OR rss_margin(e, v) < 0",
     "(v:Vehicle) WHERE to_junction(v) < 60 AND curvature(v) IS KNOWN",
-    "(t:TrafficLight) WHERE t.light_state = 'red'",
-    "(e:Ego), (t:TrafficLight) WHERE lane_dist(e, t) > 0 AND t.light_state IS KNOWN",
+    "(s:TrafficLight) WHERE s.light_state = 'red'",
+    "(e:Ego), (s:TrafficLight) WHERE lane_dist(e, s) > 0 AND s.light_state IS KNOWN",
     "(l:Lane) WHERE l.width > 3",
     "(v:Vehicle) WHERE NOT v.parked",
     "(e:Ego), (v:Vehicle) WHERE lead(e, v) AND prev(gap(e, v)) > 40",
 )
-SHOWN: Final = {"v": "v.name", "w": "w.name", "t": "t.name", "l": "l.name"}
+SHOWN: Final = {"v": "v.name", "w": "w.name", "s": "s.name", "l": "l.name"}
 
 
 def rows(store: Store, text: str) -> list[tuple[Any, ...]]:
@@ -289,3 +291,79 @@ def test_rules_say_the_same_of_shared_recordings(data: Path, tmp_path: Path, nam
     names = sorted({*CHECKS} - SEEN)
     names = names if LONG else ["yield_821", "turn_lanes_846", "rss_distance", "r_i1_stopping"]
     assert _same_rules(data / "traces" / f"{name}.mcap", tmp_path, names)
+
+
+# In memory, and frame by frame -----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def some(near: Store) -> list[int]:
+    return [f for (f,) in near.sql("SELECT frame_id FROM frames WHERE seq % 10 = 0").values]
+
+
+@pytest.mark.parametrize("asked", ASKED[:-1])
+def test_a_search_in_memory_finds_what_the_database_finds(
+    near: Store, some: list[int], asked: str
+) -> None:
+    for scope in ("graph", "world"):
+        matches = near.find(f"USING SCOPE {scope} MATCH {asked}")
+        query = compile_query(f"USING SCOPE {scope} MATCH {asked}", near.catalog()).bound
+        names = [n.key for n in query.scope.nodes.values() if n.role == "named"]
+        places = [0, *(matches.columns.index(name) for name in names)]
+        found = {tuple(row[place] for place in places) for row in matches if row[0] in some}
+        seen = set[tuple[int, ...]]()
+        for frame in some:
+            at = Binding(near._view(near.file.frame(frame), query))
+            for _ in ScopeSearch(query.scope, injective=True).run(at):
+                seen.add((frame, *(at.nodes[name] for name in names)))
+        assert seen == found
+
+
+MONITORED: Final = """
+CHECK far: FORALL (v:Vehicle) ALWAYS NOT dist(ego, v) > 60;
+CHECK lane: FORALL (v:Vehicle) ALWAYS (same_lane(ego, v) IMPLIES dist(ego, v) < 80);
+CHECK led: FORALL (v:Vehicle) ALWAYS NOT lead(ego, v);
+CHECK leads: FORALL (v:Vehicle, w:Vehicle) ALWAYS (lead(v, w) IMPLIES gap(v, w) < 30);
+CHECK red: FORALL (v:Vehicle) ALWAYS NOT red_for(v);
+CHECK counted: ALWAYS COUNT {(v:Vehicle) WHERE moving(v)} < 3;
+CHECK ways: FORALL (v:Vehicle) ALWAYS NOT lane_dist(ego, v) > 70;
+USING SCOPE graph CHECK graph: FORALL (v:Vehicle) ALWAYS NOT lead(ego, v)
+"""
+
+
+@pytest.mark.parametrize("trace", sorted(SCENES))
+def test_a_monitor_says_of_the_world_what_a_store_says(near: Store, trace: str) -> None:
+    (scene,) = SCENES[trace]
+    text = ";".join([MONITORED, *(patterns()[name].text for name in CHECKS)])
+    monitor = Monitor(text, scene.road, ranged(50, 200), trace=trace, period_s=1 / scene.rate)
+    for frame in replayed([scene.block()]):
+        monitor.step(frame)
+    told = {one.check: one for one in monitor.finish()}
+    for (name, where), (verdict_, first, _) in verdicts(near, text).items():
+        if where == trace:
+            assert told[name].verdict == verdict_, name
+            found = told[name].first_violation
+            assert (found and (found.start_seq, found.end_seq)) == first, name
+
+
+def test_a_frame_has_a_world_around_its_graph(
+    near: Store, alone: Store, wide: Store, some: list[int]
+) -> None:
+    for frame in some:
+        graph = near.file.graph(frame)
+        assert graph == alone.file.graph(frame)
+        known, far = graph.known(), wide.file.graph(frame)
+        assert graph.nodes.keys() < known.nodes.keys()
+        others = {n for n in known.nodes.keys() ^ far.nodes.keys() if n >= 0}
+        assert not others
+        for name in ("isIn", "leads", "follows", "controlsTrafficOf"):
+            ours, theirs = (
+                {
+                    (a, b, tuple(sorted(about.items())))
+                    for a, r, b, about in of.edges
+                    if r == name and a >= 0
+                }
+                for of in (known, far)
+            )
+            assert ours == theirs, name
+        assert alone.file.graph(frame).known().nodes.keys() == alone.file.graph(frame).nodes.keys()

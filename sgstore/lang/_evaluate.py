@@ -84,7 +84,7 @@ class FrameView:
 
     def in_world(self) -> FrameView:
         """Return the same frame in scope ``world``: with all that is known beyond its graph."""
-        known = getattr(self.graph, "known", lambda: self.graph)()
+        known = self.graph.known()
         if known is self.graph:
             return self
         return replace(self, graph=known, drawn=self.graph)

@@ -6,6 +6,7 @@ What only writing or drawing needs is imported where it is used: a question is s
 from __future__ import annotations
 
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -449,7 +450,13 @@ class StoreFile:
         """
         with self.access.reading() as connection:
             frame = frame_named(connection, ref)
-            return next(self._reader.scenes(connection, np.array([frame.frame_id])))
+            found = next(self._reader.scenes(connection, np.array([frame.frame_id])))
+        return replace(found, around=partial(self._known_graph, frame.frame_id))
+
+    def _known_graph(self, frame_id: int) -> SceneGraph:
+        """The graph of a frame with all that is known beyond it."""
+        with self.access.reading() as connection:
+            return next(self._reader.scenes(connection, np.array([frame_id]), known=True))
 
     def graphs(self, frame_id: NDArray[np.int64]) -> Iterator[SceneGraph]:
         """Scene graphs of some frames of one trace, whose ids ascend; their columns are in memory together."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import OrderedDict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -229,18 +230,20 @@ class Graphs:
         return _remembered(self._columns, digest, lambda: _map_columns(connection, map_id))
 
     def scenes(
-        self, connection: DuckDBPyConnection, frame_id: NDArray[np.int64]
+        self, connection: DuckDBPyConnection, frame_id: NDArray[np.int64], *, known: bool = False
     ) -> Iterator[SceneGraph]:
         """Scene graphs of some frames of one trace, whose ids ascend: all that the views show of them.
 
-        Their columns are in memory together, and the records of one graph.
+        Their columns are in memory together, and the records of one graph. ``known``: with all that is known
+        beyond them.
         """
+        of = _of_known if known else str
         by_frame, by_mask = _asked(frame_id)
         frames = connection.execute(_SCENES, by_frame).fetchall()
         _, seq, time_ns, ego, names, map_ids, digests = zip(*frames, strict=True)
-        moving = list(_records(connection, _NODES, by_frame))
+        moving = list(_records(connection, of(_NODES), by_frame))
         standing, edges = (
-            _each_frame(connection.execute(sql, by_mask).fetchnumpy())
+            _each_frame(connection.execute(of(sql), by_mask).fetchnumpy())
             for sql in (_STANDING, _EDGES)
         )
         here = standing["node_id"].astype(np.int64)
@@ -252,7 +255,7 @@ class Graphs:
         lanes, gaps = (
             (
                 (int(np.searchsorted(frame_id, frame)), src, dst, about)
-                for (frame, src, dst), about in _records(connection, sql, by_frame)
+                for (frame, src, dst), about in _records(connection, of(sql), by_frame)
             )
             for sql in (_LANES, _GAPS)
         )
@@ -284,6 +287,15 @@ class Graphs:
             for node, name, value in own.get(graph.frame_id, ()):
                 graph.nodes[node] = {name: value, **graph.nodes[node]}
             yield graph
+
+
+def _of_known(sql: str) -> str:
+    """A statement on tables of graphs, asked of those with what is known beyond them, too."""
+    sql = sql.replace("SELECT n.* FROM nodes n", "SELECT n.* EXCLUDE (in_graph) FROM world_nodes n")
+    return _OF_GRAPHS.sub(r"FROM known_\1", sql)
+
+
+_OF_GRAPHS: Final = re.compile(r"\bFROM (node|edge|lane_state|lane_gap)\b")
 
 
 def _remembered(maps: OrderedDict[str, T], digest: str, read: Callable[[], T]) -> T:
