@@ -111,6 +111,13 @@ def verdict(store: Store, trace: str, text: str) -> str:
     return verdicts(store, text)[name, trace][0]
 
 
+def in_graphs(rule: str) -> str:
+    """A rule about graphs alone."""
+    if rule.startswith("USING "):
+        return rule.replace("USING ", "USING SCOPE graph, ", 1)
+    return f"USING SCOPE graph {rule}"
+
+
 # Rules about what is beyond the graph --------------------------------------------------------------
 
 
@@ -127,7 +134,7 @@ def test_a_safe_distance_is_violated_60_m_ahead(near: Store, name: str, trace: s
     assert found.verdict == "false"
     assert found.first_violation is not None
     assert found.first_violation.start_seq == 0
-    graph = patterns()[name].text.replace("CHECK", "USING SCOPE graph CHECK")
+    graph = in_graphs(patterns()[name].text)
     (found,) = (one for one in near.check(graph) if one.trace == trace)
     assert found.first_violation is None or found.first_violation.start_seq > 0
 
@@ -135,7 +142,7 @@ def test_a_safe_distance_is_violated_60_m_ahead(near: Store, name: str, trace: s
 def test_who_stops_behind_a_car_60_m_ahead_may(near: Store) -> None:
     text = patterns()["r_i1_stopping"].text
     assert verdict(near, "standing", text) == "true"
-    graph = text.replace("CHECK", "USING SCOPE graph CHECK")
+    graph = in_graphs(text)
     assert verdict(near, "standing", graph) == "false"
 
 
