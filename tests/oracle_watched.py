@@ -125,7 +125,7 @@ class Drive:
             generator = SceneGraphGenerator(source.road_map, Config())
             graphs = [generator.step(frame) for frame in source.frames]
         stored = dict(store.sql("SELECT node_id, ident FROM entities").values)
-        nodes = (node for graph in graphs for node in graph.nodes.items())
+        nodes = (node for graph in graphs for node in graph.known().nodes.items())
         online = {node: about["ident"] for node, about in nodes if "ident" in about}
         return cls(store, name, source.road_map, graphs, stored, online)
 
