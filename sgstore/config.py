@@ -122,8 +122,12 @@ class RangeSettings:
         for name in ("radius", "width", "length"):
             value = getattr(self, name)
             _check_length(value > 0, f"range.{name}", value, "a length above 0, in metres")
-        check(self.world >= 0, "range.world", self.world, "a length of 0 or more, in metres, or inf")
-        object.__setattr__(self, "world", min(self.world, MOST_LENGTH))  # beyond it there is nothing
+        check(
+            self.world >= 0, "range.world", self.world, "a length of 0 or more, in metres, or inf"
+        )
+        object.__setattr__(
+            self, "world", min(self.world, MOST_LENGTH)
+        )  # beyond it there is nothing
         for name in ("front", "rear", "side"):
             value = getattr(self, name)
             _check_length(value >= 0, f"range.{name}", value, "a length of 0 or more, in metres")

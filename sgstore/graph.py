@@ -178,7 +178,7 @@ class LaneStates:
 
 @dataclass(frozen=True, slots=True)
 class WorldBlock:
-    """What is known beyond the graphs of a block: in range of ``[range] world``, and in no graph of its frame.
+    """What is known beyond the graphs of a block, out to ``[range] world``: what is in no graph of its frame.
 
     Attributes
     ----------
@@ -187,8 +187,8 @@ class WorldBlock:
     presence : StaticPresence
         Static entities, and parts of the map.
     edges : Edges
-        In which edges ``isIn``, ``controlsTrafficOf``, ``leads`` and ``follows`` all that is known differs from
-        the graphs: it has those that these have not, and not those that they have.
+        In which edges ``isIn``, ``controlsTrafficOf``, ``leads`` and ``follows`` all that is known differs
+        from the graphs: it has those that these have not, and not those that they have.
     lanes : LaneStates
         How entities lie in lanes.
     gaps : LaneGaps

@@ -488,9 +488,7 @@ class SegmentReader:
                 self._append(generator, block, group, segments)
                 tally.see(block)
                 self._on_block(tally.frames, _reached(block, trace.info.size), trace.info.size)
-            self._seal(
-                trace, group, segments, tally, (generator.parked, generator.world_parked)
-            )
+            self._seal(trace, group, segments, tally, (generator.parked, generator.world_parked))
 
     def _append(
         self,

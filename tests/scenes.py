@@ -485,6 +485,4 @@ def _sealed(
         block = scene.block(place, first, seq)
         segment.append(generator.block(block))
         first, seq = first + len(scene.actors), seq + len(block)
-    return segment.seal(
-        TraceReport(frames=seq), None, (generator.parked, generator.world_parked)
-    )
+    return segment.seal(TraceReport(frames=seq), None, (generator.parked, generator.world_parked))
