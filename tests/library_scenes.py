@@ -622,7 +622,7 @@ AT_ONCE = Scene(
     seconds=11,
     drawn=(1.0, 4.0),
 )
-WAITING = [(0, 4), (1.6, 4), (2.4, 0), (10.5, 0), (11, 1)]
+WAITING = [(0, 4), (2, 4), (2.8, 0), (10.5, 0), (11, 1)]
 SIREN = Scene(
     WAYS,
     ego(along(RIGHT), 8, start=40),
@@ -646,7 +646,7 @@ SCENES |= {
         FIRST_COME,
         FIRST_COME.with_actor("v", speed=[(0, 4), (4.1, 4), (4.9, 0), (10.5, 0), (11, 1)]),
     ),
-    "yield_right_820": (AT_ONCE, AT_ONCE.with_actor("ego", speed=WAITING, start=119.0)),
+    "yield_right_820": (AT_ONCE, AT_ONCE.with_actor("ego", speed=WAITING)),
     "yield_emergency_829": (SIREN, SIREN.with_actor("ego", route=aside(45, RIGHT, LEFT, 15))),
     "turn_lanes_846": (
         Scene(WIDE, ego(through("s", "e", 2, out=1), 6, start=115), seconds=8, drawn=(0.0, 6.0)),
