@@ -184,7 +184,7 @@ def block_rows(path: Path, **how: Any) -> list[tuple[str, Any]]:
                         found.append((field.name, (value.dtype.str, value.tobytes())))
                     elif isinstance(value, tuple | str | int):
                         found.append((field.name, value))
-            found.append(("messages", list(zip(*_refs(block.messages), strict=True))))
+            found.append(("messages", sorted(zip(*_refs(block.messages), strict=True))))
         losses = sorted((loss.reason, loss.messages) for loss in trace.report.losses)
         found += [("losses", losses), ("frames", trace.report.frames)]
     return found

@@ -108,7 +108,8 @@ class ChannelRanks:
     Attributes
     ----------
     rank : callable
-        Rank of a channel by its id: the least comes first.
+        Rank of a channel by its id: the least comes first. Below 0: what is read does not depend on its place
+        among other channels at one time, so that such a file counts as in order.
     schemas, channels : mapping
         Records by their id; both may grow.
     """
@@ -118,14 +119,24 @@ class ChannelRanks:
     channels: Mapping[int, Channel]
     _known: int = -1
     _numbers: Ints = field(default_factory=lambda: np.zeros(IDS, np.int64))
+    _loose: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(IDS, np.bool_))
 
     def of(self, channel: NDArray[Any]) -> Ints:
         """Number of each channel in that order."""
+        self._learn()
+        return self._numbers[channel]
+
+    def is_loose(self, channel: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return for each channel whether its place at one time does not matter."""
+        self._learn()
+        return self._loose[channel]
+
+    def _learn(self) -> None:
         if self._known != len(self.channels):
             self._known = len(self.channels)
             for number, one in enumerate(sorted(self.channels, key=self._key)):
                 self._numbers[one] = number
-        return self._numbers[channel]
+                self._loose[one] = self.rank(one) < 0
 
     def _key(self, number: int) -> tuple[Any, ...]:
         record = self.channels[number]
@@ -172,19 +183,23 @@ class OrderCheck:
             return False
         publish = np.concatenate([self._publish, run.publish_time_ns])
         channel = np.concatenate([self._channel, run.channel])
-        tied = steps == 0
-        if tied.any():
+        if not steps.all():
             publish = published(log, publish, channel)
-            number = self._ranks.of(channel)
-            before = publish[1:] < publish[:-1]
-            before |= (publish[1:] == publish[:-1]) & (number[1:] < number[:-1])
-            if (tied & before).any():
+            if not self._is_in_order(log, publish, channel):
                 return False
         last = np.flatnonzero(log == log[-1])
         _, at = np.unique(channel[last][::-1], return_index=True)
         keep = np.sort(last[::-1][at])
         self._log, self._publish, self._channel = log[keep], publish[keep], channel[keep]
         return True
+
+    def _is_in_order(self, log: Ints, publish: Times, channel: Ints) -> bool:
+        """Return whether messages of one log time, one behind the other, are in order."""
+        bound = ~self._ranks.is_loose(channel)
+        log, publish, number = log[bound], publish[bound], self._ranks.of(channel[bound])
+        before = publish[1:] < publish[:-1]
+        before |= (publish[1:] == publish[:-1]) & (number[1:] < number[:-1])
+        return not ((log[1:] == log[:-1]) & before).any()
 
 
 @dataclass(slots=True)

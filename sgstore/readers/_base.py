@@ -450,9 +450,9 @@ class MessageTrace:
                 frame = decoder.decode(run, row)
                 if frame is not None:
                     times.append(frame.time_ns)
-            if len(times) > FIRST_STEPS:
-                break
-        return np.diff(times[: FIRST_STEPS + 1]).tolist()
+                if len(times) > FIRST_STEPS:
+                    return np.diff(times).tolist()
+        return np.diff(times).tolist()
 
 
 AnySurvey = TypeVar("AnySurvey", bound=Survey[Any])
@@ -502,6 +502,10 @@ class SurveyedTrace(MessageTrace, Generic[AnySurvey]):
             lost_lanes=tuple(dict.fromkeys(survey.lost_lanes)),
             **more,
         )
+
+    def _first_steps(self) -> list[int]:
+        stamps = self._survey.leads[self._survey.leading].stamps
+        return stamps.steps[:FIRST_STEPS] or super()._first_steps()
 
     def ego_named(self, name: str) -> str | None:
         """The id of the ego that a name means, by what the first reading found."""

@@ -499,7 +499,8 @@ def assemble(
     Yields
     ------
     FrameBlock
-        Its messages are those that stand in the file from its first frame up to the next block's.
+        Its messages are those from its first frame up to the next block's; what was logged with a frame comes
+        with it.
     """
     wanted = np.zeros(IDS, np.bool_)
     wanted[[*decoder.channels]] = True
@@ -527,7 +528,8 @@ def assemble(
             if len(done) + len(raw) == window:
                 between.add(refs(run.span(start, row)))
                 start, known = row, entered
-                block_refs, open_refs = open_refs + between.take(), []
+                before, same = between.split(int(run.log_time_ns[row]))
+                block_refs, open_refs = open_refs + before, same
             raw.append(frame)
             sizes.append(decoder.roster.size)
             open_refs += between.take()
@@ -571,6 +573,14 @@ class _Between:
             # As copies, so that the whole is not kept alive by a part of it.
             self._parts = [taken(whole, near), taken(whole, near + len(whole) - NEAR_REFS)]
             self._total = 2 * NEAR_REFS
+
+    def split(self, log_time_ns: int) -> tuple[list[MessageRefs], list[MessageRefs]]:
+        """All of them: those of other log times, and those of this one; then there are none."""
+        if not self._total:
+            return self.take(), []
+        whole = chained(self.take())
+        same = whole.log_time_ns == log_time_ns
+        return [taken(whole, np.flatnonzero(~same))], [taken(whole, np.flatnonzero(same))]
 
     def take(self) -> list[MessageRefs]:
         """All of them, in order; then there are none."""

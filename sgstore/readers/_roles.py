@@ -15,14 +15,16 @@ if TYPE_CHECKING:
 
     from sgstore.mcap import Recording
 
-MAP, STATIC, TRANSFORMS, LIGHTS, STATES, EGO, CONTROLS, PAYLOAD = range(8)
+LOOSE, MAP, STATIC, TRANSFORMS, LIGHTS, STATES, EGO, CONTROLS = range(-1, 7)
+"""Ranks of channels. ``LOOSE``: the place among other channels does not matter: of payloads, which frames find
+by time, and of road maps, which are read before all frames."""
 
 _SCHEMAS: Final = {
-    "osi3.MapAsamOpenDrive": MAP,
+    "osi3.MapAsamOpenDrive": LOOSE,
     "osi3.GroundTruth": STATES,
     "osi3.SensorView": STATES,
     "osi3.HostVehicleData": CONTROLS,
-    "carla_msgs/CarlaWorldInfo": MAP,
+    "carla_msgs/CarlaWorldInfo": LOOSE,
     "std_msgs/String": MAP,
     "carla_msgs/CarlaActorList": STATIC,
     "carla_msgs/CarlaTrafficLightInfoList": STATIC,
@@ -74,6 +76,6 @@ def channel_rank(
     def rank(channel: int) -> int:
         schema = recording.schemas.get(recording.channels[channel].schema_id)
         named = _SCHEMAS.get(short_name(schema.name)) if schema is not None else None
-        return _ROLES.get(known.get(channel, ""), PAYLOAD) if named is None else named
+        return _ROLES.get(known.get(channel, ""), LOOSE) if named is None else named
 
     return rank

@@ -554,6 +554,17 @@ class ColumnReader:
         self._align = self._element.align
         self._layouts: dict[tuple[str, int], list[_StructLayout]] = {}
 
+    def head(self, data: Data) -> dict[str, Any]:
+        """The fields before the sequence.
+
+        Raises
+        ------
+        TraceError
+            As :func:`decode`.
+        """
+        reader = _MessageReader.of(data)
+        return {name: reader.value(kind) for name, kind in self._head}
+
     def read(self, data: Data) -> tuple[dict[str, Any], Floats]:
         """The fields before the sequence, and the numbers.
 

@@ -56,17 +56,19 @@ class Stamps:
         Whether the file has log times of its own. Without them a missing stamp is a loss.
     first : tuple of int or None
         Log time and stamp of the first message with a stamp that is not 0.
+    steps : list of int
+        The first times between two stamps; ns.
     """
 
     explicit: bool = True
     logged: bool = True
     first: Known | None = None
+    steps: list[int] = field(default_factory=list[int])
     _number: int = -1
     _zero: Known | None = None
     _last: Known | None = None
     _runs: list[_Unstamped] = field(default_factory=list[_Unstamped])
     _open: _Unstamped | None = None
-    _steps: list[int] = field(default_factory=list[int])
     _more: bool = False
 
     def next(self) -> None:
@@ -79,8 +81,8 @@ class Stamps:
             self._zero = self._zero or (log_time_ns, 0)
         if stamp_ns:
             known = log_time_ns, stamp_ns
-            if self._last is not None and stamp_ns > self._last[1] and len(self._steps) < _STEPS:
-                self._steps.append(stamp_ns - self._last[1])
+            if self._last is not None and stamp_ns > self._last[1] and len(self.steps) < _STEPS:
+                self.steps.append(stamp_ns - self._last[1])
             if self._open is not None:
                 self._open.behind, self._open = known, None
             self.first = self.first or known
@@ -93,7 +95,7 @@ class Stamps:
 
     def is_near(self, known: Known | None) -> bool:
         """Return whether a stamp is near 0."""
-        steps = sorted(self._steps)
+        steps = sorted(self.steps)
         period = steps[len(steps) // 2] if steps else 0
         return known is not None and abs(known[1]) <= max(NEAR, 3 * period)
 

@@ -260,8 +260,6 @@ OF_ONE_VEHICLE: Final = frozenset({STATUS, COMMANDS, VEHICLE, ODOMETRY, COLLISIO
 
 NEVER: Final = -(1 << 62)
 """Time of what was not told yet; ns."""
-STAMP: Final = ("header.stamp.sec", "header.stamp.nanosec")
-"""The numbers of a message's time."""
 _MAX_SECONDS: Final = 1 << 32
 
 
@@ -387,7 +385,6 @@ class CarlaSurvey(Survey[Lead]):
         self.ego: int | None = None
         self.lights: dict[int, Light] = {}
         self._tables: dict[int, ColumnReader] = {}
-        self._stamps: dict[int, ColumnReader] = {}
         # Places of the vehicles with a role, to find them among objects that no list of actors names: their
         # odometry by role; stamp, ids and places of the objects of the last frame.
         self._odometry: dict[str, tuple[int | None, Floats]] = {}
@@ -476,7 +473,6 @@ class CarlaSurvey(Survey[Lead]):
         self.structures[channel] = found
         if content == OBJECTS:
             self._tables[channel] = ColumnReader(found, _PLACES, "objects")
-            self._stamps[channel] = ColumnReader(found, STAMP)
             self.leads[channel] = Lead(stamps=Stamps(explicit=False))
 
     # One message -----------------------------------------------------------------------------------
@@ -490,8 +486,8 @@ class CarlaSurvey(Survey[Lead]):
             self.count(run, row, int(run.length[row]))
             self.leads[channel].stamps.next()
             with suppress(TraceError):  # reported when frames are read
-                told = self._stamps[channel].read(run.data(row))[1][0]
-                self.see_stamp(run, row, stamp_from(told))
+                head = self._tables[channel].head(run.data(row))
+                self.see_stamp(run, row, stamp_of(head))
                 self._look_for_egos(run.data(row), channel)
             return
         try:

@@ -44,7 +44,6 @@ from sgstore.readers.carla._survey import (
     OBJECTS,
     ODOMETRY,
     SAME_TICK,
-    STAMP,
     STATUS,
     VEHICLE_LIGHTS,
     CarlaSurvey,
@@ -78,6 +77,7 @@ COLUMNS: Final = (
     *(f"shape.dimensions[{i}]" for i in range(3)),
 )
 """Numbers that are read of every ``derived_object_msgs/Object``."""
+STAMP: Final = ("header.stamp.sec", "header.stamp.nanosec")
 CONTROLS: Final = (
     *("steer", "throttle", "brake", "gear", "hand_brake", "reverse", "manual_gear_shift"),
 )

@@ -154,7 +154,7 @@ class FoxgloveSurvey(Survey[Lead]):
 
     def keeps(self, channel: int) -> bool:
         """Return whether the frames need the messages of a channel."""
-        return channel in self.readers
+        return bool(encoding_of(self.recording, channel))
 
     def meet(self, channel: int) -> bool:
         """Return whether the messages of a channel are read; make ready for one that is met first."""

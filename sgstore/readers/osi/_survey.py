@@ -406,7 +406,7 @@ class OsiSurvey(Survey[OsiLead]):
 
     def keeps(self, channel: int) -> bool:
         """Return whether the frames need the messages of a channel."""
-        return channel in self.leads or channel in self.hosts
+        return schema_name(self.recording, channel) in {GROUND_TRUTH, SENSOR_VIEW, HOST_DATA}
 
     def meet(self, channel: int) -> bool:
         """Return whether a channel may lead or carries maps; make ready for one that is met first."""

@@ -370,8 +370,12 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
         if self._controls is NO_INPUTS and not self._has_controls:
             return
         data = getattr(message, "host_vehicle_data", None)
-        frame.own = _first_told(frame.own, controls_of(data))
-        frame.controls = _first_told(frame.own, frame.controls, self._controls)
+        own = controls_of(data)
+        frame.own = own if frame.own is NO_INPUTS else _first_told(frame.own, own)
+        carried = frame.controls is NO_INPUTS and self._controls is NO_INPUTS
+        frame.controls = (
+            frame.own if carried else _first_told(frame.own, frame.controls, self._controls)
+        )
 
     def _take_controls(self, data: Any, log_time: int) -> None:
         """Take the controls of the host: they are of the last frame if they were logged with it."""
