@@ -178,8 +178,10 @@ def replicate(store: StoreFile, made: Sequence[Source], traces: int, *, seed: in
             info, Config(), road_map=source.road_map, answers=source.answers
         ) as segment:
             for graph in source.graphs:
-                moved = segment.as_kept(motion.of(graph.frames))
-                segment.append(replace(graph, frames=moved))
+                moved, world = segment.as_kept(motion.of(graph.frames)), graph.world
+                if world is not None:
+                    world = replace(world, frames=segment.as_kept(motion.of(world.frames)))
+                segment.append(replace(graph, frames=moved, world=world))
             store.publish(segment.seal(source.report))
         frames += source.frames
     return frames

@@ -129,6 +129,18 @@ CHANGES = {
         "INSERT INTO inside.gap_repeated BY NAME SELECT bucket, 0 AS mask, src, dst FROM inside.edge LIMIT 1",
         "masks",
     ),
+    "a state beyond the graph that is in it": (
+        "INSERT INTO inside.world_state SELECT * FROM inside.state WHERE NOT is_ego LIMIT 1",
+        "references",
+    ),
+    "a node beyond the graph beyond the frames": (
+        "INSERT INTO inside.world_node SELECT * REPLACE (mask | (1::BIGINT << 59) AS mask) FROM inside.node",
+        "masks",
+    ),
+    "an edge beyond the graph to another kind": (
+        "INSERT INTO inside.world_edge SELECT * REPLACE ('animal' AS dst_kind) FROM inside.edge LIMIT 1",
+        "references",
+    ),
     "an ego that is nobody": ("UPDATE inside.frame SET ego = 9999", "references"),
     "settings that are gone": ("DELETE FROM inside.config", None),
     "a recording that is gone": ("DELETE FROM inside.recording", None),

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import sgstore.store._schema as shape
 from sgstore.config import from_dict
 from sgstore.errors import SgstoreError, StoreError
-from sgstore.store._columns import REPEATED, Checksum, expressions
+from sgstore.store._columns import REPEATED, STATES, Checksum, expressions
 from sgstore.store._locking import Access, translated
 from sgstore.store._packing import LONGEST_STEP
 from sgstore.store._publish import SHARED, checksum_of, owned
@@ -69,19 +69,25 @@ class Verification:
 
 
 _RULES: Final[tuple[tuple[str, str, str], ...]] = (
-    (
-        "masks",
-        "an edge holds in no frame, or in frames that the trace does not have",
-        """
-        SELECT e.bucket >> 18 FROM edge e LEFT JOIN bucket b ON b.bucket = e.bucket
-        WHERE b.bucket IS NULL OR e.mask = 0 OR (e.mask & ~b.valid) <> 0""",
+    *(
+        (
+            "masks",
+            "an edge holds in no frame, or in frames that the trace does not have",
+            f"""
+            SELECT e.bucket >> 18 FROM {edges} e LEFT JOIN bucket b ON b.bucket = e.bucket
+            WHERE b.bucket IS NULL OR e.mask = 0 OR (e.mask & ~b.valid) <> 0""",
+        )
+        for edges in ("edge", "world_edge")
     ),
-    (
-        "masks",
-        "a static node is present in no frame, or in frames that the trace does not have",
-        """
-        SELECT n.bucket >> 18 FROM node n LEFT JOIN bucket b ON b.bucket = n.bucket
-        WHERE b.bucket IS NULL OR n.mask = 0 OR (n.mask & ~b.valid) <> 0""",
+    *(
+        (
+            "masks",
+            "a static node is present in no frame, or in frames that the trace does not have",
+            f"""
+            SELECT n.bucket >> 18 FROM {nodes} n LEFT JOIN bucket b ON b.bucket = n.bucket
+            WHERE b.bucket IS NULL OR n.mask = 0 OR (n.mask & ~b.valid) <> 0""",
+        )
+        for nodes in ("node", "world_node")
     ),
     *(
         (
@@ -160,14 +166,22 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
         "SELECT f.trace_id FROM frame f WHERE f.ego IS NOT NULL AND NOT EXISTS"
         " (SELECT 1 FROM entity e WHERE e.trace_id = f.trace_id AND e.node_id = f.ego)",
     ),
+    *(
+        (
+            "references",
+            "a state belongs to no entity or no frame, or has another kind than its entity",
+            f"""
+            SELECT s.frame_id >> 24 FROM {states} s
+            LEFT JOIN entity e ON e.trace_id = s.frame_id >> 24 AND e.node_id = s.node_id
+            LEFT JOIN frame f ON f.frame_id = s.frame_id
+            WHERE e.kind IS DISTINCT FROM s.kind OR f.frame_id IS NULL""",
+        )
+        for states in STATES
+    ),
     (
         "references",
-        "a state belongs to no entity or no frame, or has another kind than its entity",
-        """
-        SELECT s.frame_id >> 24 FROM state s
-        LEFT JOIN entity e ON e.trace_id = s.frame_id >> 24 AND e.node_id = s.node_id
-        LEFT JOIN frame f ON f.frame_id = s.frame_id
-        WHERE e.kind IS DISTINCT FROM s.kind OR f.frame_id IS NULL""",
+        "an entity is in the graph of a frame and beyond it",
+        "SELECT w.frame_id >> 24 FROM world_state w JOIN state s USING (frame_id, node_id)",
     ),
     (
         "references",
@@ -175,7 +189,9 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
         """
         SELECT l.bucket >> 18
         FROM (SELECT bucket, node_id, kind, lane FROM lane_single UNION ALL
-              SELECT bucket, node_id, kind, lane FROM lane_repeated) l
+              SELECT bucket, node_id, kind, lane FROM lane_repeated UNION ALL
+              SELECT bucket, node_id, kind, lane FROM world_lane_single UNION ALL
+              SELECT bucket, node_id, kind, lane FROM world_lane_repeated) l
         LEFT JOIN trace t ON t.trace_id = l.bucket >> 18
         LEFT JOIN entity e ON e.trace_id = t.trace_id AND e.node_id = l.node_id
         LEFT JOIN map_node m ON m.map_id = t.map_id AND m.node_id = l.lane
@@ -186,7 +202,9 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
             "references",
             f"an edge {way} what is no entity of the trace or no part of its map, or of another kind",
             f"""
-            SELECT e.bucket >> 18 FROM (SELECT DISTINCT bucket, {end} AS node, {end}_kind AS kind FROM edge) e
+            SELECT e.bucket >> 18
+            FROM (SELECT DISTINCT bucket, {end} AS node, {end}_kind AS kind
+                  FROM (SELECT * FROM edge UNION ALL SELECT * FROM world_edge)) e
             LEFT JOIN trace t ON t.trace_id = e.bucket >> 18
             LEFT JOIN entity n ON n.trace_id = t.trace_id AND n.node_id = e.node
             LEFT JOIN map_node m ON m.map_id = t.map_id AND m.node_id = e.node
@@ -198,7 +216,7 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
         "references",
         "a static node is no entity of the trace and no part of its map, or of another kind",
         """
-        SELECT k.bucket >> 18 FROM node k
+        SELECT k.bucket >> 18 FROM (SELECT * FROM node UNION ALL SELECT * FROM world_node) k
         LEFT JOIN trace t ON t.trace_id = k.bucket >> 18
         LEFT JOIN entity n ON n.trace_id = t.trace_id AND n.node_id = k.node_id
         LEFT JOIN map_node m ON m.map_id = t.map_id AND m.node_id = k.node_id
