@@ -179,7 +179,8 @@ def keep_abstraction(
 
 
 def _derived(file: StoreFile, trace: StoredTrace, config: Config, name: str) -> Derivation:
-    generator, crowds = SceneGraphGenerator(_road_map(file, trace, config), config), Crowds()
+    graphs = replace(config, range=replace(config.range, world=0.0))
+    generator, crowds = SceneGraphGenerator(_road_map(file, trace, graphs), graphs), Crowds()
     frames = edges = 0
     with file.deriving.building(name, trace.trace_id) as building:
         for block in file.deriving.blocks(trace.trace_id):
@@ -219,6 +220,7 @@ def _settings(trace: StoredTrace, wanted: Config) -> Config:
         )
     old = from_dict(trace.settings)
     new = replace(wanted, **{name: getattr(old, name) for name in _NOT_RELATIONS})
+    new = replace(new, range=replace(new.range, world=old.range.world))
 
     def need(holds: bool, setting: str, was: object, asked: object) -> None:  # noqa: FBT001
         if not holds:
@@ -227,7 +229,9 @@ def _settings(trace: StoredTrace, wanted: Config) -> Config:
                 " what that leaves out is not in the store; ingest the recording anew"
             )
 
-    need(_covers(old.range, new.range), "range", _shown(old.range), _shown(new.range))
+    known = [old.range, *filter(None, [old.range.beyond()])]
+    covered = any(_covers(one, new.range) for one in known)
+    need(covered, "range", _shown(known[-1]), _shown(new.range))
     need(_kinds(new) <= _kinds(old), "kinds", old.kinds, new.kinds)
     need(dict(new.types) == dict(old.types), "types", dict(old.types), dict(new.types))
     lanes = new.lanes.granularity in {"none", old.lanes.granularity}

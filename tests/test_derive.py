@@ -29,6 +29,8 @@ OTHERS = {
     "rectangle": configured(
         range={"shape": "rectangle", "front": 40, "rear": 5, "side": 10}, without=["overlaps"]
     ),
+    "wider": configured(range={"radius": 120.0}),
+    "wide_rectangle": configured(range={"shape": "rectangle", "front": 150, "side": 60}),
     "vehicles": configured(kinds=["Vehicle", "Lane"], sees=False, pairs={"ego": False}),
 }
 
@@ -88,13 +90,17 @@ def test_a_derived_set_is_what_ingesting_with_its_settings_gives(
     [
         "carla/Town01.carla.mcap",
         "esmini/traffic_lights.mcap",
+        "esmini/swarm_Town04.mcap",
         "osi_converter",
     ],
 )
-def test_real_traces_derive_to_what_ingesting_gives(data: Any, tmp_path: Path, path: Any) -> None:
+@pytest.mark.parametrize("name", ["thresholds", "wider"])
+def test_real_traces_derive_to_what_ingesting_gives(
+    data: Any, tmp_path: Path, path: Any, name: str
+) -> None:
     found = data / "traces" / path
     trace = found if found.is_file() else min(found.glob("*.mcap"))
-    config = OTHERS["thresholds"]
+    config = OTHERS[name]
     store = stored(tmp_path / "a.sgstore", trace)
     derive(store.file.path, config, "other")
 
@@ -118,6 +124,29 @@ def test_who_follows_farther_off_under_other_settings_has_a_gap_too(
     (frame, *_, gap) = max(gaps, key=lambda row: row[-1])[-4:]
     graph = store.graph(frame, abstraction="far")
     assert gap in {about.get("gap") for *_, about in graph.edges(data=True)}
+
+
+def test_a_wider_set_is_asked_and_drawn_like_a_store_of_its_range(
+    data: Any, tmp_path: Path
+) -> None:
+    trace = data / "traces/esmini/swarm_Town04.mcap"
+    store = stored(tmp_path / "near.sgstore", trace)
+    derive(store.file.path, OTHERS["wider"], "wider")
+    ingested = stored(tmp_path / "far.sgstore", trace, OTHERS["wider"])
+    pattern = (
+        "MATCH (e:Ego), (v:Vehicle)-[i:isIn]->(l:Lane) WHERE dist(e, v) > 60"
+        " RETURN frame.id, v.id, l.id, v.speed, i.offset"
+    )
+
+    rows = set(ingested.find(pattern).rows())
+
+    assert len(rows) > 100
+    assert set(store.find(f"USING ABSTRACTION wider {pattern}").rows()) == rows
+    assert store.find(pattern).rows() == []
+    frame = min(rows)[-5]
+    derived, drawn = store.graph(frame, abstraction="wider"), ingested.graph(frame)
+    assert dict(derived.nodes(data=True)) == dict(drawn.nodes(data=True))
+    assert sorted(derived.edges(keys=True)) == sorted(drawn.edges(keys=True))
 
 
 def test_deriving_needs_no_recording_and_goes_on_where_it_was(tmp_path: Path) -> None:
@@ -152,9 +181,9 @@ def test_a_name_that_is_taken_is_replaced_on_demand_only(town: Any) -> None:
 @pytest.mark.parametrize(
     ("settings", "named"),
     [
-        ({"range": {"radius": 50.1}}, "range"),
-        ({"range": {"shape": "rectangle", "front": 49, "rear": 25, "side": 25}}, "range"),
-        ({"range": {"shape": "corridor", "length": 45}}, "range"),
+        ({"range": {"radius": 200.1}}, "range"),
+        ({"range": {"shape": "rectangle", "front": 190, "rear": 25, "side": 70}}, "range"),
+        ({"range": {"shape": "corridor", "length": 250}}, "range"),
         ({"lanes": {"granularity": "waypoint"}}, "lanes.granularity"),
         ({"lanes": {"sections": False}}, "lanes.sections"),
         ({"types": {"vehicle.x": {"kind": "car"}}}, "types"),

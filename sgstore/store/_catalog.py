@@ -212,8 +212,12 @@ def _derived(
     shadows["node"] = (
         f"SELECT kind, bucket, node_id, mask FROM derived_node WHERE set_name = {word} AND NOT moves"
     )
+    states = 'SELECT s.* FROM inside."state"'
+    if whole.beyond:  # the range of a set may be larger than that of the graphs
+        states = "SELECT s.* EXCLUDE (in_graph) FROM inside.known_state"
+        shadows["lane_state"] = "SELECT * EXCLUDE (in_graph) FROM inside.known_lane_state"
     shadows["state"] = (
-        'SELECT s.* FROM inside."state" AS s JOIN derived_node AS d'
+        f"{states} AS s JOIN derived_node AS d"
         f" ON d.set_name = {word} AND d.moves AND d.bucket = s.frame_id >> 6 AND d.node_id = s.node_id"
         " AND (d.mask & (CAST(1 AS BIGINT) << CAST(s.frame_id & 63 AS INTEGER))) <> 0"
     )

@@ -63,7 +63,7 @@ WHERE frame_id >= $low << 6 AND frame_id < $high << 6 ORDER BY frame_id
 _STATES: Final = f"""
 SELECT frame_id, node_id, coalesce(lights, -1) AS lights, derived, coalesce(carrier, -1) AS carrier,
        coalesce(enum_code(light_state)::INTEGER, -1) AS light_state, {", ".join(_NUMBERS)}
-FROM state WHERE frame_id >= $low << 6 AND frame_id < $high << 6 ORDER BY frame_id, node_id
+FROM known_state WHERE frame_id >= $low << 6 AND frame_id < $high << 6 ORDER BY frame_id, node_id
 """
 _ENTITIES: Final = """
 SELECT e.node_id, enum_code(e.kind) AS kind, e.is_static, coalesce(e.ident, '') AS ident,
@@ -72,9 +72,9 @@ SELECT e.node_id, enum_code(e.kind) AS kind, e.is_static, coalesce(e.ident, '') 
        e.x, e.y, e.z, e.heading, e.length, e.width, e.height, coalesce(p.bucket, 1::BIGINT << 62) AS bucket
 FROM entity e LEFT JOIN (
   SELECT node_id, min(bucket) AS bucket FROM (
-    SELECT node_id, frame_id >> 6 AS bucket FROM state
+    SELECT node_id, frame_id >> 6 AS bucket FROM known_state
     WHERE frame_id >= $trace << 24 AND frame_id < ($trace + 1) << 24 UNION ALL
-    SELECT node_id, bucket FROM node
+    SELECT node_id, bucket FROM known_node
     WHERE node_id >= 0 AND bucket >= $trace << 18 AND bucket < ($trace + 1) << 18)
   GROUP BY node_id) p ON p.node_id = e.node_id
 WHERE e.trace_id = $trace ORDER BY e.node_id
@@ -126,7 +126,7 @@ class Deriving:
     def blocks(self, trace_id: int) -> Iterator[FrameBlock]:
         """The frames of a trace, with the states that are in the store; no more than two buckets at a time.
 
-        An entity is introduced when it is in a graph for the first time, or before one that is: what the
+        An entity is introduced when it is known for the first time, or before one that is: what the
         generator did not know then, it does not know now.
         """
         with self._access.reading() as connection:
@@ -193,11 +193,14 @@ class Deriving:
             present = rows(f"SELECT node_id FROM derived_node WHERE {_HERE} AND set_name = $name")
             ends = "SELECT src, relation::VARCHAR, dst FROM"
             drawn = rows(f"{ends} derived_edge WHERE {_HERE} AND set_name = $name ORDER BY ALL")
-            before = rows(f"{ends} edge WHERE {_HERE}")
+            before = rows(
+                f"{ends} (SELECT * FROM edge UNION ALL SELECT * FROM world_edge) WHERE {_HERE}"
+            )
             gaps = rows(
                 "SELECT src, dst, gap FROM derived_gap"
                 " WHERE bucket = $frame >> 6 AND bit = $frame & 63 AND set_name = $name AND gap IS NOT NULL"
             )
+        whole = whole.known()
         nodes = {node: whole.nodes[node] for (node,) in present if node in whole.nodes}
         about = {(src, relation, dst): more for src, relation, dst, more in whole.edges}
         about |= {(src, "follows", dst): {"gap": gap} for src, dst, gap in gaps}

@@ -227,7 +227,7 @@ class Segment:
         more : mapping, optional
             What else the report in the store is to say, as plain values.
         parked : sequence of (n,) int8
-            Of each entity whether it is parked, as graphs tell, and as all that is known: 1 or 0; -1: not known.
+            Whether each entity is parked, by the graphs and by all known rows: 1 or 0; -1: not known.
 
         Raises
         ------
