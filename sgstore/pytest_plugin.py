@@ -24,8 +24,8 @@ the same in all processes of pytest-xdist. Of a check it is the trace and the na
 
 A case of a lock is looked at before its test runs: another number of frames, other times or other graphs are an
 error of that test; so are other messages when the test asks for one. A rule is checked before the body of its
-test: a trace that violates it fails, one that cannot answer it is skipped. A mark that is wrong is an error of
-its tests, not of the session: the others run.
+test: a trace that violates it fails, one that cannot answer it, or in which it is still due, is skipped. A mark
+that is wrong is an error of its tests, not of the session: the others run.
 """
 
 from __future__ import annotations
@@ -253,6 +253,8 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> None:
     if verdict.verdict == "unknown":
         why = f": {verdict.reason}" if verdict.reason else ""
         pytest.skip(f"{verdict.trace} cannot answer {verdict.check}{why}")
+    if verdict.verdict == "pending":
+        pytest.skip(f"{verdict.check} is still due at the end of {verdict.trace}")
 
 
 def violations_text(verdict: Verdict) -> str:

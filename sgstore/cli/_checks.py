@@ -62,7 +62,8 @@ _NO_XML: Final = re.compile(r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U001
 def write_junit(path: Path, verdicts: Iterable[Verdict]) -> None:
     """Write a suite for each check, with a case for each trace.
 
-    A violated check is a failure whose text names each violation; what a trace cannot answer is skipped.
+    A violated check is a failure whose text names each violation. What a trace cannot answer, or what is still
+    due at its end, is skipped. A case that is kept says in how many frames an entity is absent.
 
     Parameters
     ----------
@@ -76,6 +77,8 @@ def write_junit(path: Path, verdicts: Iterable[Verdict]) -> None:
     """
     from xml.etree import ElementTree as Xml  # few need it
 
+    from sgstore.temporal import absence_text
+
     root = Xml.Element("testsuites", name="sgstore check")
     suites: dict[str, Xml.Element] = {}
     for one in verdicts:
@@ -88,7 +91,9 @@ def write_junit(path: Path, verdicts: Iterable[Verdict]) -> None:
             count = f"{len(lines)} violation{'s' * (len(lines) != 1)}"
             Xml.SubElement(case, "failure", message=count).text = "\n".join(lines)
         elif one.verdict != "true":
-            Xml.SubElement(case, "skipped", message=_plain(one.reason or one.verdict))
+            Xml.SubElement(case, "skipped", message=_plain(one.reason or _word(one)))
+        elif one.absent_frames:
+            Xml.SubElement(case, "system-out").text = absence_text(one.absent_frames)
     for element, cases in [(root, root.findall("*/*")), *((s, list(s)) for s in suites.values())]:
         element.set("tests", str(len(cases)))
         element.set("failures", str(sum(case.find("failure") is not None for case in cases)))
@@ -96,6 +101,13 @@ def write_junit(path: Path, verdicts: Iterable[Verdict]) -> None:
         element.set("skipped", str(sum(case.find("skipped") is not None for case in cases)))
     Xml.indent(root)
     write_bytes(path, Xml.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
+
+
+def _word(verdict: Verdict) -> str:
+    """A verdict without a reason, in words."""
+    return (
+        "still due at the end of the recording" if verdict.verdict == "pending" else verdict.verdict
+    )
 
 
 def _violations(verdict: Verdict) -> list[str]:
@@ -142,8 +154,8 @@ def check(
 ) -> int:
     """Check what must be true of every trace.
 
-    One row a check and trace: true, false, or unknown where it cannot be told; and one a violation: by whom,
-    and from when to when.
+    One row a check and trace: true, false, unknown where it cannot be told, or pending where something is
+    still due at the end; and one a violation: by whom, and from when to when.
     """
     from sgstore.lang import joined
 
@@ -174,11 +186,14 @@ def _reported(
     say_notes(run.notes)
     tally = {"true": 0, "false": 0}
     kept: list[Verdict] = []
+    absent: dict[str, int] = {}
 
     def counted() -> Iterator[Verdict]:
         for verdict in run:
             if junit is not None or verdict.reason:
                 kept.append(verdict)
+            if verdict.absent_frames:
+                absent[verdict.check] = absent.get(verdict.check, 0) + verdict.absent_frames
             tally[verdict.verdict] = tally.get(verdict.verdict, 0) + 1
             yield verdict
 
@@ -200,6 +215,8 @@ def _reported(
         )
         ask.write((*_DOCUMENT, *more), told)
     say_unknown((one.check, one.trace, one.reason) for one in kept)
+    for one, frames in absent.items():
+        say(f"{one} is true, and an entity is absent in {frames} frame{'s' * (frames != 1)}")
     if junit is not None:
         write_junit(junit, kept)
     return NO_MATCH if require and tally["false"] else 0
@@ -213,6 +230,7 @@ _DOCUMENT: Final = (
     "first_violation",
     "violations",
     "witnesses",
+    "absent_frames",
 )
 """Columns of verdicts as a program reads them."""
 
@@ -230,7 +248,7 @@ def _document(verdict: Verdict, returned: Sequence[str]) -> tuple[Any, ...]:
         for one in verdict.witnesses
     ]
     head = verdict.check, verdict.trace, verdict.verdict, verdict.reason or None
-    return (*head, spans[0] if spans else None, spans, witnesses)
+    return (*head, spans[0] if spans else None, spans, witnesses, verdict.absent_frames)
 
 
 def _margin_document(verdict: Verdict) -> dict[str, Any] | None:
@@ -238,8 +256,9 @@ def _margin_document(verdict: Verdict) -> dict[str, Any] | None:
     found = verdict.robustness
     if found is None:
         return None
-    value = found.value if math.isfinite(found.value) else None
-    return {**asdict(found), "value": value}
+    upper = found.value if found.upper is None else found.upper
+    ends = {"value": found.value, "upper": upper}
+    return asdict(found) | {k: v if math.isfinite(v) else None for k, v in ends.items()}
 
 
 def _span(interval: Interval, returned: Sequence[str]) -> dict[str, Any]:
@@ -409,12 +428,13 @@ def _tell_verdict(verdict: Verdict, *, as_json: bool) -> None:
             "verdict": verdict.verdict,
             "violations": len(verdict.violations),
             "reason": verdict.reason or None,
+            "absent_frames": verdict.absent_frames,
         }
         if verdict.robustness is not None:
             about["robustness"] = _margin_document(verdict)
         _line(json_text(about))
     else:
-        from sgstore.temporal import margin_cells
+        from sgstore.temporal import absence_text, margin_cells
 
         count = len(verdict.violations)
         more = f"  {count} violation{'s' * (count > 1)}" if count else ""
@@ -422,6 +442,7 @@ def _tell_verdict(verdict: Verdict, *, as_json: bool) -> None:
         margin, decided, _ = margin_cells(verdict)
         more += f"  robustness {margin}" if margin else ""
         more += f"  {decided}" if decided else ""
+        more += f"  {absence_text(verdict.absent_frames)}" if verdict.absent_frames else ""
         _line(f"{verdict.check}: {verdict.verdict}{more}{why}")
 
 

@@ -256,6 +256,7 @@ def _values_of(verdict: Verdict) -> list[Any]:
         [(w.nodes, w.names, w.holds, [*map(_of_interval, w.violations)]) for w in witnesses],
         *(verdict.status, verdict.reason),
         None if margin is None else _of_robustness(margin),
+        verdict.absent_frames,
     ]
 
 
@@ -263,7 +264,7 @@ def as_verdict(values: list[Any]) -> Verdict:
     """The verdict whose values these are."""
     from sgstore.arrays import np
 
-    check, trace, word, violations, witnesses, status, reason, margin = values
+    check, trace, word, violations, witnesses, status, reason, margin, absent = values
     return Verdict(
         check,
         trace,
@@ -276,6 +277,7 @@ def as_verdict(values: list[Any]) -> Verdict:
         None if status is None else np.array(status, np.int8),
         reason,
         None if margin is None else Robustness(*margin),
+        absent,
     )
 
 

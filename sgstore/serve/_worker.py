@@ -99,6 +99,7 @@ def _told_check(store: Store, question: dict[str, Any], most: int) -> Iterator[R
         many += len(spans)
         about = {"check": verdict.check, "trace": verdict.trace, "verdict": verdict.verdict}
         about |= {"reason": verdict.reason, "violations": len(verdict.violations), "spans": spans}
+        about["absent_frames"] = verdict.absent_frames
         about["robustness"] = " · ".join(filter(None, margin_cells(verdict)))
         verdicts.append(about)
     yield {"verdicts": verdicts, "count": many, "truncated": many >= most, "notes": run.notes}

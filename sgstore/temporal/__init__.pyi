@@ -2,6 +2,7 @@
 
 from ._checks import CheckRun as CheckRun
 from ._checks import Verdict as Verdict
+from ._checks import absence_text as absence_text
 from ._checks import cell_of as cell_of
 from ._checks import columns_returned as columns_returned
 from ._checks import margin_cells as margin_cells
@@ -39,6 +40,7 @@ __all__ = [
     "Witness",
     "evaluate",
     "kept_throughout",
+    "absence_text",
     "cell_of",
     "columns_returned",
     "margin_cells",

@@ -380,7 +380,7 @@ class CheckPlan(Plan):
 
     def _signal(self, value: b.Bound) -> Ask:
         if not (isinstance(value, b.Operation) and value.word == STATE):
-            return Plan._signal(self, value)
+            return Plan._signal(self, value)  # noqa: SLF001 - of the base class
         (operand,) = value.operands
         things = self._things(operand)
         if isinstance(operand, b.Value):
@@ -392,7 +392,7 @@ class CheckPlan(Plan):
             ask = replace(inner, name=f"state of {inner.name}")
             self.states[ask.name] = inner, None
             return ask
-        inner = Plan._signal(self, operand)
+        inner = Plan._signal(self, operand)  # noqa: SLF001 - of the base class
         doubt = self._unknown(operand)
         atom = None if doubt is None else self._ask(doubt, things)
         ask = replace(inner, name=f"state of {inner.name}")
@@ -419,7 +419,9 @@ class CheckPlan(Plan):
 
     # Margins
 
-    def margin(self, expression: b.Bound, reading: Reading) -> f.Formula:
+    def margin(  # noqa: PLR0911 - a case each
+        self, expression: b.Bound, reading: Reading
+    ) -> f.Formula:
         """The formula over margins of a condition in a reading; see :meth:`Plan.quantity`."""
         match expression:
             case b.Tense(word=word, operands=operands):

@@ -272,8 +272,8 @@ class Verdict:
     check, trace : str
         Their names.
     verdict : str
-        ``true`` or ``false``, if that holds whatever is unknown; ``pending``, if something is still due at the end
-        of the recording; else ``unknown``.
+        ``true`` or ``false``, if that holds whatever is unknown; ``pending``, if something is still due at the
+        end of the recording; else ``unknown``.
     first_violation : Interval or None
         The first of the violations.
     violations : tuple of Interval
@@ -724,7 +724,7 @@ class StoreCheck:
             ask = plan.atoms[plan.presence(node)]
             statement = relation(ask.query, self._knowing, None, (), {node})
             *before, (sql, values) = statement.steps()
-            counted = f'SELECT "frame_id", count(*) AS "there" FROM ({sql}) GROUP BY "frame_id"'
+            counted = f'SELECT "frame_id", count(*) AS "there" FROM ({sql}) GROUP BY ALL'  # noqa: S608
             found = self._file.arrays(counted, values, given=before, plain=True)
             there = np.zeros(len(frames), np.int64)
             ids, many = (np.ma.getdata(found[name]) for name in ("frame_id", "there"))
