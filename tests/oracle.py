@@ -503,8 +503,15 @@ def pair(name: str, a: dict[str, Any], b: dict[str, Any]) -> float | None:
     if any(axis not in n for n in (a, b) for axis in "xyz"):
         return None
     dx, dy, dz = (b[axis] - a[axis] for axis in "xyz")
+    if name in {"dist", "closing_speed"} and abs(dz) >= 2.5:  # on another storey
+        return None
     if name == "dist":
         return math.sqrt(dx * dx + dy * dy + dz * dz)
+    if name == "closing_speed":
+        speeds = [0.0 if n.get("is_static") else n.get(v) for v in ("vx", "vy") for n in (a, b)]
+        if None in speeds or not (dx or dy):
+            return None
+        return -(dx * (speeds[1] - speeds[0]) + dy * (speeds[3] - speeds[2])) / math.hypot(dx, dy)
     heading = math.radians(a["heading"])
     if name == "lon":
         return dx * math.cos(heading) + dy * math.sin(heading)

@@ -28,7 +28,7 @@ from sgstore.errors import TextSpan
 from sgstore.graph import SceneGraph
 from sgstore.lang import parse
 from sgstore.lang import syntax as s
-from sgstore.pair_numbers import PAIR_FUNCTIONS
+from sgstore.pair_numbers import PAIR_FUNCTIONS, columns_needed
 from sgstore.store import StoreFile
 from sgstore.temporal import Monitor
 from sgstore.vocabulary import normalize_name
@@ -51,6 +51,11 @@ WINDOWS = {
     "avg_over": lambda values: math.fsum(values) / len(values),
 }
 NUMBERS = {normalize_name(name) for name in PAIR_FUNCTIONS}
+PROPER = {normalize_name(name): name for name in PAIR_FUNCTIONS}
+SIZES = {"length", "width", "heading", "vx", "ax", "yaw_rate"}
+MOVING = {"speed", "accel", "vx", "vy", "ax", "ay"}
+RECORDED = {"speed", "accel", "vx", "vy", "ax", "ay", "length", "width", "height", "heading"}
+"""What is measured, among the attributes that random conditions are about."""
 TIMED = {"run_length", "since_true", "age"}
 AHEAD = {"ALWAYS", "EVENTUALLY", "NEXT", "WEAKNEXT", "UNTIL", "RELEASE"}
 
@@ -93,18 +98,28 @@ def parts_within(expression: Any) -> list[Any]:
 @remembered
 def has_pairs(expression: Any) -> bool:
     """Whether numbers of pairs stand in an expression, outside of braces."""
+    runs = {"run_length", "since_true", "robustness"}
     if isinstance(expression, s.Block):
+        return False
+    if isinstance(expression, s.Call) and expression.name in runs:
         return False
     if isinstance(expression, s.Call) and normalize_name(expression.name) in NUMBERS:
         return True
     return any(has_pairs(one) for one in parts_within(expression))
 
 
+def waits(e: Any) -> bool:
+    """Whether a condition waits for something as long as a trace goes on."""
+    endless = isinstance(e, s.Temporal) and (e.bound is None or e.bound[1] is None)
+    return endless and e.word in {"UNTIL", "EVENTUALLY"}
+
+
 def once(method: Callable[[Any, Any, int, Binding], T]) -> Callable[[Any, Any, int, Binding], T]:
     """What is told of an expression at a frame, worked out once for each binding."""
 
     def told(self: Told, e: Any, i: int, binding: Binding) -> T:
-        key = method.__name__, self.absent, id(e), i, *binding.items()
+        reading = self.absent, self.unknown, self.due
+        key = method.__name__, reading, id(e), i, *binding.items()
         if key not in self.known:
             self.known[key] = e, method(self, e, i, binding)
         return self.known[key][1]
@@ -125,6 +140,10 @@ class Told:
     """Whether a gap between frames ends nothing."""
     absent: bool | None = None
     """Of a check: what a condition counts as on an entity that is absent; it changes under NOT."""
+    unknown: bool | None = None
+    """Of a check: what a condition counts as that is unknown; it changes under NOT. Without: it is false."""
+    due: bool | None = None
+    """Whether an operator counts as true whose bound is not over at the end; it changes under NOT."""
     taken: list[s.StepClause] = field(default_factory=list)
     """The steps of the match that :meth:`sequences` told last, in the order of its frames."""
 
@@ -172,6 +191,8 @@ class Told:
                 return binding[name] in self.frames[i].graph
             case _ if self.absent is not None and self.is_away(e, i, binding):
                 return self.absent
+            case _ if self.unknown is not None and self.is_unknown(e, i, binding):
+                return self.unknown
             case _ if is_temporal(e):
                 return self.value(e, i, binding) is True
             case _:
@@ -182,12 +203,58 @@ class Told:
                 return any(self.searches[i].value(e, way) is True for way in ways)
 
     @contextmanager
-    def under_not(self, absent: bool | None = None) -> Iterator[None]:
-        """While the operand of a negation is looked at; or one where absence counts as is said."""
-        before = self.absent
-        self.absent = not before if absent is None else absent
+    def under_not(self) -> Iterator[None]:
+        """While the operand of a negation is looked at."""
+        unknown = None if self.unknown is None else not self.unknown
+        due = None if self.due is None else not self.due
+        with self.counting(not self.absent, unknown, due=due):
+            yield
+
+    @contextmanager
+    def counting(
+        self, absent: bool, unknown: bool | None, *, due: bool | None
+    ) -> Iterator[None]:
+        """While conditions count so."""
+        before = self.absent, self.unknown, self.due
+        self.absent, self.unknown, self.due = absent, unknown, due
         yield
-        self.absent = before
+        self.absent, self.unknown, self.due = before
+
+    def is_unknown(self, e: Any, i: int, binding: Binding) -> bool:  # noqa: PLR0911 - a case each
+        """Whether a condition is about what is measured and was not recorded."""
+        match e:
+            case s.Call(name="coalesce" | "known") | s.Case() | s.NullTest() | s.Block():
+                return False
+            case s.Call(name="prev", arguments=(inner,)):
+                return self.is_unknown(inner, i - 1, binding)
+            case s.Call(name="delta", arguments=(inner, by)):
+                return any(self.is_unknown(inner, j, binding) for j in (i, self.then(by, i)))
+            case s.Call(name=name, arguments=(inner, by)) if name in WINDOWS:
+                frames = (j for j in self.last_frames(by, i) if not self.was_away(inner, j, binding))
+                return any(self.is_unknown(inner, j, binding) for j in frames)
+            case s.Comparison() if any(
+                isinstance(one, s.Call) and one.name in {"run_length", "since_true"}
+                for one in parts_of(e)
+            ):
+                told = set[Any]()
+                for unknown in (True, False):
+                    with self.counting(bool(self.absent), unknown, due=self.due):
+                        told.add(self.value(e, i, binding) is True)
+                return len(told) > 1
+            case s.Call(name=name) if normalize_name(name) in NUMBERS:
+                return self.value(e, i, binding) is None and any(
+                    self.value(s.AttributeOf(owner, column, e.span), i, binding) is None
+                    for owner, columns in zip(
+                        e.arguments, columns_needed(PROPER[normalize_name(name)]), strict=True
+                    )
+                    for column in columns & SIZES
+                )
+            case s.AttributeOf(owner=owner, name=name) if name in RECORDED:
+                entity = self.trace.entities.get(binding[owner.name], {})
+                still = name in MOVING and entity.get("static", False)
+                return not still and self.value(e, i, binding) is None
+            case _:
+                return any(self.is_unknown(one, i, binding) for one in parts_within(e))
 
     def is_away(self, e: Any, i: int, binding: Binding) -> bool:
         """Whether a condition is about what is absent, a value without a past, or a pair without one."""
@@ -196,6 +263,8 @@ class Told:
             return True
         if self.lacks_past(e, i, binding):
             return True
+        if self.unknown is not None and self.is_unknown(e, i, binding):
+            return False
         return has_pairs(e) and self.value(e, i, binding) is None
 
     def lacks_past(self, e: Any, i: int, binding: Binding) -> bool:  # noqa: PLR0911 - a case each
@@ -249,13 +318,15 @@ class Told:
         one = e.operands[-1]
         match e.word:
             case "NEXT" | "WEAKNEXT":
-                return self.true(one, i + 1, binding) if i < last else e.word == "WEAKNEXT"
+                if i < last:
+                    return self.true(one, i + 1, binding)
+                return e.word == "WEAKNEXT" or (self.due is True and not waits(one))
             case "PREVIOUS":
                 return i > 0 and self.true(one, i - 1, binding)
             case "ALWAYS" | "HISTORICALLY":
                 return all(self.true(one, j, binding) for j in near)
             case "EVENTUALLY" | "ONCE":
-                return any(self.true(one, j, binding) for j in near)
+                return any(self.true(one, j, binding) for j in near) or self.is_due(e, i)
             case "RELEASE":
                 left = e.operands[0]
                 return all(
@@ -268,11 +339,23 @@ class Told:
                 between = (
                     (lambda j: range(i, j)) if e.word == "UNTIL" else lambda j: range(j + 1, i + 1)
                 )
-                return any(
+                still = self.is_due(e, i) and all(
+                    self.true(left, k, binding) for k in range(i, last + 1)
+                )
+                return still or any(
                     self.true(one, j, binding)
                     and all(self.true(left, k, binding) for k in between(j))
                     for j in near
                 )
+
+    def is_due(self, e: s.Temporal, i: int) -> bool:
+        """Whether an operator counts as true that looks ahead, for its bound is not over at the end."""
+        if not self.due or e.word not in AHEAD or e.bound is None or e.bound[1] is None:
+            return False
+        high = e.bound[1]
+        if high.unit == "frames":
+            return i + high.amount > len(self.frames) - 1
+        return self.times[-1] - self.times[i] < high.ns - self.slack
 
     # Margins: by how much a condition is true
 
@@ -448,7 +531,9 @@ class Told:
 
     def within_run(self) -> Any:
         """While a condition of ``run_length`` is looked at: in a check who is absent ends the run."""
-        return nullcontext() if self.absent is None else self.under_not(absent=False)
+        if self.absent is None:
+            return nullcontext()
+        return self.counting(absent=False, unknown=self.unknown, due=None)
 
     def last_frames(self, by: s.Duration, i: int) -> list[int]:
         """The frames of a window, back to a gap."""
@@ -483,7 +568,18 @@ class Told:
             {n for search in self.searches for n in search.graph if search.labelled(n, asked)}
         )
 
-    def checked(self, statement: s.CheckClause) -> tuple[bool, float]:
+    def verdict(self, statement: s.CheckClause) -> str:
+        """The verdict of a check of the ego, or of it and each or some v."""
+        if not self.checked(statement, unknown=True, due=True)[0]:
+            return "false"
+        if self.checked(statement, unknown=False)[0]:
+            return "true"
+        pending = self.checked(statement, unknown=False, due=True)[0]
+        return "pending" if pending else "unknown"
+
+    def checked(
+        self, statement: s.CheckClause, *, unknown: bool | None = None, due: bool | None = None
+    ) -> tuple[bool, float]:
         """Whether a check of the ego, or of it and each or some v, is met, and by how much."""
         # The signs of the map are entities, too.
         domain = self.ever("Entity")
@@ -493,7 +589,7 @@ class Told:
             domain = [node for node in domain if node != ego]
         asked = {one.word for one in statement.quantifiers}
         bindings = [{"v": v, "ego": ego} for v in domain] if asked else [{"ego": ego}]
-        with self.under_not(absent="FORSOME" not in asked):
+        with self.counting("FORSOME" not in asked, unknown, due=due):
             values = [self.true(statement.formula, 0, binding) for binding in bindings]
             margins = [self.margin(statement.formula, 0, binding) for binding in bindings]
         if "FORSOME" in asked:
@@ -1454,6 +1550,56 @@ def compare_check(world: World, store: Store, *checks: str) -> int:
                 assert told.value == 0 or (told.value > 0) == expected, (text, told)
             violated += not expected
     return violated
+
+
+UNKNOWN_ATOMS = (
+    *("closing_speed(ego, v) > 1", "NOT closing_speed(ego, v) < 2", "v.length > 3", "v.width < 2"),
+    *("prev(v.speed) > 1", "delta(v.speed, 0.2s) < 1", "max_over(v.speed, 0.2s) > 1"),
+    *("run_length(v.speed > 1) >= 2frames", "since_true(closing_speed(ego, v) < 2) > 0.1s"),
+    *("NOT v.speed > 1", "coalesce(v.speed, 0) < 1", "v.speed IS NULL", "v.speed > ego.speed"),
+    *("exists_now(v)", "v.special = 'taxi'", "EXISTS {(ego)-[:near]->(v)}", "dist(ego, v) < 5"),
+)
+
+
+def unknown_check(rng: random.Random) -> str:
+    """A check of values that may be unknown."""
+
+    def formula(depth: int) -> str:
+        if depth == 0:
+            return rng.choice(UNKNOWN_ATOMS)
+        bound = rng.choice(("", "", "[0s, 0.3s]", "[0.2s, 0.5s]", "[0frames, 2frames]"))
+        shapes = [
+            *("NOT ({0})", "({0}) AND ({1})", "({0}) OR ({1})", "({0}) IMPLIES ({1})"),
+            *(f"{word}{bound} ({{0}})" for word in ("ALWAYS", "EVENTUALLY", "ONCE")),
+            *("NEXT ({0})", "PREVIOUS ({0})", "({0}) XOR ({1})", f"({{0}}) UNTIL{bound} ({{1}})"),
+        ]
+        inner = [formula(depth - 1) for _ in range(2)]
+        return rng.choice(shapes).format(*inner)
+
+    word = rng.choice(("FORALL", "FORALL", "FORSOME"))
+    always = rng.choice(("ALWAYS", "ALWAYS", "EVENTUALLY", ""))
+    return f"CHECK c: {word} (v:Entity) {always} ({formula(rng.randint(0, 2))})"
+
+
+def compare_unknown(world: World, store: Store, *checks: str) -> Counter[str]:
+    """Ask checks whose values may be unknown, both ways; how often each verdict is right."""
+    texts = [text.replace("CHECK c:", f"CHECK c{n}:", 1) for n, text in enumerate(checks)]
+    asked = ";".join(texts)
+    verdicts = {(one.trace, one.check): one for one in store.check(asked)}
+    online = margins_watched(world, asked, periods(store))
+    found: Counter[str] = Counter()
+    for n, text in enumerate(texts):
+        (statement,) = parse(text)
+        assert isinstance(statement, s.CheckClause)
+        for trace in world.traces:
+            stored, watched = (told[trace.name, f"c{n}"] for told in (verdicts, online))
+            if stored.reason and " is unknown" not in stored.reason:
+                continue  # the trace cannot answer at all
+            wanted = Told(trace, periods(store)[trace.name]).verdict(statement)
+            assert stored.verdict == wanted, (text, stored, wanted)
+            assert watched.verdict == wanted, (text, watched, wanted)
+            found[wanted] += 1
+    return found
 
 
 def margins_watched(world: World, text: str, period: dict[str, int]) -> dict[Any, Verdict]:

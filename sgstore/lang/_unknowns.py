@@ -51,7 +51,13 @@ def any_of(conditions: Iterable[b.Bound]) -> b.Bound:
 
 def has_pairs(value: b.Bound) -> bool:
     """Tell whether a value is made of numbers of pairs, which some pairs do not have."""
-    return any(isinstance(part, b.PairNumber) for part in b.walk(value))
+    match value:
+        case b.PairNumber():
+            return True
+        case b.SignalCall(word="run_length" | "since_true" | "robustness"):
+            return False
+        case _:
+            return any(map(has_pairs, b.operands_of(value)))
 
 
 def negated(condition: b.Bound) -> b.Bound:  # noqa: PLR0911 - a case each

@@ -18,7 +18,6 @@ import sgstore.temporal._formula as f
 from sgstore.lang import (
     CONNECTIVES,
     Type,
-    any_of,
     certain,
     has_pairs,
     negated,
@@ -282,12 +281,12 @@ class CheckPlan(Plan):
         counted = self._counted(things, reading)
         state = self._state(expression)
         known = b.Operation("=", (state, _number(0)), Type.boolean)
-        if counted:
-            found = self._tested(_boolean("AND", known, _contrary(expression)), expression)
-            sign = _CONTRARY[reading.unknown]
-        else:
-            found = self._tested(_boolean("AND", known, expression), expression)
-            sign = reading.unknown
+        ways = [expression]
+        if self._open_runs(expression):
+            ways.append(_with_possible_runs(expression))
+        ways = [_contrary(one) for one in ways] if counted else ways
+        found = self._tested(_boolean("AND", known, *ways), expression)
+        sign = _CONTRARY[reading.unknown] if counted else reading.unknown
         doubt = self._doubtful(expression, state) if sign else None
         whole: f.Formula = f.Proposition(found)
         if doubt is not None:
@@ -308,13 +307,19 @@ class CheckPlan(Plan):
         ways: list[b.Bound] = []
         if any(self._may_be_unknown(part) for part in b.walk(state)):
             ways.append(b.Operation(">", (state, _number(0)), Type.boolean))
-        runs = [p for p in b.walk(expression) if isinstance(p, b.SignalCall) and p.word in _RUNS]
-        if any(self._open(run.operand) for run in runs):
+        if self._open_runs(expression):
             there = b.Operation(">=", (state, _number(0)), Type.boolean)
             other = _with_possible_runs(expression)
             differ = _case(expression, _case(other, FALSE, TRUE), _case(other, TRUE, FALSE))
             ways.append(_boolean("AND", there, differ))
-        return any_of(ways) if ways else None
+        if len(ways) > 1:
+            return _case(ways[0], TRUE, ways[1])
+        return ways[0] if ways else None
+
+    def _open_runs(self, expression: b.Bound) -> bool:
+        """Tell whether an expression is about runs of conditions that may be unknown."""
+        runs = [p for p in b.walk(expression) if isinstance(p, b.SignalCall) and p.word in _RUNS]
+        return any(self._open(run.operand) for run in runs)
 
     def _open(self, condition: b.Bound) -> bool:
         """Tell whether a condition within ``run_length`` may be unknown."""
