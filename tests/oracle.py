@@ -503,7 +503,9 @@ def pair(name: str, a: dict[str, Any], b: dict[str, Any]) -> float | None:
     if any(axis not in n for n in (a, b) for axis in "xyz"):
         return None
     dx, dy, dz = (b[axis] - a[axis] for axis in "xyz")
-    if name in {"dist", "closing_speed"} and abs(dz) >= 2.5:  # on another storey
+    hung = {"traffic_light", "stop_sign", "yield_sign", "speed_limit", "sign"}
+    level = a["kind"] in hung or b["kind"] in hung or abs(dz) < 2.5
+    if name in {"dist", "closing_speed"} and not level:  # on another storey
         return None
     if name == "dist":
         return math.sqrt(dx * dx + dy * dy + dz * dz)
