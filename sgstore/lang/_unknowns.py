@@ -146,6 +146,8 @@ def possible(condition: b.Bound) -> b.Bound:
     match condition:
         case b.Operation("AND" | "OR", operands):
             return replace(condition, operands=tuple(map(possible, operands)))
+        case b.Operation("NOT", (b.BlockValue(),)):
+            return condition  # a match that is known is one
         case b.Operation("NOT", (operand,)):
             doubt = unknown(operand)
             return certain(condition) if doubt is None else any_of((certain(condition), doubt))

@@ -1,0 +1,343 @@
+"""Verdicts of checks: what counts where an entity is absent, where too little is known, and at the end."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
+
+import pytest
+from oracle_over_time import compare_unknown, unknown_check, worlds
+from thorough import LONG
+
+import sgstore
+from sgstore.cli._checks import write_junit
+from sgstore.ingest import ingest
+from sgstore.step import Frame
+from sgstore.temporal import Monitor
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from sgstore.temporal import Verdict
+
+NO_TOUCH = "CHECK no_touch: FORALL (v:Vehicle) ALWAYS gap(ego, v) > 0"
+Car = dict[str, Any]
+
+
+def car(ident: str, x: float, y: float = 0.0, **more: Any) -> Car:
+    sized = {"heading": 0.0, "length": 4.0, "width": 2.0, "height": 1.5, "vx": 10.0, "vy": 0.0}
+    return {"ident": ident, "x": x, "y": y, "z": 0.75, **sized, **more}
+
+
+def frame_of(number: int, cars: Sequence[Car]) -> Frame:
+    frame = Frame(time_ns=number * 100_000_000, ego="ego")
+    for one in cars:
+        own = dict(one)
+        frame.add(own.pop("ident"), "car", own.pop("x"), own.pop("y"), own.pop("z"), **own)
+    return frame
+
+
+def judged(text: str, scene: Sequence[Sequence[Car]]) -> Verdict:
+    monitor = Monitor(text, period_s=0.1, trace="drive")
+    for number, cars in enumerate(scene):
+        monitor.step(frame_of(number, cars))
+    (verdict,) = monitor.finish()
+    return verdict
+
+
+def following(frames: int, change: Callable[[int, Car], Car | None]) -> list[list[Car]]:
+    """The ego and a car 12 m ahead of it, as it is changed; ``None``: it is absent."""
+    scene: list[list[Car]] = []
+    for number in range(frames):
+        other = change(number, car("v", number + 12.0))
+        scene.append([car("ego", float(number)), *([other] if other else [])])
+    return scene
+
+
+# Random checks of random worlds against definitions ----------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(100, 400) if LONG else (13, 18, 30))
+def test_verdicts_are_what_their_definition_says(tmp_path: Path, seed: int) -> None:
+    rng, (world, store) = random.Random(seed), worlds(seed, tmp_path)
+    found = Counter[str]()
+    for _ in range(12):
+        found += compare_unknown(world, store, unknown_check(rng))
+
+    assert sum(found.values()) > 12
+    assert {"true", "false"} <= set(found)
+
+
+# Absent -----------------------------------------------------------------------------------------------
+
+
+def test_who_leaves_the_recording_touches_nobody(data: Path, tmp_path: Path) -> None:
+    path = tmp_path / "merge.sgstore"
+    ingest(path, [data / "traces/esmini/highway_merge.mcap"])
+    store = sgstore.open(path)
+
+    (verdict,) = store.check(f"{NO_TOUCH} ROBUSTNESS")
+    (old,) = store.check(NO_TOUCH.replace("Vehicle", "Vehicle ABSENT AS FALSE"))
+
+    assert verdict.verdict == "true"
+    assert 0 < verdict.absent_frames < 286
+    assert verdict.robustness is not None
+    least = store.find("MATCH (e:Ego), (v:Vehicle) RETURN MIN(gap(e, v)) AS m").rows()[0][0]
+    assert verdict.robustness.value == pytest.approx(least)
+    assert list(store.shrink(NO_TOUCH)) == []
+    assert old.verdict == "false"
+
+
+def gone_in_between(number: int, other: Car) -> Car | None:
+    return None if 3 <= number < 6 else other
+
+
+@pytest.mark.parametrize(
+    ("check", "verdict"),
+    [
+        ("FORALL (v:Car) ALWAYS gap(ego, v) > 5", "true"),
+        ("FORALL (v:Car) ALWAYS NOT gap(ego, v) <= 5", "true"),
+        ("FORALL (v:Car) ALWAYS gap(ego, v) > 9", "false"),
+        ("FORALL (v:Car) ALWAYS NOT gap(ego, v) <= 9", "false"),
+        ("FORALL (v:Car ABSENT AS TRUE) ALWAYS gap(ego, v) > 5", "true"),
+        ("FORALL (v:Car ABSENT AS FALSE) ALWAYS gap(ego, v) > 5", "false"),
+        ("FORALL (v:Car ABSENT AS FALSE) ALWAYS NOT gap(ego, v) <= 5", "true"),
+        ("FORSOME (v:Car) ALWAYS gap(ego, v) > 5", "false"),
+        ("FORSOME (v:Car) ALWAYS NOT gap(ego, v) <= 5", "false"),
+        ("FORSOME (v:Car) EVENTUALLY gap(ego, v) > 5", "true"),
+        ("FORSOME (v:Car) EVENTUALLY gap(ego, v) > 9", "false"),
+        ("FORALL (v:Car) ALWAYS exists_now(v)", "false"),
+        ("FORALL (v:Car) ALWAYS NOT run_length(gap(ego, v) > 5) > 3frames", "false"),
+        ("FORALL (v:Car) ALWAYS NOT run_length(gap(ego, v) > 5) > 4frames", "true"),
+        ("ALWAYS abs(delta(ego.speed, 0.2s)) < 1", "true"),
+        ("ALWAYS prev(ego.speed) > 5", "true"),
+        ("ALWAYS prev(ego.speed) > 15", "false"),
+        ("ALWAYS sum_over(ego.speed, 3frames) > 25", "true"),
+        ("ALWAYS sum_over(ego.speed, 3frames) > 35", "false"),
+        ("FORALL (v:Car) ALWAYS delta(v.x, 1frames) > 0.5", "true"),
+        ("FORALL (v:Car) ALWAYS coalesce(prev(v.speed), 99) < 50", "false"),
+    ],
+)
+def test_an_absent_entity_neither_violates_nor_fulfils(check: str, verdict: str) -> None:
+    found = judged(f"CHECK c: {check}", following(10, gone_in_between))
+
+    assert found.verdict == verdict
+    assert found.absent_frames == (3 if verdict == "true" and "v:Car" in check else 0)
+
+
+def test_absence_is_never_an_infinite_fault() -> None:
+    scene = following(10, gone_in_between)
+
+    near = judged("CHECK c: FORALL (v:Car) ALWAYS gap(ego, v) > 5 ROBUSTNESS", scene)
+    lately = judged("CHECK c: ALWAYS delta(ego.x, 0.2s) > 1 ROBUSTNESS", scene)
+
+    assert near.robustness is not None
+    assert lately.robustness is not None
+    assert near.robustness.value == pytest.approx(3.0)
+    assert near.robustness.upper is None
+    assert lately.robustness.value == pytest.approx(1.0)
+
+
+# Unknown ----------------------------------------------------------------------------------------------
+
+
+def without_size(number: int, other: Car) -> Car:
+    return {**other, "length": float("nan")} if number == 4 else other
+
+
+@pytest.mark.parametrize(
+    ("check", "verdict"),
+    [
+        ("FORALL (v:Car) ALWAYS gap(ego, v) > 5", "unknown"),
+        ("FORALL (v:Car) ALWAYS NOT gap(ego, v) <= 5", "unknown"),
+        ("FORALL (v:Car) ALWAYS gap(ego, v) > 9", "false"),
+        ("FORALL (v:Car) ALWAYS (dist(ego, v) > 5 OR gap(ego, v) > 5)", "true"),
+        ("FORALL (v:Car) ALWAYS (dist(ego, v) > 50 AND gap(ego, v) > 5)", "false"),
+        ("FORALL (v:Car) EVENTUALLY gap(ego, v) > 5", "true"),
+        ("FORSOME (v:Car) ALWAYS gap(ego, v) > 5", "unknown"),
+        ("FORSOME (v:Car) ALWAYS gap(ego, v) > 9", "false"),
+        ("ALWAYS NOT EXISTS {(v:Car) WHERE gap(ego, v) < 1}", "unknown"),
+        ("ALWAYS EXISTS {(v:Car) WHERE gap(ego, v) > 5 OR dist(ego, v) > 5}", "true"),
+        ("FORALL (v:Car) ALWAYS max_over(v.length, 3frames) < 5", "unknown"),
+        ("FORALL (v:Car) ALWAYS NOT run_length(gap(ego, v) > 5) >= 20frames", "true"),
+        ("FORALL (v:Car) ALWAYS NOT run_length(gap(ego, v) > 5) >= 8frames", "unknown"),
+        ("FORALL (v:Car) ALWAYS NOT run_length(gap(ego, v) > 5) >= 4frames", "false"),
+        ("FORALL (v:Car) ALWAYS v.length IS NOT NULL", "false"),
+    ],
+)
+def test_what_is_unknown_decides_nothing(check: str, verdict: str) -> None:
+    found = judged(f"CHECK c: {check}", following(10, without_size))
+
+    assert found.verdict == verdict
+
+
+def test_an_unknown_verdict_names_condition_entity_and_frame() -> None:
+    found = judged("CHECK c: FORALL (v:Car) ALWAYS gap(ego, v) > 5", following(10, without_size))
+
+    assert "gap(ego, v)" in found.reason
+    assert "car 1" in found.reason
+    assert found.reason.endswith("in drive#4")
+    assert not found.violated
+
+
+def test_an_unknown_value_bounds_robustness() -> None:
+    text = "CHECK c: FORALL (v:Car) ALWAYS (gap(ego, v) > 5 OR dist(ego, v) > 11) ROBUSTNESS"
+
+    found = judged(text, following(10, without_size)).robustness
+
+    assert found is not None
+    assert found.value == pytest.approx(1.0)
+    assert found.upper == pytest.approx(3.0)
+
+
+def test_a_number_that_does_not_exist_is_not_unknown() -> None:
+    scene = following(10, lambda _, other: {**other, "vx": 20.0})
+
+    for text in ("NOT ttc(ego, v) < 2", "ttc(ego, v) >= 2"):
+        assert judged(f"CHECK c: FORALL (v:Car) ALWAYS {text}", scene).verdict == "true"
+
+
+# Still due --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("check", "frames", "verdict"),
+    [
+        ("EVENTUALLY[0s, 5s] ego.speed > 30", 50, "pending"),
+        ("EVENTUALLY[0s, 5s] ego.speed > 30", 51, "false"),
+        ("EVENTUALLY[0s, 5s] ego.speed > 5", 2, "true"),
+        ("EVENTUALLY ego.speed > 30", 20, "false"),
+        ("ALWAYS (ego.speed > 5 IMPLIES EVENTUALLY[0s, 1s] ego.speed > 30)", 8, "pending"),
+        ("ALWAYS (ego.speed > 5 IMPLIES EVENTUALLY[0s, 1s] ego.speed > 30)", 30, "false"),
+        ("ALWAYS[0s, 5s] ego.speed > 5", 20, "true"),
+        ("ALWAYS NEXT ego.speed > 5", 20, "pending"),
+        ("ALWAYS WEAKNEXT ego.speed > 5", 20, "true"),
+        ("ego.speed > 5 UNTIL[0frames, 30frames] ego.speed > 30", 20, "pending"),
+        ("ego.speed > 30 UNTIL[0frames, 30frames] ego.speed > 40", 20, "false"),
+        ("FORALL (v:Car) EVENTUALLY[0s, 5s] gap(ego, v) > 9", 20, "pending"),
+    ],
+)
+def test_what_is_not_over_at_the_end_is_pending(check: str, frames: int, verdict: str) -> None:
+    scene = following(frames, lambda _, other: other)
+
+    assert judged(f"CHECK c: {check}", scene).verdict == verdict
+    if verdict == "pending":
+        assert judged(f"USING END strong CHECK c: {check}", scene).verdict == "false"
+        assert judged(f"USING END weak CHECK c: {check}", scene).verdict == "true"
+
+
+def test_all_that_is_due_may_be_pending() -> None:
+    scene = following(20, lambda _, other: other)
+
+    asked = {"EVENTUALLY ego.speed > 30": "pending", "ALWAYS ego.speed > 5": "true"}
+    for check, verdict in asked.items():
+        assert judged(f"USING END pending CHECK c: {check}", scene).verdict == verdict
+
+
+def test_build_servers_skip_what_is_not_decided(tmp_path: Path) -> None:
+    scene = following(10, gone_in_between)
+    texts = ["EVENTUALLY[0s, 5s] ego.speed > 30", "FORALL (v:Car) ALWAYS gap(ego, v) > 5"]
+    told = [judged(f"CHECK c{n}: {text}", scene) for n, text in enumerate(texts)]
+
+    write_junit(tmp_path / "junit.xml", told)
+
+    pending, kept = ElementTree.parse(tmp_path / "junit.xml").getroot().findall("*/testcase")
+    (skipped,) = pending
+    assert (skipped.tag, skipped.get("message")) == (
+        "skipped",
+        "still due at the end of the recording",
+    )
+    assert [(one.tag, one.text) for one in kept] == [
+        ("system-out", "an entity is absent in 3 frames")
+    ]
+
+
+# Laws: less knowledge, and an earlier end, contradict nothing --------------------------------------
+
+RULES = (
+    "FORALL (v:Car) ALWAYS gap(ego, v) > 3",
+    "FORALL (v:Car) ALWAYS NOT ttc(ego, v) < 2",
+    "FORALL (v:Car) ALWAYS (v.speed > 8 IMPLIES EVENTUALLY[0s, 0.3s] dist(ego, v) > 8)",
+    "FORALL (v:Car) ALWAYS (abs(delta(v.speed, 0.2s)) < 3 OR prev(gap(ego, v)) > 5)",
+    "FORALL (v:Car) ALWAYS NOT run_length(gap(ego, v) < 6) >= 3frames",
+    "FORALL (v:Car) ALWAYS (max_over(v.speed, 0.2s) < 12 XOR v.length > 4.2)",
+    "FORSOME (v:Car) EVENTUALLY (gap(ego, v) < 4 AND v.speed < ego.speed)",
+    "FORSOME (v:Car) ALWAYS NOT headway(ego, v) < 0.5",
+    "FORALL (a:Car) FORSOME (b:Car) EVENTUALLY gap(a, b) < 5",
+    "ALWAYS NOT EXISTS {(v:Car) WHERE gap(ego, v) < 2 AND v.speed < ego.speed}",
+    "ALWAYS (COUNT {(v:Car) WHERE v.speed > 9} < 2)",
+    "ALWAYS NOT MIN {(v:Car) | gap(ego, v)} < 2",
+)
+REDUCED = ("length", "width", "vx", "heading")
+
+
+def random_scene(rng: random.Random) -> list[list[Car]]:
+    frames = rng.randint(4, 9)
+    cars = [
+        (f"v{n}", rng.uniform(-15, 25), rng.uniform(-3, 3), rng.uniform(4, 14), rng.uniform(3, 6))
+        for n in range(rng.randint(1, 3))
+    ]
+    away = {(n, rng.choice(cars)[0]) for n in range(frames) if rng.random() < 0.2}
+    scene: list[list[Car]] = []
+    for n in range(frames):
+        here = [car("ego", n * 0.9, vx=9.0)]
+        here += [
+            car(name, x + 0.1 * n * v, y, vx=v + rng.uniform(-1, 1), length=size)
+            for name, x, y, v, size in cars
+            if (n, name) not in away
+        ]
+        scene.append(here)
+    return scene
+
+
+def reduced(scene: list[list[Car]], rng: random.Random) -> list[list[Car]]:
+    """The same scene, of which less was recorded: sizes, speeds and headings of some cars."""
+
+    def less(one: Car) -> Car:
+        names = [name for name in REDUCED if rng.random() < 0.25]
+        names += ["vy"] if "vx" in names else []
+        return one | dict.fromkeys(names, float("nan"))
+
+    share = rng.choice((0.1, 0.3, 0.6))
+    return [[less(one) if rng.random() < share else one for one in cars] for cars in scene]
+
+
+def all_judged(scene: Sequence[Sequence[Car]], rules: Sequence[str]) -> dict[str, str]:
+    text = ";".join(f"CHECK c{n}: {rule}" for n, rule in enumerate(rules))
+    monitor = Monitor(text, period_s=0.1, trace="drive")
+    for number, cars in enumerate(scene):
+        monitor.step(frame_of(number, cars))
+    return {rules[int(one.check[1:])]: one.verdict for one in monitor.finish()}
+
+
+def test_less_knowledge_contradicts_no_verdict() -> None:
+    known: Counter[str] = Counter()
+    for seed in range(10_000 if LONG else 60):
+        rng = random.Random(seed)
+        scene, rules = random_scene(rng), rng.sample(RULES, 4)
+        whole, less = all_judged(scene, rules), all_judged(reduced(scene, rng), rules)
+        for rule, verdict in less.items():
+            known[verdict] += 1
+            if verdict in {"true", "false"}:
+                assert whole[rule] == verdict, (seed, rule)
+
+    assert min(known["true"], known["false"], known["unknown"]) > 10
+
+
+def test_an_earlier_end_violates_nothing_more() -> None:
+    ended: Counter[str] = Counter()
+    for seed in range(2_000 if LONG else 60):
+        rng = random.Random(seed)
+        scene, rules = random_scene(rng), rng.sample(RULES, 4)
+        first = scene[: rng.randint(1, len(scene) - 1)]
+        whole, cut = all_judged(scene, rules), all_judged(first, rules)
+        for rule, verdict in cut.items():
+            ended[verdict] += 1
+            # Who comes later may fulfil what FORSOME asks for, and an operator without a bound waits for it.
+            if verdict == "false" and "FORSOME" not in rule:
+                assert whole[rule] == "false", (seed, rule)
+
+    assert min(ended["true"], ended["false"], ended["pending"]) > 3
