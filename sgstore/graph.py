@@ -203,6 +203,38 @@ class WorldBlock:
 
 
 @dataclass(frozen=True, slots=True)
+class LeftOut:
+    """How many states of a recording settings leave out of graphs; those of what never moves do not count.
+
+    Attributes
+    ----------
+    states : int
+        All states.
+    beyond_radius, beyond_world : int
+        Those that are out of range of the graphs; and those of them that are out of ``[range] world``, too.
+    excluded : tuple of (int, int)
+        Codes of kinds, and states of what is not wanted of each.
+    """
+
+    states: int = 0
+    beyond_radius: int = 0
+    beyond_world: int = 0
+    excluded: tuple[tuple[int, int], ...] = ()
+
+    def more(self, other: LeftOut) -> LeftOut:
+        """Return the counts of both together."""
+        excluded = dict(self.excluded)
+        for code, many in other.excluded:
+            excluded[code] = excluded.get(code, 0) + many
+        return LeftOut(
+            self.states + other.states,
+            self.beyond_radius + other.beyond_radius,
+            self.beyond_world + other.beyond_world,
+            tuple(sorted(excluded.items())),
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class GraphBlock:
     """Scene graphs of the frames of a block.
 
@@ -223,6 +255,8 @@ class GraphBlock:
         are, the frame, and how many bodies it has.
     world : WorldBlock or None
         What is known beyond the graphs; ``None`` where the settings want nothing of it.
+    left_out : LeftOut
+        What settings leave out.
     """
 
     frames: FrameBlock
@@ -232,6 +266,7 @@ class GraphBlock:
     gaps: LaneGaps
     crowded: tuple[tuple[str, int, int], ...] = ()
     world: WorldBlock | None = None
+    left_out: LeftOut = LeftOut()
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -507,6 +542,8 @@ class SceneGraph:
         not say whether it has.
     around : callable, optional
         Gives the same with all that is known beyond it; see :meth:`known`.
+    out_of_world : int
+        Online: how many entities of the frame are out of ``[range] world``, so that nothing is known of them.
     """
 
     frame_id: int
@@ -523,13 +560,16 @@ class SceneGraph:
         repr=False,
     )
     around: Callable[[], SceneGraph] | None = field(default=None, compare=False, repr=False)
+    out_of_world: int = field(default=0, compare=False, repr=False)
 
     def known(self) -> SceneGraph:
         """All that is known of the world around: this graph, and what lies beyond it, out to ``[range] world``.
 
         Beyond it there are edges ``isIn``, ``controlsTrafficOf``, ``leads``, ``follows``, and those of the map.
         """
-        return self if self.around is None else replace(self.around(), events=self.events)
+        if self.around is None:
+            return self
+        return replace(self.around(), events=self.events, out_of_world=self.out_of_world)
 
     def __repr__(self) -> str:
         size = f"{len(self.nodes)} nodes, {len(self.edges)} edges"

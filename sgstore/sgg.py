@@ -27,7 +27,7 @@ from sgstore import compiled
 from sgstore.abstractions import Classes, GraphColumns, MapColumns, abstraction_named, lane_roles
 from sgstore.columns import chained, taken
 from sgstore.errors import ConfigError
-from sgstore.graph import Edges, GraphBlock, LaneStates, StaticPresence, WorldBlock
+from sgstore.graph import Edges, GraphBlock, LaneStates, LeftOut, StaticPresence, WorldBlock
 from sgstore.relations import (
     IS_SIGNAL,
     IS_UPRIGHT,
@@ -232,7 +232,27 @@ class SceneGraphGenerator:
         beyond = None
         if self._outer is not None:
             beyond = self._beyond(frames, poses, self._outer, keys)
-        return _View(_reduced(frames, kept), here, areas, keys, beyond)
+        left_out = self._counted(frames, named, len(kept), beyond)
+        return _View(_reduced(frames, kept), here, areas, keys, beyond, left_out)
+
+    def _counted(
+        self, frames: FrameBlock, named: Bools, drawn: int, beyond: _Beyond | None
+    ) -> LeftOut:
+        """How many states are left out of graphs that have so many of them."""
+        kind = self._kinds[frames.states.node]
+        wanted = self._wanted(frames.states.node, kind) | named
+        known = 0 if beyond is None else len(beyond.frames.states)
+        codes, many = np.unique(kind[~wanted], return_counts=True)
+        return LeftOut(
+            len(kind),
+            int(wanted.sum()) - drawn,
+            int(wanted.sum()) - drawn - known,
+            tuple(zip(codes.tolist(), many.tolist(), strict=True)),
+        )
+
+    def _wanted(self, node: Ints, kind: Codes) -> Bools:
+        """Mask of what the client wants, wherever it is."""
+        return self._keeping.entities(kind) & ~self._left_out[node]
 
     def _beyond(self, frames: FrameBlock, poses: EgoPoses, outer: Extent, keys: Ints) -> _Beyond:
         """What is known beyond the graph of one ego, of which ``keys`` are."""
@@ -323,6 +343,7 @@ class SceneGraphGenerator:
             gaps=self._keeping.gaps(gaps(bodies, ground)),
             crowded=self._crowded(bodies, {NEAR: over_near, TOUCHING: over_touching}),
             world=self._world_of(view, world.whole, ground, edges),
+            left_out=view.left_out,
         )
 
     def _world_of(
@@ -544,7 +565,7 @@ class SceneGraphGenerator:
         states = frames.states
         kind = self._kinds[states.node]
         held = areas.hold(frames.frame_of, _boxes(states), _bottom(states), hung=IS_SIGNAL[kind])
-        return held & self._keeping.entities(kind) & ~self._left_out[states.node]
+        return held & self._wanted(states.node, kind)
 
     def _bodies(self, frames: FrameBlock, keys: Ints) -> Bodies:
         """The states of a block and the scenery that stands in it, as rows of one table."""
@@ -598,6 +619,7 @@ class _View:
         What is in range, ascending: rows of the block's states, and beyond them the scenery, frame by frame.
     beyond : _Beyond or None
         What is known beyond it.
+    left_out : LeftOut
     """
 
     frames: FrameBlock
@@ -605,6 +627,7 @@ class _View:
     areas: Areas
     keys: Ints
     beyond: _Beyond | None
+    left_out: LeftOut
 
 
 @dataclass(frozen=True, slots=True)

@@ -523,6 +523,7 @@ class Records:
             Node id of the records → entity, of all that move in the frame.
         """
         found = self._graph(graph, (graph,), graph.edges, outer, known)
+        found = replace(found, out_of_world=graph.left_out.beyond_world)
         if (world := graph.world) is None:
             return found
 

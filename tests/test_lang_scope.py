@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import pytest
@@ -374,3 +375,65 @@ def test_a_frame_has_a_world_around_its_graph(
             )
             assert ours == theirs, name
         assert alone.file.graph(frame).known().nodes.keys() == alone.file.graph(frame).nodes.keys()
+
+
+# What settings leave out -----------------------------------------------------------------------------
+
+LONG_ROAD: Final = Scene(
+    WAYS, ego(along(RIGHT), 20), actor("v", along(LEFT), 30, start=390), seconds=1
+)
+APART: Final = "CHECK apart: FORALL (v:Vehicle) ALWAYS dist(ego, v) > 60"
+SLOW: Final = "CHECK slow: FORALL (v:Vehicle) ALWAYS v.speed < 25"
+
+
+@pytest.mark.parametrize(
+    ("radius", "world", "apart", "slow"),
+    [
+        (50, 0, "unknown", "unknown"),
+        (50, 100, "true", "unknown"),
+        (50, 200, "true", "unknown"),
+        (50, 400, "true", "false"),
+        (400, 0, "true", "false"),
+    ],
+)
+def test_a_verdict_is_unknown_where_the_trace_knows_less_than_the_check_looks(
+    tmp_path: Path, radius: float, world: float, apart: str, slow: str
+) -> None:
+    config = ranged(radius, world)
+    store = store_of(tmp_path / "s.sgstore", {"road": [LONG_ROAD]}, {"road": config})
+    monitor = Monitor(f"{APART}; {SLOW}", LONG_ROAD.road, config)
+    for frame in replayed([LONG_ROAD.block()]):
+        monitor.step(frame)
+    watched = {one.check: one for one in monitor.finish()}
+    for text, expected in ((APART, apart), (SLOW, slow)):
+        (found,) = store.check(text)
+        assert found.verdict == watched[found.check].verdict == expected
+        assert ("around the ego, and the trace knows" in found.reason) is (expected == "unknown")
+        assert found.reason == watched[found.check].reason
+        (found,) = store.check(f"USING SCOPE graph {text}")
+        assert found.verdict == ("false" if radius > 300 and text is SLOW else "true")
+
+
+def test_what_is_left_out_is_counted(tmp_path: Path) -> None:
+    scene = Scene(
+        WAYS,
+        ego(along(RIGHT), 20),
+        actor("near", along(LEFT), 20, start=30),
+        actor("far", along(LEFT), 20, start=100),
+        actor("p", along(LEFT), 20, "person", start=20),
+        actor("gone", along(LEFT), 20, start=390),
+        seconds=1,
+    )
+    config = replace(ranged(50, 200), kinds=("Vehicle",))
+    store = store_of(tmp_path / "s.sgstore", {"road": [scene]}, {"road": config})
+    (trace,) = store.traces()
+    frames = trace.frames
+    assert trace.report["scope"] == {
+        "radius": 50.0,
+        "world": 200.0,
+        "states": 5 * frames,
+        "beyond_radius": 2 * frames,
+        "beyond_world": frames,
+        "excluded": {"person": frames},
+        "rate": 0.0,
+    }

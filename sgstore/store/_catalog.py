@@ -6,6 +6,7 @@ statement.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
@@ -18,7 +19,7 @@ from sgstore.store._traces import stored_traces
 from sgstore.vocabulary import BEYOND, NAMES, RELATIONS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Mapping
 
     from duckdb import DuckDBPyConnection
 
@@ -60,6 +61,7 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
                 RelationScope.of(t.settings),
                 t.period_ns,
                 extents.get(t.trace_id, (0, 0)),
+                known_range(t.report.get("scope")),
             )
             for t in stored_traces(connection)
         ),
@@ -91,6 +93,19 @@ def _sets(connection: DuckDBPyConnection) -> tuple[DerivedSet, ...]:
     from sgstore.store._derive import sets_of
 
     return sets_of(connection)
+
+
+def known_range(scope: Mapping[str, Any] | None) -> float:
+    """How far around the ego all is known that was recorded; m. Infinite where nothing was left out.
+
+    Parameters
+    ----------
+    scope : mapping or None
+        What settings left out, as the report of a trace has it.
+    """
+    if scope is None or not scope["beyond_world"]:
+        return math.inf
+    return float(max(scope["radius"] or 0.0, scope["world"]))
 
 
 _KNOWN: Final = ("state", "node", "lane_state", "lane_gap")

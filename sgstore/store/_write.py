@@ -6,6 +6,7 @@ at all.
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -16,11 +17,13 @@ import numpy as np
 import sgstore.store._packing as packing
 import sgstore.store._payloads as payloads
 from sgstore.errors import StoreError
+from sgstore.graph import LeftOut
 from sgstore.store._classes import IngestedClasses
 from sgstore.store._packing import MAX_FRAMES, NodeKinds, texts
 from sgstore.store._payloads import FrameTimes, Happenings
 from sgstore.store._staging import Sealed, Staging
 from sgstore.store._traces import uri_of
+from sgstore.vocabulary import KINDS
 from sgstore.world import BUCKET_FRAMES, Origin, longest_step_ns, origin_of, quantize
 
 if TYPE_CHECKING:
@@ -114,6 +117,7 @@ class Segment:
         self._happenings = Happenings(identity.trace_id)
         self._next_seq = 0
         self._times: list[Ints] = []
+        self._left_out = LeftOut()
         self._constants = {name: [np.zeros(0, object)] for name in ("special", "subkind")}
         self._staging = Staging(store, place)
         try:
@@ -166,6 +170,7 @@ class Segment:
             raise StoreError(f"{self._info.path}: more than {MAX_FRAMES} frames in one trace")
         self._staging.settle(whole=self._next_seq % BUCKET_FRAMES == 0)
         self._next_seq += len(frames)
+        self._left_out = self._left_out.more(graph.left_out)
         self._kinds.learn(frames.entities)
         self._origin = self._origin or origin_of(frames)
         self._insert_graph(graph, self._identity.trace_id, self._origin or Origin(0.0, 0.0, 0.0))
@@ -269,13 +274,30 @@ class Segment:
             "origin_y": origin.y,
             "origin_z": origin.z,
             "answers": list(self._answers),
-            "report": packing.as_json(asdict(report) | dict(more or {})),
+            "report": packing.as_json(asdict(report) | self._scope() | dict(more or {})),
             "version": version("sgstore"),
         }  # fmt: skip
         words, path = staging.words(self._answers), self._info.path
         sealed = Sealed(staging.folder, path, identity, trace, staging.checksums, words)
         sealed.write()
         return sealed
+
+    def _scope(self) -> dict[str, Any]:
+        """What settings left out of the recording, as the report has it; nothing of an import."""
+        counts, settings = self._left_out, json.loads(self._identity.settings)
+        if not counts.states:
+            return {}
+        around = settings["range"]
+        scope = {
+            "radius": around["radius"] if around["shape"] == "radius" else None,
+            "world": around["world"],
+            "states": counts.states,
+            "beyond_radius": counts.beyond_radius,
+            "beyond_world": counts.beyond_world,
+            "excluded": {KINDS[code]: many for code, many in counts.excluded},
+            "rate": settings["rate"],
+        }
+        return {"scope": scope}
 
     def _parked(self, parked: Codes) -> Ints:
         known = np.full(len(self._kinds.entities), packing.MISSING)

@@ -475,6 +475,11 @@ class CheckMonitor:
         self._immediate = all(q.word == "FORALL" for q in check.quantifiers)
 
     @property
+    def check(self) -> BoundCheck:
+        """The check."""
+        return self._check
+
+    @property
     def name(self) -> str:
         """Of the check."""
         return self._check.name

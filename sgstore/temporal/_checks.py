@@ -337,6 +337,16 @@ _COLUMNS: Final = ("check", "trace", "verdict", "who", "from", "start", "end", "
 _MARGIN_COLUMNS: Final = ("robustness", "decided by", "in")
 
 
+def within_range(found: Verdict, short: ShortRange) -> Verdict:
+    """A verdict of what is known as one of the whole world: unknown, if too little is known for it."""
+    if found.verdict not in {"true", "false"}:
+        return found
+    reason = short.of(holds=found.verdict == "true")
+    if not reason:
+        return found
+    return replace(found, verdict="unknown", violations=(), witnesses=(), reason=reason)
+
+
 def verdict_columns(*, margin: bool = False, returned: Sequence[str] = ()) -> tuple[str, ...]:
     """Columns of verdicts for people.
 
@@ -765,6 +775,7 @@ class StoreCheck:
             found = replace(found, reason=self._reason(trace, strict, other))
         if word == "true":
             found = replace(found, absent_frames=self._absences.get(trace.trace_id, 0))
+        found = within_range(found, self._short.get(trace.trace_id, ShortRange()))
         if self._quantity is None:
             return found
         robustness = self._robustness(self._quantity, trace, levels)

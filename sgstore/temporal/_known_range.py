@@ -11,7 +11,7 @@ from sgstore.records import dataclass
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from sgstore.lang import Catalog
+    from sgstore.lang import Catalog, FrameView
     from sgstore.lang.ir import BoundCheck
     from sgstore.store import StoreFile
 
@@ -49,7 +49,11 @@ def short_ranges(file: StoreFile, catalog: Catalog, check: BoundCheck) -> Mappin
     check : BoundCheck
     """
     limited = [trace for trace in catalog.traces if trace.known < math.inf]
-    if check.unknown_is_false or not _any_short(horizon(check), [t.known for t in limited]):
+    if (
+        not check.world
+        or check.unknown_is_false
+        or not _any_short(horizon(check), [t.known for t in limited])
+    ):
         return {}
     fastest = dict(file.rows(_SPEEDS).values)
     found: dict[int, ShortRange] = {}
@@ -81,3 +85,34 @@ def short_range(needed: Horizon, known: float) -> ShortRange:
         return f"it depends on {far} around the ego, and the trace knows {known:g} m"
 
     return ShortRange(reason(needed.true), reason(needed.false))
+
+
+@dataclass(slots=True)
+class SeenRange:
+    """What a monitor has seen of the world around an ego, out to a distance.
+
+    Attributes
+    ----------
+    known : float
+        The distance; m.
+    cut : bool
+        Whether something was told that lies beyond it.
+    fastest : float
+        The greatest speed so far; m/s.
+    """
+
+    known: float
+    cut: bool = False
+    fastest: float = 0.0
+
+    def see(self, view: FrameView) -> None:
+        """Take note of a frame."""
+        self.cut = self.cut or view.graph.out_of_world > 0
+        speeds = (about.get("speed", 0.0) for about in view.nodes.values())
+        self.fastest = max(self.fastest, *speeds, 0.0)
+
+    def short(self, check: BoundCheck) -> ShortRange:
+        """Why it cannot be told that a check is true, or false, of what was seen."""
+        if not self.cut or not check.world or check.unknown_is_false:
+            return ShortRange()
+        return short_range(horizon(check, self.fastest), self.known)

@@ -36,8 +36,9 @@ from sgstore.readers import on_map, open_trace
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.step import GcPaused, replayed
 from sgstore.temporal._check_monitor import CheckMonitor
-from sgstore.temporal._checks import Verdict
+from sgstore.temporal._checks import Verdict, within_range
 from sgstore.temporal._expression_monitor import sequence_monitor
+from sgstore.temporal._known_range import SeenRange
 from sgstore.temporal._sequence_monitor import FrameTime, MonitorEvent, SequenceMonitor
 from sgstore.temporal._valuation import NodeNames, QueryCache, StreamClock
 
@@ -262,6 +263,10 @@ class Monitor:
         self._egos: list[str] = []
         self._questions: list[QueryCache] = []
         self._scopes: list[tuple[int, bool]] = []
+        self._seen: list[SeenRange] = []
+        around = config.range
+        radius = around.radius if around.shape == "radius" else 0.0
+        self._known = max(radius, around.world)
         self._pulse = StreamClock(None if period_s is None else round(period_s * 1e9))
         self._last: FrameTime | None = None
         self._watches: list[tuple[int, CheckMonitor, _PendingEvents]] = []
@@ -296,6 +301,7 @@ class Monitor:
         if scope not in self._scopes:
             self._scopes.append(scope)
             self._questions.append(QueryCache())
+            self._seen.append(SeenRange(self._known))
         number = self._scopes.index(scope)
         return number, self._questions[number]
 
@@ -340,9 +346,12 @@ class Monitor:
         tick, time = self._pulse.tick, self._pulse.told(self._pulse.tick.time)
         here = FrameTime(tick.number, time, (time - self._pulse.start) / 1e9)
         people: list[NodeNames] = []
-        for (number, world), questions in zip(self._scopes, self._questions, strict=True):
+        scopes = zip(self._scopes, self._questions, self._seen, strict=True)
+        for (number, world), questions, seen in scopes:
             view = self._view(graphs[number], here, number if classed else None)
             view = view.in_world() if world else view
+            if world:
+                seen.see(view)
             people.append(NodeNames(view))
             questions.ask(view, people[-1])
         return here, people
@@ -427,12 +436,12 @@ class Monitor:
         verdicts: list[Verdict] = []
         events: list[MonitorEvent] = []
         unknown = dict(self._unknown)
-        for _, watch, waiting in self._watches:
+        for scope, watch, waiting in self._watches:
             if waiting.reason:
                 unknown[watch.name] = waiting.reason
                 continue
             verdict, late = watch.finish(self.trace, self._last)
-            verdicts.append(verdict)
+            verdicts.append(within_range(verdict, self._seen[scope].short(watch.check)))
             events += late
         for _, follow, waiting in self._follows:
             if not waiting.reason:
