@@ -174,7 +174,7 @@ def block_rows(path: Path, **how: Any) -> list[tuple[str, Any]]:
         found: list[tuple[str, Any]] = [
             (name, getattr(info, name)) for name in ("flavour", "ego", "map_text", "map_name")
         ]
-        found.append(("channels", [(c.id, c.topic, c.schema, c.role) for c in info.channels]))
+        found.append(("channels", [(c.topic, c.schema, c.role) for c in info.channels]))
         found.append(("context", sorted(zip(*_refs(info.context), strict=True))))
         for block in trace.blocks():
             for part in (block, block.states, block.entities, block.scenery):

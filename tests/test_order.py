@@ -17,6 +17,7 @@ from test_flavours import EXAMPLES
 from thorough import LONG
 
 import sgstore.mcap._order as order
+from sgstore.cli import run
 from sgstore.demo import RECORDING
 from sgstore.mcap import Findings, McapFile
 from sgstore.readers import channel_rank, open_trace
@@ -28,7 +29,7 @@ SHARED = [
     for path in sorted((DATA / part).rglob("*.mcap"))
     if "damaged" not in path.parts
 ]
-COUNT = 200 if LONG else 2
+COUNT = int(os.environ.get("SGSTORE_PERMUTATIONS", "200" if LONG else "2"))
 
 
 def rich_osi(path: Path) -> Path:
@@ -221,3 +222,50 @@ def test_parts_of_a_file_that_are_read_often_are_reported(
     with open_trace(mixed) as trace:
         assert sum(map(len, trace.blocks())) == 40
     assert any("were read more than 2 times" in warning for warning in trace.report.warnings)
+
+
+def test_a_clip_of_a_file_without_log_times_keeps_its_order(tmp_path: Path) -> None:
+    path = tmp_path / "looped.osi"
+    stamps = [0.0, 0.1, 0.2, 0.3, 0.0, 0.1, 0.2, 0.3]
+    messages = [
+        recordings.ground_truth(stamp, [recordings.car(1, x=i)], host=1).SerializeToString()
+        for i, stamp in enumerate(stamps)
+    ]
+    path.write_bytes(b"".join(len(one).to_bytes(4, "little") + one for one in messages))
+    (clip,) = cut(path, tmp_path / "a", (0.1, 0.3))
+
+    with open_trace(clip) as trace:
+        (block,) = trace.blocks()
+
+    assert (block.time_ns / 1e9).tolist() == [0.1, 0.2, 0.3, 0.1, 0.2, 0.3]
+    assert block.states.x.tolist() == [1, 2, 3, 5, 6, 7]
+
+
+@pytest.mark.parametrize("part", [{"since": 0.7, "until": 1.6}, {"rate": 4.0}])
+@pytest.mark.parametrize("name", ["osi", "carla with everything", "foxglove protobuf"])
+def test_order_in_the_file_changes_no_row_of_a_part(
+    name: str, part: dict[str, float], tmp_path: Path
+) -> None:
+    path = MANY[name](tmp_path / f"{name}.mcap")
+    rows = view_rows(path, tmp_path / "a.sgstore", **part)
+
+    assert rows["frames"]
+    for number, other in enumerate(permutations(path, tmp_path / "permuted", 2, seed=2)):
+        assert not first_difference(rows, view_rows(other, tmp_path / f"{number}.sgstore", **part))
+
+
+@pytest.mark.parametrize("name", ["osi split", "carla with everything", "foxglove with two scenes"])
+def test_order_in_the_file_changes_nothing_that_a_monitor_tells(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = MANY[name](tmp_path / f"{name}.mcap")
+    asked = ("-e", "CHECK FORALL (v:Vehicle) ALWAYS v.x < 15", "-e", "MATCH (v:Car) WHERE v.x > 9")
+
+    def told(file: Path) -> str:
+        run(["monitor", str(file), *asked, "--json"])
+        return capsys.readouterr().out
+
+    first = told(path)
+    assert '"violation"' in first or "violat" in first
+    for other in permutations(path, tmp_path / "permuted", 2, seed=3):
+        assert told(other) == first
