@@ -757,6 +757,9 @@ def _unknown(prefix: str, name: str, known: set[str]) -> ConfigError:
     return ConfigError(f"unknown setting '{prefix}{name}'; {hint}")
 
 
+_ENDLESS: Final = frozenset({"range.world"})
+"""Numbers that may be infinite."""
+
 _PLAIN: Final[dict[object, str]] = {str: "a text", bool: "true or false", int: "a whole number"}
 
 
@@ -770,7 +773,8 @@ def _value(hint: Any, value: Any, name: str, default: Any = None) -> Any:
         return {str(key): _value(inner, one, f'{name}."{key}"') for key, one in value.items()}
     if hint is float:
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        check(number and abs(value) <= sys.float_info.max, name, value, "a number")
+        endless = number and value == math.inf and name in _ENDLESS
+        check(endless or (number and abs(value) <= sys.float_info.max), name, value, "a number")
         return float(value)
     if hint is Any:
         return value

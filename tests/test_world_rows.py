@@ -1,0 +1,198 @@
+"""What is known beyond the graphs: the rows of a graph as wide, and nothing else changes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import pytest
+from graph_blocks import trace_info
+from scenes import NO_MESSAGES, Scene, actor, along, ego, light, path, street
+from thorough import LONG
+
+from sgstore.config import Config, RangeSettings, from_dict
+from sgstore.demo import RECORDING
+from sgstore.errors import ConfigError
+from sgstore.ingest import ingest
+from sgstore.query import Store
+from sgstore.sgg import SceneGraphGenerator
+from sgstore.step import replayed
+from sgstore.store import StoreFile
+from sgstore.world import TraceReport
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+WAYS: Final = street("driving", "driving")
+SCENE: Final = Scene(
+    WAYS,
+    ego(along(-1.75), 10),
+    actor("near", along(-1.75), 10, start=30),
+    actor("far", along(-5.25), 9, start=120),
+    actor("leaves", path((20, -5.25), (400, -5.25)), 25),
+    actor("beyond", along(-1.75), 0, start=390),
+    light("light", (180.0, -7.0), (0, "red"), (2, "green")),
+    seconds=6,
+)
+
+OF_GRAPHS: Final = (
+    *(
+        "frames",
+        "nodes",
+        "edges",
+        "lane_states",
+        "lane_courses",
+        "lane_gaps",
+        "pairs",
+        "lane_dists",
+    ),
+    *("classes", "roles", "lanes", "entities", "payloads", "events"),
+)
+"""Views that do not read what is known beyond graphs."""
+
+RECORDINGS: Final = (
+    *("esmini/highway_merge.mcap", "sumo/Town10HD_sumo_osi.mcap", "esmini/swarm_Town04.mcap"),
+    *("carla/Town01.carla.mcap", "omega_prime/osi_centerline_example.mcap"),
+    *("esmini/cut-in.mcap", "esmini/traffic_lights.mcap", "omega_prime/pedestrian.osi"),
+    *("osi_converter/disappearingVehicle.mcap", "osi_converter/MovingHostWithStopLine.mcap"),
+)
+
+
+def ranged(radius: float, world: float, **more: Any) -> Config:
+    return from_dict({"range": {"radius": radius, "world": world}, **more})
+
+
+def of_scene(folder: Path, config: Config) -> Store:
+    """A store of it, with the numbers that a recording would have: rounded before graphs are made."""
+    file = StoreFile.create(folder / "s.sgstore")
+    generator = SceneGraphGenerator(WAYS, config)
+    info = trace_info("/scene.mcap", flavour="scene", channels=(), ego="ego", context=NO_MESSAGES)
+    with file.segment(info, config, road_map=WAYS, answers=generator.answers) as segment:
+        for piece in generator.pieces(segment.as_kept(SCENE.block())):
+            segment.append(generator.block(piece))
+        parked = generator.parked, generator.world_parked
+        file.publish(segment.seal(TraceReport(frames=len(SCENE.times)), None, parked))
+    return Store(file.path)
+
+
+def of_recording(folder: Path, recording: Path, config: Config) -> Store:
+    """The first seconds of it; all of it where tests are long."""
+    place = folder / "s.sgstore"
+    (report,) = ingest(place, [recording], config=config, until=None if LONG else 4.0)
+    assert report.status == "added"
+    return Store(place)
+
+
+@pytest.fixture(scope="module", params=["scene", "bundled", *RECORDINGS[: None if LONG else 2]])
+def stores(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Store]:
+    """Graphs of 50 m alone, with a world of 200 m, and graphs of 200 m."""
+    configs = {"alone": ranged(50, 0), "near": ranged(50, 200), "wide": ranged(200, 0)}
+    found: dict[str, Store] = {}
+    for name, config in configs.items():
+        folder = tmp_path_factory.mktemp(name)
+        if request.param == "scene":
+            found[name] = of_scene(folder, config)
+        else:
+            recording = RECORDING
+            if request.param != "bundled":
+                recording = request.getfixturevalue("data") / "traces" / request.param
+            found[name] = of_recording(folder, recording, config)
+    return found
+
+
+def rows(store: Store, sql: str) -> list[tuple[Any, ...]]:
+    return store.sql(f"{sql} ORDER BY ALL").values
+
+
+def columns(store: Store, view: str) -> str:
+    return ", ".join(f'"{name}"' for name in store.sql(f"SELECT * FROM {view} LIMIT 0").columns)
+
+
+@pytest.mark.parametrize("view", OF_GRAPHS)
+def test_a_view_of_graphs_has_the_rows_that_it_has_without_a_world(
+    stores: dict[str, Store], view: str
+) -> None:
+    sql = f"SELECT * FROM {view}"
+    assert rows(stores["near"], sql) == rows(stores["alone"], sql)
+
+
+@pytest.mark.parametrize("view", ["nodes", "lane_states", "pairs", "criticality", "lane_dists"])
+def test_a_view_of_the_world_has_the_rows_of_a_graph_as_wide(
+    stores: dict[str, Store], view: str
+) -> None:
+    names = columns(stores["wide"], view)
+    found = rows(stores["near"], f"SELECT {names} FROM world_{view}")
+    assert found == rows(stores["wide"], f"SELECT {names} FROM {view}")
+
+
+@pytest.mark.parametrize("view", ["nodes", "lane_states"])
+def test_a_row_of_the_world_says_whether_it_is_in_the_graph(
+    stores: dict[str, Store], view: str
+) -> None:
+    near, names = stores["near"], columns(stores["near"], view)
+    within = rows(near, f"SELECT {names} FROM world_{view} WHERE in_graph")
+    assert within == rows(near, f"SELECT {names} FROM {view}")
+    count = f"SELECT count(*) FROM world_{view} WHERE NOT in_graph"
+    assert near.sql(count).values[0][0] > 0
+
+
+def test_without_a_world_nothing_is_known_beyond_the_graphs(stores: dict[str, Store]) -> None:
+    alone = stores["alone"]
+    for view in ("nodes", "lane_states"):
+        names = columns(alone, view)
+        found = rows(alone, f"SELECT {names}, in_graph FROM world_{view}")
+        assert found == rows(alone, f"SELECT {names}, true FROM {view}")
+
+
+def test_nothing_but_the_recording_bounds_a_world_that_is_infinite(tmp_path: Path) -> None:
+    store = of_scene(tmp_path, ranged(50, float("inf")))
+    told = "SELECT DISTINCT ident FROM world_nodes WHERE NOT in_graph AND ident IS NOT NULL"
+    assert {ident for (ident,) in rows(store, told)} == {"far", "leaves", "beyond", "light"}
+    ((count,),) = store.sql("SELECT count(*) FROM world_nodes WHERE ident = 'beyond'").values
+    assert count == len(SCENE.times)
+    (tmp_path / "near").mkdir()
+    near = of_scene(tmp_path / "near", ranged(50, 200))
+    assert {ident for (ident,) in rows(near, told)} == {"far", "leaves", "light"}
+
+
+@pytest.mark.parametrize("world", [-1.0, float("nan"), float("-inf")])
+def test_a_world_of_no_length_is_refused(world: float) -> None:
+    with pytest.raises(ConfigError, match=r"range\.world.*expected a length of 0 or more"):
+        RangeSettings(world=world)
+
+
+@pytest.mark.parametrize("egos", [("near",), ("near", "far"), ("far", "near", "ego")])
+def test_a_world_is_that_of_its_ego_however_many_there_are(
+    tmp_path: Path, egos: Sequence[str]
+) -> None:
+    """The blocks of each ego are those of a generator of its own."""
+    config = ranged(50, 100)
+    block = SCENE.block()
+    named = [block.entities.ident.index(ego) for ego in egos]
+    nodes = [block.ego * 0 + node for node in named]
+    together = SceneGraphGenerator(WAYS, config).blocks(block, nodes)
+    for node, found in zip(nodes, together, strict=True):
+        (own,) = SceneGraphGenerator(WAYS, config).blocks(block, [node])
+        assert own.world is not None
+        assert found.world is not None
+        assert len(own.world.frames.states)
+        assert repr(found.world) == repr(own.world)
+
+
+def test_a_generator_step_by_step_knows_the_world_that_a_store_knows(tmp_path: Path) -> None:
+    near = of_scene(tmp_path, ranged(50, 200))
+    generator = SceneGraphGenerator(WAYS, ranged(50, 200))
+    told = "SELECT ident, x, y, z, heading, speed, length FROM world_nodes n JOIN frames f USING (frame_id)"
+    for seq, frame in enumerate(replayed([SCENE.block()])):
+        known = generator.step(frame).known()
+        found = sorted(
+            (
+                about["ident"],
+                *(about.get(name) for name in ("x", "y", "z", "heading", "speed", "length")),
+            )
+            for about in known.nodes.values()
+            if "ident" in about
+        )
+        assert found == rows(near, f"{told} WHERE f.seq = {seq} AND ident IS NOT NULL")
