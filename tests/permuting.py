@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import random
 from contextlib import closing
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -72,6 +72,24 @@ class Recorded:
             for i in range(0, len(order) - 1, 2):
                 order[i : i + 2] = draw.sample(order[i : i + 2], 2)
         return Recorded(self.profile, self.schemas, self.channels, self._kept(order), self.metadata)
+
+    def split(self) -> Recorded:
+        """The same messages, every second instant of each channel on another channel of its topic."""
+        beyond = max(self.channels) + 1
+        more = {
+            number + beyond: replace(channel, id=number + beyond)
+            for number, channel in self.channels.items()
+        }
+        times: dict[int, list[int]] = {}
+        messages: list[Message] = []
+        for one in self.messages:
+            told = times.setdefault(one.channel_id, [])
+            if one.log_time not in told[-1:]:
+                told.append(one.log_time)
+            moved = one.channel_id + beyond * (len(told) % 2 == 0)
+            messages.append(replace(one, channel_id=moved))
+        channels = self.channels | more
+        return Recorded(self.profile, self.schemas, channels, messages, self.metadata)
 
     def _kept(self, order: list[int]) -> list[Message]:
         """Messages in an order, but those of one channel and log time in the order that they have here."""

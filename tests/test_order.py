@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 from pathlib import Path
+from typing import Any
 
 import autoware_recordings
 import carla_recordings
@@ -269,3 +270,20 @@ def test_order_in_the_file_changes_nothing_that_a_monitor_tells(
     assert '"violation"' in first or "violat" in first
     for other in permutations(path, tmp_path / "permuted", 2, seed=3):
         assert told(other) == first
+
+
+@pytest.mark.parametrize("name", [name for name in MANY if name != "osi split"])
+def test_a_topic_may_be_split_over_two_channels(name: str, tmp_path: Path) -> None:
+    path = MANY[name](tmp_path / f"{name}.mcap")
+    split = Recorded.of(path).split()
+    told = {"x", "y", "time_ns", "node", "light_state", "throttle", "ident", "frames"}
+    rows = [row for row in block_rows(path) if row[0] in told]
+    found: list[Any] = []
+
+    for number in range(COUNT):
+        draw = random.Random(number)
+        file = split.permuted(draw).write(tmp_path / str(number) / path.name, draw)
+        found.append(block_rows(file))
+
+    assert not first_difference(rows, [row for row in found[0] if row[0] in told])
+    assert not any(first_difference(found[0], other) for other in found)

@@ -159,7 +159,7 @@ class McapFile:
         The file cannot be opened or is no MCAP file.
     """
 
-    has_log_times: Final = True
+    has_log_times = True
 
     def __new__(cls, path: Path, spool: Spool | None = None) -> Self:
         """A file, or all files of a bag."""

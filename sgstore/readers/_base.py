@@ -276,11 +276,29 @@ class Survey(Generic[AnyLead]):
             lead.first_ns = min(lead.first_ns, log_time)
 
     def first_lead(self) -> int:
-        """The channel that leads all others; -1 if none has a frame."""
+        """The channel that leads all others; -1 if none has a frame. Of equal ones it is the first topic."""
         ranked = [
-            (*self.rank(lead), -channel) for channel, lead in self.leads.items() if lead.frames
+            ([-number for number in self.rank(lead)], self.topic(channel), channel)
+            for channel, lead in self.leads.items()
+            if lead.frames
         ]
-        return -max(ranked)[-1] if ranked else -1
+        return min(ranked)[-1] if ranked else -1
+
+    def alike(self, channel: int) -> list[int]:
+        """The channels of one topic and one definition, the least first: their messages are those of one."""
+        channels = self.recording.channels
+        return [number for number in sorted(channels) if self._key(number) == self._key(channel)]
+
+    def _key(self, channel: int) -> tuple[str, ...]:
+        record = self.recording.channels[channel]
+        schema = self.recording.schemas.get(record.schema_id)
+        named = (schema.name, schema.encoding, schema.data.hex()) if schema else ()
+        return record.topic, record.message_encoding, *named
+
+    def shared_stamps(self, channel: int, stamps: Stamps) -> Stamps:
+        """The stamps of a channel like this one that may lead, else ``stamps``."""
+        leads = self.leads
+        return next((leads[one].stamps for one in self.alike(channel) if one in leads), stamps)
 
     def no_frames(self) -> str:
         """The reason why no channel leads."""
@@ -310,7 +328,7 @@ class Survey(Generic[AnyLead]):
 
     def role(self, channel: int) -> str:
         """The role of a channel."""
-        return "ground_truth" if channel == self.leading else "payload"
+        return "ground_truth" if channel in self.alike(self.leading) else "payload"
 
     def context(self) -> Iterable[Ref]:
         """Messages that later ones depend on."""

@@ -143,7 +143,7 @@ def _own(
     if not parts:
         return {name: np.zeros(0, np.int64) for name in ("frame", "channel", *_PLACE)}
     said = chained("message", parts)
-    order = np.lexsort((said["offset"], said["chunk_offset"], said["log_time_ns"]))
+    order = np.lexsort((said["offset"], said["chunk_offset"], said["channel"], said["log_time_ns"]))
     said = {name: values[order] for name, values in said.items()}
     turn = np.arange(len(frames.time)) - np.searchsorted(frames.time, frames.time)
     at = np.searchsorted(said["log_time_ns"], frames.time) + turn

@@ -182,13 +182,13 @@ class AutowareSurvey(Survey[ObjectLead]):
     def find_ego(self) -> str:
         """Find the channel of the ego's pose and the axes, and return the ego's id."""
         found = [
-            (parent == MAP, child == "base_link", count, -channel)
+            (parent != MAP, child != "base_link", -count, self.topic(channel), channel)
             for channel, (parent, child, count) in self._poses.items()
         ]
         frame = self._frames.get(self.leading, "")
         roots = set(self._parents.values()) - set(self._parents)
         if found:
-            self.pose_channel = -max(found)[-1]
+            self.pose_channel = min(found)[-1]
             self.world, child, _ = self._poses[self.pose_channel]
             self.ego_axes = child or self.ego_axes
         elif MAP not in roots:
@@ -239,7 +239,8 @@ class AutowareSurvey(Survey[ObjectLead]):
         if content == OBJECTS:
             self._tables[channel] = ColumnReader(found, CLASS_COLUMNS, "objects")
             order = RANK[short_name(schema.name).rpartition("/")[2]]
-            self.leads[channel] = ObjectLead(order=order, stamps=Stamps(explicit=False))
+            stamps = self.shared_stamps(channel, Stamps(explicit=False))
+            self.leads[channel] = ObjectLead(order=order, stamps=stamps)
 
     # One message -------------------------------------------------------------------------------------
 

@@ -196,7 +196,8 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
             survey.structures[survey.leading], _columns(self._is_predicted()), "objects"
         )
         self._stamps = survey.leads[survey.leading].stamps.reading()
-        super().__init__({survey.leading, *self._takers()}, survey.recording.window, report)
+        self._leading = frozenset(survey.alike(survey.leading))
+        super().__init__({*self._leading, *self._takers()}, survey.recording.window, report)
         self._take = self._takers()
         self._axes = Axes()
         self._motions: tuple[list[int], list[Floats]] = ([], [])
@@ -211,7 +212,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
     def decode(self, run: Messages, row: int) -> AutowareRawFrame | None:
         """The frame that a message is; ``None`` if it is none, cannot be read, or lies outside the window."""
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
-        if channel == self._survey.leading:
+        if channel in self._leading:
             self._stamps.next()
         try:
             take = self._take.get(channel)
@@ -265,7 +266,8 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
             if content in takers
         }
         if self._survey.pose_channel >= 0:
-            found[self._survey.pose_channel] = self._take_pose
+            alike = self._survey.alike(self._survey.pose_channel)
+            found |= dict.fromkeys(alike, self._take_pose)
         return found
 
     def _decoded(self, channel: int, data: memoryview) -> dict[str, Any]:

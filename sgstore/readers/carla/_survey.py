@@ -473,7 +473,8 @@ class CarlaSurvey(Survey[Lead]):
         self.structures[channel] = found
         if content == OBJECTS:
             self._tables[channel] = ColumnReader(found, _PLACES, "objects")
-            self.leads[channel] = Lead(stamps=Stamps(explicit=False))
+            stamps = self.shared_stamps(channel, Stamps(explicit=False))
+            self.leads[channel] = Lead(stamps=stamps)
 
     # One message -----------------------------------------------------------------------------------
 

@@ -159,7 +159,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
         report: TraceReport,
     ) -> None:
         self._survey = survey
-        self._leading, self._ego = survey.leading, survey.ego
+        self._leading, self._ego = frozenset(survey.alike(survey.leading)), survey.ego
         self._table = ColumnReader(survey.structures[survey.leading], COLUMNS, "objects")
         self._nodes: dict[int, int] = {}
         self._idents: dict[int, int] = {}
@@ -175,13 +175,13 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
         self._drivers: dict[int, int] = {}
         self._take = self._takers()
         self._stamps = survey.leads[survey.leading].stamps.reading()
-        super().__init__({survey.leading, *self._take}, survey.recording.window, report)
+        super().__init__({*self._leading, *self._take}, survey.recording.window, report)
         self._lights = Lights(survey.lights, signals, road_map, self.roster)
 
     def decode(self, run: Messages, row: int) -> CarlaRawFrame | None:
         """The frame that a message is; ``None`` if it is none, cannot be read, or lies outside the window."""
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
-        if channel == self._leading:
+        if channel in self._leading:
             self._stamps.next()
         try:
             take = self._take.get(channel)
@@ -190,7 +190,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
             elif self.is_inside(log_time):
                 return self._raw(log_time, run.data(row))
         except TraceError as error:
-            what = "frame" if channel == self._leading else "message"
+            what = "frame" if channel in self._leading else "message"
             topic = self._survey.topic(channel)
             self.lose(f"a {what} of {topic!r} cannot be read: {error.reason}", run, row)
         return None

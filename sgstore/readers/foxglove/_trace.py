@@ -27,7 +27,7 @@ import numpy as np
 from sgstore.errors import TraceError
 from sgstore.readers._base import Lead, Ref, Survey, SurveyedTrace, count_ref, ref_of
 from sgstore.readers._blocks import FAR, NAN, FrameRows, LossTally, MessageDecoder
-from sgstore.readers._stamps import NO_TIME
+from sgstore.readers._stamps import NO_TIME, Stamps
 from sgstore.readers.foxglove._mapping import Mapping, mapping_for
 from sgstore.readers.foxglove._messages import (
     ERRORS,
@@ -170,7 +170,7 @@ class FoxgloveSurvey(Survey[Lead]):
             return False
         self.readers[channel] = ChannelReader(schema, encoding)
         if schema.name == SCENE:
-            self.leads[channel] = Lead()
+            self.leads[channel] = Lead(stamps=self.shared_stamps(channel, Stamps()))
         return True
 
     def look(self, run: Messages, row: int) -> None:
@@ -232,7 +232,9 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
 
     def __init__(self, survey: FoxgloveSurvey, report: TraceReport) -> None:
         super().__init__(survey.readers, survey.recording.window, report)
-        self._readers, self._leading = survey.readers, survey.leading
+        self._readers = survey.readers
+        self._leading = frozenset(survey.alike(survey.leading))
+        self._sources = {channel: survey.alike(channel)[0] for channel in survey.leads}
         self._mapping, self._root = survey.mapping, survey.root()
         self._ego_entity, self._ego_axes = survey.ego
         self._states = {normalize_name(name): code for name, code in LIGHT_STATE_CODE.items()}
@@ -243,6 +245,7 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
         self._ego = -1
         self._standing: dict[int, dict[str, tuple[int, Box]]] = {}
         self._open: FoxgloveRawFrame | None = None
+        self._told_by = -1
         self._left_out = LossTally()
         self._bodiless = self._odd_axes = 0
         self._stamps = survey.leads[survey.leading].stamps.reading()
@@ -251,7 +254,7 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
         """The frame that a message of the leading scene is; of others ``None``."""
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
         reader = self._readers[channel]
-        if channel == self._leading:
+        if channel in self._leading:
             self._stamps.next()
         try:
             data = bytes(run.data(row))
@@ -267,13 +270,17 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
         if time_ns is None:
             self.lose(NO_TIME, run, row)
             return None
-        self._take_scene(channel, scene, time_ns, log_time)
-        last = self._open
-        if channel != self._leading:
-            if last is not None and last.log_time_ns == log_time:  # it tells of the same instant
-                self._fill(last)
+        last, before = self._open, self._told_by
+        leads = channel in self._leading
+        same = last is not None and last.log_time_ns == log_time  # it tells of the same instant
+        goes_on = same and leads and before not in {-1, channel}
+        self._take_scene(self._sources[channel], scene, time_ns, log_time, goes_on=goes_on)
+        if leads:
+            self._told_by = channel
+        if last is not None and same and (goes_on or not leads):
+            self._fill(last)
             return None
-        if not self.is_inside(log_time):
+        if not leads or not self.is_inside(log_time):
             return None
         frame = self._open = FoxgloveRawFrame(time_ns, log_time)
         self._fill(frame)
@@ -331,13 +338,16 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
 
     def _time(self, channel: int, scene: SceneUpdate, log_time: int) -> int | None:
         """The time of a message."""
-        if channel != self._leading or not self.is_inside(log_time):
+        if channel not in self._leading or not self.is_inside(log_time):
             return self._stamps.beside(log_time, time_of(scene))
         return self._stamps.time(log_time, time_of(scene))
 
-    def _take_scene(self, channel: int, scene: SceneUpdate, time_ns: int, log_time: int) -> None:
+    def _take_scene(
+        self, channel: int, scene: SceneUpdate, time_ns: int, log_time: int, *, goes_on: bool
+    ) -> None:
+        """Take a message. ``goes_on``: it adds to a message of another channel."""
         standing = self._standing.setdefault(channel, {})
-        if self._mapping.scene.snapshot:
+        if self._mapping.scene.snapshot and not goes_on:
             standing.clear()
         for gone in scene.deletions:
             self._delete(standing, gone, log_time)

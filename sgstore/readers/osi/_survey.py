@@ -441,7 +441,7 @@ class OsiSurvey(Survey[OsiLead]):
             objects=object_class(message),
             latch=_Latch(present, bulbs),
             lanes=lanes,
-            stamps=Stamps(logged=self.recording.has_log_times),
+            stamps=self.shared_stamps(channel, Stamps(logged=self.recording.has_log_times)),
         )
 
     # One message -------------------------------------------------------------------------------------

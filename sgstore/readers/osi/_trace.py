@@ -199,13 +199,14 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
     def __init__(self, survey: OsiSurvey, report: TraceReport) -> None:
         super().__init__({*survey.leads, *survey.hosts}, survey.recording.window, report)
         self._survey = survey
-        self._leading, self._ego = survey.leading, survey.ego
+        self._leading, self._ego = frozenset(survey.alike(survey.leading)), survey.ego
         self._idents = survey.cast.idents()
         self._nodes: dict[int, int] = {}
         self._keys: dict[bytes, int] = {}
         self._last_keys: list[bytes] = []
         self._last_nodes: list[int] = []
         self._open: OsiRawFrame | None = None
+        self._told_by = -1
         self._ahead: dict[int, list[bytes]] = {}
         self._aside: dict[int, int] = {}
         self._controls = NO_INPUTS
@@ -226,7 +227,7 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
     def decode(self, run: Messages, row: int) -> OsiRawFrame | None:
         """The frame that a message begins, if it begins one; what else it says is taken up."""
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
-        if channel == self._leading:
+        if channel in self._leading:
             self._stamps.next()
         try:
             data = bytes(run.data(row))
@@ -239,12 +240,12 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
                 self._lights.update(lights_of(ground))
                 return None
             stamp = time_of(message, ground)
-            if channel != self._leading:
+            if channel not in self._leading:
                 self._take_aside(told, self._stamps.beside(log_time, stamp))
                 return None
             time_ns = self._stamps.time(log_time, stamp)
             if time_ns is not None:
-                return self._frame(told, time_ns, log_time)
+                return self._frame(told, time_ns, log_time, channel)
             self.lose(NO_TIME, run, row)
         except DECODE_ERRORS as error:
             what = "a ground truth message cannot be read"
@@ -328,13 +329,14 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
     # One message ---------------------------------------------------------------------------------------
 
     def _frame(
-        self, told: tuple[Any, Any, list[bytes]], time_ns: int, log_time: int
+        self, told: tuple[Any, Any, list[bytes]], time_ns: int, log_time: int, channel: int
     ) -> OsiRawFrame | None:
-        """A frame, unless the message goes on with the last one."""
+        """A frame, unless the message goes on with the last one, or another channel tells the same time."""
         message, ground, contents = told
         nodes, objects = self._met(contents, log_time)
-        last = self._open
-        if last is not None and time_ns == last.time_ns and not set(nodes) & set(last.nodes):
+        last, before, self._told_by = self._open, self._told_by, channel
+        same_time = last is not None and time_ns == last.time_ns
+        if last and same_time and (before != channel or not set(nodes) & set(last.nodes)):
             self._lights.update(lights_of(ground))
             self._join(last, message, nodes, objects)
             return None
