@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, overload
 import numpy as np
 
 from sgstore.columns import taken
+from sgstore.pair_numbers import UNEVEN
 from sgstore.vocabulary import MOST_RELATIONS, RELATION_CODE, RELATIONS, SIGNALS
 
 if TYPE_CHECKING:
@@ -257,6 +258,8 @@ class GraphBlock:
         What is known beyond the graphs; ``None`` where the settings want nothing of it.
     left_out : LeftOut
         What settings leave out.
+    uneven : int
+        What there may be that is no pair of bodies: bits of :data:`sgstore.pair_numbers.UNEVEN`.
     """
 
     frames: FrameBlock
@@ -267,6 +270,7 @@ class GraphBlock:
     crowded: tuple[tuple[str, int, int], ...] = ()
     world: WorldBlock | None = None
     left_out: LeftOut = LeftOut()
+    uneven: int = sum(UNEVEN.values())
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -28,6 +28,7 @@ from sgstore.abstractions import Classes, GraphColumns, MapColumns, abstraction_
 from sgstore.columns import chained, taken
 from sgstore.errors import ConfigError
 from sgstore.graph import Edges, GraphBlock, LaneStates, LeftOut, StaticPresence, WorldBlock
+from sgstore.pair_numbers import UNEVEN, all_level, low_and_high
 from sgstore.relations import (
     IS_SIGNAL,
     IS_UPRIGHT,
@@ -286,7 +287,25 @@ class SceneGraphGenerator:
             near=self._near(bodies, part.rows, len(frames)),
             contacts=gathered(partial(contacts, bodies), bodies.frame, len(frames)),
             whole=whole,
+            uneven=self._uneven(frames),
         )
+
+    def _uneven(self, frames: FrameBlock) -> int:
+        """What there may be, in range or not, that is no pair of bodies; bits of ``UNEVEN``."""
+        states, scenery = frames.states, self._scenery
+        kind = np.concatenate([self._kinds[states.node], self._kinds[scenery.node]])
+        z, height = (
+            np.concatenate([getattr(states, name), getattr(scenery, name)])
+            for name in ("z", "height")
+        )
+        upright = IS_UPRIGHT[kind]
+        level = all_level(*low_and_high(z, height, IS_SIGNAL[kind], upright))
+        found = {
+            "flat": bool((~upright & (height == 0)).any()),
+            "storeys": not level,
+            "carried": bool((states.carrier >= 0).any()),
+        }
+        return sum(UNEVEN[name] for name, holds in found.items() if holds)
 
     def _near(self, bodies: Bodies, rows: tuple[Ints, int, int], frames: int) -> Gathered:
         """Pairs of bodies that are near one another, ``rows`` as of :meth:`StillPairs.among`."""
@@ -344,6 +363,7 @@ class SceneGraphGenerator:
             crowded=self._crowded(bodies, {NEAR: over_near, TOUCHING: over_touching}),
             world=self._world_of(view, world.whole, ground, edges),
             left_out=view.left_out,
+            uneven=world.uneven,
         )
 
     def _world_of(
@@ -653,6 +673,7 @@ class _World:
     contacts: Gathered
     standing: Standing | None
     whole: _World | None = None
+    uneven: int = 0
 
     def of(self, keys: Ints) -> _World:
         """The part of it that is in the range of one ego."""
@@ -668,6 +689,7 @@ class _World:
             near=(_among(place, self.near[0]), self.near[1]),
             contacts=(_among(place, self.contacts[0]), self.contacts[1]),
             standing=None if self.standing is None else self.standing.take(place),
+            uneven=self.uneven,
         )
 
 

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from sgstore.lang import parse
 from sgstore.lang import syntax as s
+from sgstore.vocabulary import SIGNALS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -500,13 +501,10 @@ def pair(name: str, a: dict[str, Any], b: dict[str, Any]) -> float | None:
     """Numbers of a pair that need no more than school geometry; the others have tests of their own."""
     if any(n["kind"] in {"lane", "road", "junction", "crosswalk", "off_road"} for n in (a, b)):
         return None
-    if any(axis not in n for n in (a, b) for axis in "xyz"):
+    if any(axis not in n for n in (a, b) for axis in "xy") or storeys_apart(a, b):
         return None
-    dx, dy, dz = (b[axis] - a[axis] for axis in "xyz")
-    hung = {"traffic_light", "stop_sign", "yield_sign", "speed_limit", "sign"}
-    level = a["kind"] in hung or b["kind"] in hung or abs(dz) < 2.5
-    if name in {"dist", "closing_speed"} and not level:  # on another storey
-        return None
+    dx, dy = (b[axis] - a[axis] for axis in "xy")
+    dz = b["z"] - a["z"] if "z" in a and "z" in b else 0
     if name == "dist":
         return math.sqrt(dx * dx + dy * dy + dz * dz)
     if name == "closing_speed":
@@ -520,6 +518,16 @@ def pair(name: str, a: dict[str, Any], b: dict[str, Any]) -> float | None:
     if name == "lat":
         return dy * math.cos(heading) - dx * math.sin(heading)
     raise NotImplementedError(name)
+
+
+def storeys_apart(a: dict[str, Any], b: dict[str, Any]) -> bool:
+    """Whether two are apart in height, as far as it is known; signals are on no storey."""
+    if {a["kind"], b["kind"]} & set(SIGNALS) or "z" not in a or "z" not in b:
+        return False
+    half_a, half_b = (n.get("height", 0) / 2 for n in (a, b))
+    if half_a and half_b:
+        return abs(b["z"] - a["z"]) > half_a + half_b + 1e-4
+    return abs((b["z"] - half_b) - (a["z"] - half_a)) > 2.5
 
 
 def assignments(

@@ -421,7 +421,8 @@ def test_a_number_as_an_array_is_what_the_database_computes(name: str) -> None:
 
     with duckdb.connect() as db:
         db.execute(
-            "CREATE SCHEMA inside; CREATE TABLE inside.state AS"
+            "CREATE SCHEMA inside; CREATE TABLE inside.trace AS SELECT 0 AS trace_id, NULL AS uneven;"
+            " CREATE TABLE inside.state AS"
             f" SELECT frame_id, node_id, kind, FALSE AS is_ego, {read} FROM state"
         )
         view, _ = pairs_view("criticality")

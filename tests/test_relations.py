@@ -471,7 +471,21 @@ def touching(a: Thing, b: Thing) -> bool:
     known = not any(math.isnan(v) for t in (a, b) for v in (t.heading, t.length, t.width))
     if not known or footprint(a).distance(footprint(b)) > 1e-4:
         return False
-    return not (flat(a) or flat(b) or storeys_apart(a, b))
+    return bodies(a, b)
+
+
+def bodies(a: Thing, b: Thing) -> bool:
+    """Whether both are bodies on one storey, and neither rides on the other."""
+    return not (flat(a) or flat(b) or storeys_apart(a, b) or rides(a, b) or rides(b, a))
+
+
+def rides(a: Thing, b: Thing) -> bool:
+    """Whether a is a person within the footprint of a two-wheeler who faces its way."""
+    if a.kind != "person" or b.kind != "bicycle" or a.static or b.static:
+        return False
+    faces = math.cos(a.heading - b.heading) > 0.7
+    known = not any(math.isnan(v) for v in (a.length, a.width, b.length, b.width))
+    return known and faces and footprint(b).intersects(shapely.Point(a.x, a.y))
 
 
 def flat(t: Thing) -> bool:
@@ -484,8 +498,7 @@ def storeys_apart(a: Thing, b: Thing) -> bool:
     if {a.kind, b.kind} & set(SIGNALS):
         return False
     apart, reach = abs(a.z - b.z), (a.height + b.height) / 2
-    unknown = any(t.height == 0 and t.kind not in {"prop", "unknown"} for t in (a, b))
-    if math.isnan(reach) or unknown:
+    if math.isnan(reach) or 0 in {a.height, b.height}:
         apart, reach = abs(bottom(a) - bottom(b)), 2.5 - 1e-4
     return apart > reach + 1e-4
 
@@ -503,8 +516,7 @@ def seen(a: Thing, b: Thing) -> set[tuple[str, str, str]]:
     """What is said of b as seen from a, and how near they are."""
     of: set[tuple[str, str, str]] = set()
     for name, low, high in zip(PROXIMITY, (-1, *BOUNDS), BOUNDS, strict=False):
-        bodies = not (flat(a) or flat(b) or storeys_apart(a, b))
-        if bodies and low < distance(a, b) <= high:
+        if bodies(a, b) and low < distance(a, b) <= high:
             of.add((a.name, name, b.name))
     if math.isnan(a.heading):
         return of

@@ -18,7 +18,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.criticality import RECORDED
-from sgstore.pair_numbers import PAIR_FUNCTIONS
+from sgstore.pair_numbers import PAIR_FUNCTIONS, UNEVEN
 from sgstore.records import dataclass
 from sgstore.vocabulary import (
     KINDS,
@@ -633,6 +633,8 @@ class TraceFacts:
         Its first bucket, and how many follow from there on.
     known : float
         How far around the ego all is known that was recorded; m. Infinite where nothing was left out.
+    uneven : int
+        What there is that is no pair of bodies: bits of :data:`sgstore.pair_numbers.UNEVEN`.
     """
 
     trace_id: int
@@ -643,6 +645,7 @@ class TraceFacts:
     period_ns: int = 0
     extent: tuple[int, int] = (0, 0)
     known: float = math.inf
+    uneven: int = sum(UNEVEN.values())
 
 
 @dataclass(frozen=True, slots=True)

@@ -49,9 +49,9 @@ def pair_column(name: str, a: str, b: str) -> str:
     return quoted(f"{a if name[0] == 'a' else b}:{name[2:]}")
 
 
-def pair_text(name: str, a: str, b: str) -> str:
-    """A number of a pair in terms of the columns of the layers before."""
-    return pair_sql(name, lambda part: pair_column(part, a, b))
+def pair_text(name: str, a: str, b: str, without: frozenset[str] = frozenset()) -> str:
+    """A number of a pair in terms of the columns of the layers before, without some marks."""
+    return pair_sql(name, lambda part: pair_column(part, a, b), without)
 
 
 # Pieces of SQL text: values, attributes, conditions, and the numbers of pairs of entities -------

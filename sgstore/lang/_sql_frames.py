@@ -74,7 +74,7 @@ from sgstore.lang.ir import (
     blocks_of,
     nodes_of,
 )
-from sgstore.pair_numbers import WAYS, needed_for, parts_of, stage_of
+from sgstore.pair_numbers import MARKS, UNEVEN, WAYS, needed_for, parts_of, stage_of
 from sgstore.quoting import quoted
 
 if TYPE_CHECKING:
@@ -138,6 +138,8 @@ class Layers:
     needed : list of Leaf
         Values that conditions or results are made of.
     conditions : list of Bound
+    without : frozenset of str
+        Marks of pairs that no pair of these traces needs (:data:`sgstore.pair_numbers.MARKS`).
     early : set of Part
         What the conditions are made of that no dear number is in.
     tested : int
@@ -147,6 +149,7 @@ class Layers:
     join: Join
     needed: list[Leaf]
     conditions: list[Bound]
+    without: frozenset[str] = frozenset()
     early: set[Part] = field(default_factory=set["Part"])
     tested: int = 0
     _stages: dict[Part, int] = field(default_factory=dict["Part", int])
@@ -155,9 +158,12 @@ class Layers:
         cheap = [c for c in self.conditions if not any(is_dear(leaf) for leaf in leaves(c))]
         pairs = [pair for c in cheap for pair in _pairs(leaves(c))]
         self.early = {
-            (name, p.a, p.b) for p in pairs for name in needed_for(p.function) if stage_of(name)
+            (name, p.a, p.b)
+            for p in pairs
+            for name in needed_for(p.function, self.without)
+            if stage_of(name)
         }
-        self.tested = max((stage_of(name) for name, _, _ in self.early), default=0)
+        self.tested = max((stage_of(name, self.without) for name, _, _ in self.early), default=0)
 
     def stage(self, name: str, a: str, b: str) -> int:
         """The layer in which a number of a pair is computed; 0 for a raw column."""
@@ -165,7 +171,7 @@ class Layers:
             return 0
         part = name, a, b
         if part not in self._stages:
-            found = 1 + max(self.stage(one, a, b) for one in parts_of(name))
+            found = 1 + max(self.stage(one, a, b) for one in parts_of(name, self.without))
             self._stages[part] = found if part in self.early else max(found, self.tested + 1)
         return self._stages[part]
 
@@ -227,10 +233,12 @@ class Layers:
         parts = dict.fromkeys(
             (name, pair.a, pair.b)
             for pair in pairs
-            for name in sorted(needed_for(pair.function))
+            for name in sorted(needed_for(pair.function, self.without))
             if self.stage(name, pair.a, pair.b) == stage
         )
-        select.columns += [named(pair_text(*part), pair_column(*part)) for part in parts]
+        select.columns += [
+            named(pair_text(*part, self.without), pair_column(*part)) for part in parts
+        ]
         select.where = self._tests(values, stage - 1) if stage > 1 else []
         return select.text()
 
@@ -245,7 +253,7 @@ class Layers:
         """The raw columns that numbers of pairs are made of."""
         columns: dict[str, str] = {}
         for pair in pairs:
-            for name in sorted(needed_for(pair.function)):
+            for name in sorted(needed_for(pair.function, self.without)):
                 if stage_of(name) == 0:
                     key = pair.a if name[0] == "a" else pair.b
                     columns[pair_column(name, pair.a, pair.b)] = raw_text(
@@ -394,7 +402,7 @@ def frames(
     ties = edges | {leaf.edge for leaf in needed if isinstance(leaf, EdgeRelation) or _is_own(leaf)}
     join, given = _first_phase(sql, scope, parts, given, bound, ties, needed)
     _second_phase(sql, join, scope, parts, given, needed)
-    layers = Layers(join, needed, conditions)
+    layers = Layers(join, needed, conditions, _needless(sql.catalog))
     text = layers.text(sql.values, columns_of(nodes, edges), wanted)
     told = {leaf.node for leaf in wanted if isinstance(leaf, NodeValue)}
     told |= {leaf.edge for leaf in wanted if isinstance(leaf, EdgeRelation)}
@@ -407,6 +415,15 @@ def frames(
     if hidden or bare or (known and not (known.nodes <= nodes and known.edges <= edges)):
         return "SELECT DISTINCT" + text.removeprefix("SELECT")
     return text
+
+
+def _needless(catalog: Catalog) -> frozenset[str]:
+    """Marks of pairs that no pair of some traces needs."""
+    uneven = 0
+    for trace in catalog.traces:
+        uneven |= trace.uneven
+    needed = {"level"} if uneven & ~UNEVEN["flat"] else set[str]()
+    return MARKS - needed - ({"solid"} if uneven & UNEVEN["flat"] else set[str]())
 
 
 def _kinds_of_edges(

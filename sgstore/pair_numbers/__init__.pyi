@@ -8,9 +8,12 @@ from ._levels import HUNG as HUNG
 from ._levels import OPTIONAL as OPTIONAL
 from ._levels import STOREY as STOREY
 from ._levels import TOUCH as TOUCH
+from ._levels import UNEVEN as UNEVEN
 from ._levels import UPRIGHT as UPRIGHT
+from ._levels import all_level as all_level
 from ._levels import low_and_high as low_and_high
 from ._levels import low_and_high_sql as low_and_high_sql
+from ._table import MARKS as MARKS
 from ._table import PAIR_FUNCTIONS as PAIR_FUNCTIONS
 from ._table import columns_needed as columns_needed
 from ._table import needed_for as needed_for
@@ -31,6 +34,7 @@ __all__ = [
     "COURSES",
     "HUNG",
     "LANE_DIST",
+    "MARKS",
     "NEXT_PARTS",
     "OF_ONE",
     "OPTIONAL",
@@ -40,8 +44,10 @@ __all__ = [
     "PairNumbers",
     "STOREY",
     "TOUCH",
+    "UNEVEN",
     "UPRIGHT",
     "WAYS",
+    "all_level",
     "as_written",
     "columns_needed",
     "gap",

@@ -139,8 +139,9 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
 
 PARTS: Final[Mapping[str, str]] = {
     # Two on different storeys, and what pulls or carries the other, are no pair: NULL, else 0.
-    "apart": f"CASE WHEN a_high + b_high IS NULL THEN abs(b_low - a_low) - {STOREY}e0"
-    f" ELSE greatest(b_low - a_high, a_low - b_high) - {TOUCH:.0e} END",
+    "apart": "CASE WHEN a_high > a_low AND b_high > b_low"
+    f" THEN greatest(b_low - a_high, a_low - b_high) - {TOUCH:.0e}"
+    f" ELSE abs(b_low - a_low) - {STOREY}e0 END",
     "level": "CASE WHEN apart > 0 OR a_carrier = b_node_id OR b_carrier = a_node_id OR a_carrier = b_carrier"
     " THEN NULL ELSE 0 END",
     # What is flat is no body: NULL, else 0.

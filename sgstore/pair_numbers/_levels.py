@@ -40,6 +40,18 @@ STOREY: Final = 2.5
 """Difference of the lower sides from which on storeys differ, where a height is not known; m."""
 
 
+UNEVEN: Final = {"flat": 1, "storeys": 2, "carried": 4}
+"""Bits of what a trace has that is no pair of bodies."""
+
+
+def all_level(low: Floats, high: Floats) -> bool:
+    """Return whether no two of some bodies are on different storeys, whichever of them share a frame."""
+    solid, known = high > low, ~np.isnan(low)
+    if solid.any() and low[solid].max() > high[solid].min() + TOUCH:
+        return False
+    return bool((solid == known).all() or np.ptp(low[known]) <= STOREY)
+
+
 def low_and_high(z: Floats, height: Floats, hung: Bools, upright: Bools) -> tuple[Floats, Floats]:
     """Heights of the lower and the upper side of bodies.
 

@@ -40,26 +40,50 @@ _NAME: Final = re.compile(r"\b[a-z]\w*\b(?!\()")
 """A part: words of SQL are in capitals, functions have a bracket behind them."""
 
 
+MARKS: Final = frozenset({"level", "solid"})
+"""Parts that almost all numbers have; they make those of what is no pair of bodies NULL."""
+Marks = frozenset[str]
+
+
 @cache
-def parts_of(name: str) -> tuple[str, ...]:
+def _expression(name: str, without: Marks) -> str:
+    """The SQL of a number or part, without some marks: where no pair needs them they cost time."""
+    text = EXPRESSIONS[name]
+    for mark in without:
+        text = text.replace(f" + {mark}", "")
+    return text
+
+
+@cache
+def parts_of(name: str, without: Marks = frozenset()) -> tuple[str, ...]:
     """The numbers, parts and columns that a number of a pair is made of."""
-    return tuple(sorted({*_NAME.findall(EXPRESSIONS[name])}))
+    return tuple(sorted({*_NAME.findall(_expression(name, without))}))
 
 
 @cache
-def stage_of(name: str) -> int:
+def stage_of(name: str, without: Marks = frozenset()) -> int:
     """Return the number of layers before a number of a pair; 0 for a column of an entity."""
-    return 1 + max(stage_of(part) for part in parts_of(name)) if name in EXPRESSIONS else 0
+    if name not in EXPRESSIONS:
+        return 0
+    return 1 + max(stage_of(part, without) for part in parts_of(name, without))
 
 
 @cache
-def needed_for(name: str) -> frozenset[str]:
-    """A number of a pair with all that it is made of; nothing for one that is looked up."""
+def needed_for(name: str, without: Marks = frozenset()) -> frozenset[str]:
+    """A number of a pair with all that it is made of; nothing for one that is looked up.
+
+    Parameters
+    ----------
+    name : str
+    without : frozenset of str
+        Those of :data:`MARKS` that no pair needs.
+    """
     if name in WAYS:
         return frozenset()
     if name not in EXPRESSIONS:
         return frozenset({name})
-    return frozenset({name}).union(*(needed_for(part) for part in parts_of(name)))
+    parts = parts_of(name, without)
+    return frozenset({name}).union(*(needed_for(part, without) for part in parts))
 
 
 def columns_needed(name: str) -> tuple[frozenset[str], frozenset[str]]:
@@ -77,10 +101,6 @@ _WRITTEN_OUT: Final = 2000
 """Columns that a number may be spelled out to, before DuckDB is kept from it; ``ttc`` has 1,500."""
 
 
-_ONCE: Final = frozenset({"level", "solid"})
-"""Parts that almost all numbers have, so that they are computed once for each pair."""
-
-
 @cache
 def _spelled(name: str) -> int:
     """Number of columns that stand in a number of a pair when each part in it is replaced by its expression."""
@@ -94,17 +114,17 @@ def _spelled(name: str) -> int:
 @cache
 def _is_apart(name: str) -> bool:
     """Tell whether conditions on a number are not to be replaced by conditions on its parts."""
-    return name in _ONCE or _spelled(name) > _WRITTEN_OUT
+    return name in MARKS or _spelled(name) > _WRITTEN_OUT
 
 
-def pair_sql(name: str, column: Callable[[str], str]) -> str:
-    """A number of a pair as SQL, given the columns of what it is made of.
+def pair_sql(name: str, column: Callable[[str], str], without: Marks = frozenset()) -> str:
+    """A number of a pair as SQL, given the columns of what it is made of; ``without`` some marks.
 
     DuckDB moves a condition below a layer by writing the layer's expressions into it, which for ``wttc`` are 21
     million columns, and a minute's work for some others. It leaves a condition where it is if a column in it is
     volatile: so a large number is made so, at no cost, because nothing is drawn where the number is known.
     """
-    text = _NAME.sub(lambda found: column(found[0]), EXPRESSIONS[name])
+    text = _NAME.sub(lambda found: column(found[0]), _expression(name, without))
     return f"coalesce({text}, CASE WHEN random() > 2 THEN 0 END)" if _is_apart(name) else text
 
 
@@ -123,9 +143,27 @@ def _is_of(name: str, one: str) -> bool:
 def _side(one: str, names: Sequence[str]) -> str:
     """The states as those of a or b, with functions of it alone: worked out once, not for each of its pairs."""
     made = [f"{pair_sql(name, lambda n: f'{n[2:]}::DOUBLE')} AS {name}" for name in names]
+    return f"(SELECT {', '.join(['*', *made])} FROM inside.state) {one}"  # noqa: S608
+
+
+def _no_pairs() -> str:
+    """The pairs that are none, of the traces that have any: with both marks, or ``solid`` alone."""
     sides = low_and_high_sql(lambda n: n if n == "kind" else f"{n}::DOUBLE")
-    columns = ", ".join(["*", *made, *(f"{text} AS {n}" for n, text in sides.items())])
-    return f"(SELECT {columns} FROM inside.state) {one}"  # noqa: S608
+    heights = ", ".join(f"{text} AS {name}" for name, text in sides.items())
+    side = f"(SELECT frame_id, node_id, carrier, {heights} FROM inside.state)"  # noqa: S608
+
+    def text(name: str) -> str:
+        return _NAME.sub(lambda at: column(at[0]), EXPRESSIONS[name])
+
+    def column(name: str) -> str:
+        return f"({text(name)})" if name in EXPRESSIONS else f"{name[0]}.{name[2:]}"
+
+    return (
+        f"(SELECT a.frame_id, a.node_id AS one, b.node_id AS other, {text('level')} AS level,"  # noqa: S608
+        f" {text('solid')} AS solid FROM inside.trace t JOIN {side} a ON a.frame_id >> 24 = t.trace_id"
+        f" JOIN {side} b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id"
+        " WHERE t.uneven IS NULL OR t.uneven <> 0)"
+    )
 
 
 def pairs_view(view: str = "pairs") -> tuple[str, str]:
@@ -142,6 +180,8 @@ def pairs_view(view: str = "pairs") -> tuple[str, str]:
         if one.sql and one.view in {view, "pairs"}
     ]
     wanted = frozenset[str]().union(*(needed_for(name) for _, name in listed))
+    wanted -= needed_for("level") | needed_for("solid")
+    wanted |= frozenset().union(*(needed_for(name, MARKS) for _, name in listed))
     inputs = sorted(name for name in wanted if not stage_of(name))
     sides = {one: sorted(name for name in wanted if _is_of(name, one)) for one in "ab"}
     columns = ["b.frame_id", "a.node_id AS src", "b.node_id AS dst"]
@@ -149,14 +189,19 @@ def pairs_view(view: str = "pairs") -> tuple[str, str]:
     columns += ["a.is_ego AS src_is_ego", "b.is_ego AS dst_is_ego"]
     columns += [f"{name[0]}.{name[2:]}::DOUBLE AS {name}" for name in inputs]
     columns += [f"{one}.{name}" for one, names in sides.items() for name in names]
+    columns += [
+        f"CASE WHEN n.one IS NULL THEN 0 ELSE n.{mark} END AS {mark}" for mark in sorted(MARKS)
+    ]
     joined = (
         f"{_side('a', sides['a'])} JOIN {_side('b', sides['b'])}"
         " ON b.frame_id = a.frame_id AND b.node_id <> a.node_id"
+        f" LEFT JOIN {_no_pairs()} n"
+        " ON n.frame_id = a.frame_id AND n.one = a.node_id AND n.other = b.node_id"
     )
     text = f"SELECT {', '.join(columns)} FROM {joined}"  # noqa: S608
     left = sorted(wanted.difference(*sides.values()))
-    for stage in range(1, 1 + max(map(stage_of, left))):
-        layer = [f"{pair_sql(n, str)} AS {n}" for n in left if stage_of(n) == stage]
+    for stage in range(1, 1 + max(stage_of(name, MARKS) for name in left)):
+        layer = [f"{pair_sql(n, str)} AS {n}" for n in left if stage_of(n, MARKS) == stage]
         text = f"SELECT *, {', '.join(layer)} FROM ({text})"  # noqa: S608
     numbers = [name if column == name else f"{name} AS {column}" for column, name in listed]
     shown = [*_KEPT[:3], *numbers[:_BEFORE_KINDS], *_KEPT[3:], *numbers[_BEFORE_KINDS:]]

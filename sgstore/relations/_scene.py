@@ -16,7 +16,7 @@ from sgstore.columns import taken
 from sgstore.compiled import worth
 from sgstore.geometry import bearings
 from sgstore.graph import Edges
-from sgstore.pair_numbers import STOREY, TOUCH, UPRIGHT, gap, low_and_high
+from sgstore.pair_numbers import STOREY, TOUCH, UPRIGHT, all_level, gap, low_and_high
 from sgstore.vocabulary import KIND_CODE, MOST_KINDS, RELATION_CODE, SIGNALS, VEHICLES
 
 if TYPE_CHECKING:
@@ -250,7 +250,7 @@ class BodyPairs:
         of = self._bodies
         plain = not (of.carrier >= 0).any() and not (of.height == 0).any()
         levels = of.low_and_high
-        if plain and _all_level(*levels):
+        if plain and all_level(*levels):
             return np.zeros(0, np.bool_)
         return meet_as_bodies(of, *self._halves)
 
@@ -275,15 +275,6 @@ class BodyPairs:
             np.concatenate([one, other]),
             np.concatenate([other, one]),
         )
-
-
-def _all_level(low: Floats, high: Floats) -> bool:
-    """Return whether for certain no two bodies are on different storeys."""
-    known = low[~np.isnan(low)]
-    if not len(known):
-        return True
-    least = np.where(np.isnan(high), STOREY, high - low)[~np.isnan(low)].min()
-    return bool(np.ptp(known) <= least)
 
 
 MOST_TURNED: Final = 1e3
@@ -336,8 +327,9 @@ def on_one_level(bodies: Bodies, a: Rows, b: Rows) -> Bools:
     """Mask of the pairs of bodies that are not on different storeys; where it is not known, they are not."""
     low, high = bodies.low_and_high
     reach = np.fmax(low[b] - high[a], low[a] - high[b])
-    unknown = np.isnan(high[a] + high[b])
-    return ~np.where(unknown, np.abs(low[b] - low[a]) > STOREY, reach > TOUCH)
+    solid = high > low
+    level = np.where(solid[a] & solid[b], reach > TOUCH, np.abs(low[b] - low[a]) > STOREY)
+    return ~level
 
 
 def meet_as_bodies(bodies: Bodies, a: Rows, b: Rows) -> Bools:

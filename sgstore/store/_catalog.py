@@ -62,6 +62,7 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
                 t.period_ns,
                 extents.get(t.trace_id, (0, 0)),
                 known_range(t.report.get("scope")),
+                uneven=t.uneven,
             )
             for t in stored_traces(connection)
         ),

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import SgstoreError, StoreError, place_named, url_named
+from sgstore.pair_numbers import UNEVEN
 from sgstore.records import dataclass
 from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, as_json, plain
 from sgstore.store._rows import run
@@ -142,6 +143,8 @@ class StoredTrace:
         Simulation time of the first and of the last frame; ns.
     period_ns : int
         Median difference of consecutive frames; ns.
+    uneven : int
+        What it has that is no pair of bodies: bits of :data:`sgstore.pair_numbers.UNEVEN`.
     answers : tuple of str
         Relations that it can answer.
     report : dict
@@ -170,6 +173,7 @@ class StoredTrace:
     start_ns: int
     end_ns: int
     period_ns: int
+    uneven: int
     answers: tuple[str, ...]
     report: dict[str, Any]
     settings: dict[str, Any]
@@ -211,10 +215,12 @@ class FrameRef:
     t: float
 
 
-_TRACES: Final = """
+_TRACES: Final = f"""
 SELECT t.trace_id, t.name, r.uri AS path, r.place, r.size, r.mtime_ns, r.digest, t.flavour,
        coalesce(t.ego, '') AS ego, t.since, t.until, coalesce(m.name, '') AS map,
-       t.frames, t.start_ns, t.end_ns, t.period_ns, t.answers, t.report, t.config_id, t.ingested_at, t.version
+       t.frames, t.start_ns, t.end_ns, t.period_ns,
+       coalesce(t.uneven, {sum(UNEVEN.values())}) AS uneven,
+       t.answers, t.report, t.config_id, t.ingested_at, t.version
 FROM trace t JOIN recording r ON r.recording_id = t.recording_id JOIN config c ON c.config_id = t.config_id
      LEFT JOIN map m ON m.map_id = t.map_id
 """

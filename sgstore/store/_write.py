@@ -116,6 +116,7 @@ class Segment:
         self._on_map = on_map
         self._happenings = Happenings(identity.trace_id)
         self._next_seq = 0
+        self._uneven = 0
         self._times: list[Ints] = []
         self._left_out = LeftOut()
         self._constants = {name: [np.zeros(0, object)] for name in ("special", "subkind")}
@@ -171,6 +172,7 @@ class Segment:
         self._staging.settle(whole=self._next_seq % BUCKET_FRAMES == 0)
         self._next_seq += len(frames)
         self._left_out = self._left_out.more(graph.left_out)
+        self._uneven |= graph.uneven
         self._kinds.learn(frames.entities)
         self._origin = self._origin or origin_of(frames)
         self._insert_graph(graph, self._identity.trace_id, self._origin or Origin(0.0, 0.0, 0.0))
@@ -270,6 +272,7 @@ class Segment:
             "start_ns": int(time_ns[0]),
             "end_ns": int(time_ns[-1]),
             "period_ns": period_ns,
+            "uneven": self._uneven,
             "origin_x": origin.x,
             "origin_y": origin.y,
             "origin_z": origin.z,
