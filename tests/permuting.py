@@ -126,7 +126,7 @@ class Recorded:
                 number: writer.register_channel(
                     one.topic, one.message_encoding, schemas[one.schema_id], one.metadata
                 )
-                for number, one in sorted(self.channels.items())
+                for number, one in self._registered(draw)
             }
             for record in self.metadata:
                 writer.add_metadata(record.name, record.metadata)
@@ -140,6 +140,13 @@ class Recorded:
                 )
             writer.finish()
         return path
+
+    def _registered(self, draw: random.Random) -> list[tuple[int, Channel]]:
+        """The channels in the order in which they get their ids; those of one topic in the order of theirs."""
+        ranks = {
+            topic: draw.random() for topic in sorted({c.topic for c in self.channels.values()})
+        }
+        return sorted(self.channels.items(), key=lambda item: (ranks[item[1].topic], item[0]))
 
     def bag(self, folder: Path, draw: random.Random) -> Path:
         """Write them into a bag of three files: those of one channel and log time into any of them."""
@@ -192,8 +199,9 @@ def block_rows(path: Path, **how: Any) -> list[tuple[str, Any]]:
         found: list[tuple[str, Any]] = [
             (name, getattr(info, name)) for name in ("flavour", "ego", "map_text", "map_name")
         ]
-        found.append(("channels", [(c.topic, c.schema, c.role) for c in info.channels]))
-        found.append(("context", sorted(zip(*_refs(info.context), strict=True))))
+        topics = [c.topic for c in info.channels]
+        found.append(("channels", sorted((c.topic, c.schema, c.role) for c in info.channels)))
+        found.append(("context", _refs(info.context, topics)))
         for block in trace.blocks():
             for part in (block, block.states, block.entities, block.scenery):
                 for field in fields(part):
@@ -202,15 +210,16 @@ def block_rows(path: Path, **how: Any) -> list[tuple[str, Any]]:
                         found.append((field.name, (value.dtype.str, value.tobytes())))
                     elif isinstance(value, tuple | str | int):
                         found.append((field.name, value))
-            found.append(("messages", sorted(zip(*_refs(block.messages), strict=True))))
+            found.append(("messages", _refs(block.messages, topics)))
         losses = sorted((loss.reason, loss.messages) for loss in trace.report.losses)
         found += [("losses", losses), ("frames", trace.report.frames)]
     return found
 
 
-def _refs(refs: Any) -> Sequence[list[int]]:
-    """Messages without their places."""
-    return [getattr(refs, name).tolist() for name in ("channel", "log_time_ns", "length")]
+def _refs(refs: Any, topics: Sequence[str]) -> list[tuple[str, int, int]]:
+    """Topic, log time and length of messages."""
+    named = [topics[channel] for channel in refs.channel.tolist()]
+    return sorted(zip(named, refs.log_time_ns.tolist(), refs.length.tolist(), strict=True))
 
 
 def first_difference(ours: Any, theirs: Any) -> str:

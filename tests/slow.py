@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 SECONDS: Final = {
+    "order": 50,
     "explorer": 60,
     "importing": 25,
     "cli_ending": 33,
