@@ -36,6 +36,7 @@ from sgstore.store import (
     IN_NOTEBOOK,
     SEQ_BITS,
     FrameRef,
+    scope_of,
     GivenTable,
     Tabular,
     as_told,
@@ -261,6 +262,14 @@ class Matches(Tabular):
         with self._compiled() as compiled:
             compared = compared_in_query(compiled.bound)
             return notes_in(self._file, compared, self._text, self._parameters)
+
+    @property
+    def scope(self) -> dict[str, Any]:
+        """What settings left out of the traces that are asked; see :func:`sgstore.store.scope_of`."""
+        with self._compiled() as compiled:
+            chosen = {trace.trace_id for trace in compiled.chosen}
+            traces = (one for one in self._file.traces() if one.trace_id in chosen)
+            return scope_of(traces, world=compiled.bound.world)
 
     def __iter__(self) -> Iterator[Row]:
         return self._rows(whole=False)

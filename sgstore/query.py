@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
+from sgstore.criticality import KNOWN
 from sgstore.errors import StoreError, place_named
 from sgstore.lang import CONSTANTS, about_frame, compile_query, union_parts
 from sgstore.matches import UnionMatches
@@ -819,7 +820,8 @@ class Store:
             if node in graph.nodes:
                 graph.nodes[node].update(zip(constants.columns[1:], values, strict=True))
         events = events_in(query, frame.frame_id, lambda sql, at: self.file.rows(sql, at).values)
-        later = partial(measured, self.file.rows, frame.trace_id)
+        scope = KNOWN if query.world else ""
+        later = partial(measured, self.file.rows, frame.trace_id, scope)
         drawn = drawn if query.world else None
         return FrameView(graph, about, whole, classes, roles, events, later, drawn)
 

@@ -584,3 +584,27 @@ def test_a_narrow_table_keeps_the_frames_that_one_will_type(
     assert all(len(line) <= 70 for line in lines)
     assert any("…" in line for line in lines)
     assert lines[2].startswith("town#200 ")
+
+
+def test_find_and_check_say_what_settings_left_out(
+    store: str, tmp_path: Path, sgstore: Any
+) -> None:
+    rule = tmp_path / "rule.sgql"
+    rule.write_text("CHECK slow: ALWAYS ego.speed < 90")
+    for words, cut in (
+        (
+            ("find", store, CROSSING),
+            "scope graph: 25,349 of 36,189 states lie beyond the graphs (50 m)",
+        ),
+        (
+            ("check", store, str(rule)),
+            "scope world: 3,153 of 36,189 states lie beyond the world (200 m)",
+        ),
+    ):
+        assert sgstore(*words)[2].count(cut) == 1
+        _, out, err = sgstore(*words, "--json")
+        told = [json.loads(line) for line in err.splitlines() if line.startswith("{")]
+        scope = {"beyond_radius": 25349, "beyond_world": 3153, "states": 36189, "rate": 0.0}
+        scope |= {"scope": cut.split()[1][:-1], "radius": 50.0, "world": 200.0, "excluded": {}}
+        assert told == [{"scope": scope}]
+        assert json.loads(out)

@@ -379,7 +379,8 @@ def test_cases_are_put_in_order_by_what_was_recorded_later(open_town: Store) -> 
 def test_patterns_sql_and_the_verb_have_the_measures_of_all_pairs(open_town: Store) -> None:
     names = [*RECORDED]
     told = ", ".join(f"{name}(e, v)" for name in names)
-    query = f"MATCH (e:Ego), (v:Entity) RETURN DISTINCT trace.name, e.id, v.id, {told}"
+    asked = f"MATCH (e:Ego), (v:Entity) RETURN DISTINCT trace.name, e.id, v.id, {told}"
+    query = f"USING SCOPE world {asked}"
     patterns = {tuple(row[:3]): tuple(row[3:]) for row in open_town.find(query)}
     sql = f"SELECT trace, src, dst, {', '.join(names)} FROM encounters"
     view = {row[:3]: row[3:] for row in open_town.sql(sql).values}

@@ -54,7 +54,7 @@ def worst_by_hand(some: ChosenFrames, name: str, low: bool = True) -> dict[int, 
     frames = {*some.frame_id.tolist()}
     found: dict[int, tuple[float, int]] = {}
     rows = some.store.sql(
-        f"SELECT frame_id, dst, {name} FROM criticality WHERE {OTHERS} ORDER BY frame_id, dst"
+        f"SELECT frame_id, dst, {name} FROM world_criticality WHERE {OTHERS} ORDER BY frame_id, dst"
     ).values
     for frame, other, value in rows:
         if value is not None and frame in frames:
@@ -257,7 +257,7 @@ def test_what_has_no_worse_side_is_no_measure_of_risk(measures: tuple[str, ...])
 def test_a_situation_is_that_of_whom_the_ego_could_meet_soonest(some: ChosenFrames) -> None:
     sql = f"""
       SELECT frame_id, closing_time, dce_3s, dst, dst_kind, abs(rel_heading), lat_gap, lon
-      FROM criticality WHERE {OTHERS}
+      FROM world_criticality WHERE {OTHERS}
     """
     soonest: dict[int, Any] = {}
     for frame, *row in some.store.sql(sql).values:
@@ -348,7 +348,7 @@ def named_outcomes(some: ChosenFrames, failed: set[int]) -> dict[str, bool]:
 
 def test_what_is_learned_finds_what_fails(some: ChosenFrames, model: str) -> None:
     """Frames fail whose nearest neighbour, whoever it is, is on the left: nothing that risk knows."""
-    pairs = f"criticality WHERE {OTHERS} GROUP BY frame_id"
+    pairs = f"world_criticality WHERE {OTHERS} GROUP BY frame_id"
     sql = f"SELECT frame_id, arg_min(lat, closing_time) FROM {pairs}"
     left = {frame for frame, lat in some.store.sql(sql).values if lat is not None and lat > 0}
     outcomes = named_outcomes(some, left)
@@ -441,8 +441,8 @@ def test_a_case_is_told_by_its_most_critical_neighbours(some: ChosenFrames) -> N
     units = units_of(some, SelectionUnit.frame, 2.0, None)
     rows = np.arange(len(units))
     sql = f"""
-      SELECT c.frame_id, c.closing_time, c.dce_3s, c.lon, n.width FROM criticality c
-      JOIN nodes n ON n.frame_id = c.frame_id AND n.node_id = c.dst WHERE {OTHERS}
+      SELECT c.frame_id, c.closing_time, c.dce_3s, c.lon, n.width FROM world_criticality c
+      JOIN world_nodes n ON n.frame_id = c.frame_id AND n.node_id = c.dst WHERE {OTHERS}
     """
     by_frame: dict[int, list[tuple[float, float, float, float]]] = defaultdict(list)
     for frame, *row in some.store.sql(sql).values:

@@ -35,6 +35,7 @@ from sgstore.cli._options import (
     app,
     parameters_of,
     say_notes,
+    say_scope,
     say_unknown,
     seconds_of,
     text_of,
@@ -184,6 +185,7 @@ def _reported(
         typer.echo(run.explain())
         return 0
     say_notes(run.notes)
+    say_scope(run, ask)
     tally = {"true": 0, "false": 0}
     kept: list[Verdict] = []
     absent: dict[str, int] = {}

@@ -18,7 +18,7 @@ from typer.core import TyperCommand, TyperGroup
 
 import sgstore.cli._completion as completion
 from sgstore.cli._completion import STORE
-from sgstore.cli._output import LONG_TABLE, Format, say, talk, write_rows
+from sgstore.cli._output import LONG_TABLE, Format, say, say_json, talk, write_rows
 from sgstore.cli._process import set_deadline
 from sgstore.errors import ConfigError, url_named
 from sgstore.records import dataclass
@@ -826,6 +826,19 @@ def say_left_out(
     for reason, names in of.items():
         say(f"left out, because they cannot answer this query ({reason}): {', '.join(names)}")
     say_notes(getattr(matches, "notes", ()))
+
+
+def say_scope(asked: object, ask: AskOptions) -> None:
+    """Say in one line what settings left out of what is asked; as JSON where results are."""
+    from sgstore.store import scope_text
+
+    found = getattr(asked, "scope", {})
+    if not found:
+        return
+    if ask.chosen in {Format.json, Format.ndjson}:
+        say_json({"scope": found})
+    else:
+        say(scope_text(found))
 
 
 def say_unknown(told: Iterable[tuple[str, str, str]]) -> None:

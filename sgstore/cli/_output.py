@@ -20,7 +20,7 @@ from sgstore.files import without_controls, working_folder, written_text
 from sgstore.records import dataclass
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
     from typing import TextIO
 
@@ -224,6 +224,12 @@ def say(message: str) -> None:
     """Tell something that is neither a result nor an error, on stderr."""
     if not _manner.quiet:
         complain(message)
+
+
+def say_json(found: Mapping[str, Any]) -> None:
+    """Tell the same as one line of JSON, for who reads results as JSON."""
+    if not _manner.quiet:
+        sys.stderr.write(f"{json.dumps(found, ensure_ascii=False)}\n")
 
 
 def complain(message: str) -> None:

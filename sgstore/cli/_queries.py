@@ -32,6 +32,7 @@ from sgstore.cli._options import (
     parameters_of,
     query_of,
     say_left_out,
+    say_scope,
     seconds_of,
     tables_of,
     text_of,
@@ -118,6 +119,7 @@ def find(
             number = matches.count()
             typer.echo(number)
             return NO_MATCH if require and not number else 0
+        say_scope(matches, ask)
         if ask.chosen in BINARY and not matches.graphs:
             number = write_binary(matches.parquet, ask.chosen, ask.output)
         elif not each_frame and on_terminal(ask) and _returns_nothing(text):

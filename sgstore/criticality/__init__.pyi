@@ -15,6 +15,7 @@ from ._headway import headway_recorded as headway_recorded
 from ._potential import cpi as cpi
 from ._potential import crash_probability as crash_probability
 from ._recorded import FIXED_KINDS as FIXED_KINDS
+from ._recorded import KNOWN as KNOWN
 from ._recorded import RECORDED as RECORDED
 from ._recorded import TRACKS as TRACKS
 from ._recorded import RecordedMeasure as RecordedMeasure
@@ -26,6 +27,7 @@ __all__ = [
     "Encounter",
     "Encroachment",
     "FIXED_KINDS",
+    "KNOWN",
     "RECORDED",
     "RecordedMeasure",
     "TRACKS",

@@ -107,10 +107,13 @@ FIXED_KINDS: Final = f"({', '.join(map(literal, _FIXED))})"
 _columns = ", ".join(f"{column}::DOUBLE AS s{i}" for i, column in enumerate(_STATES))
 TRACKS: Final = f"""
   SELECT n.node_id, n.kind::VARCHAR AS kind, n.is_ego, f.t, {_columns}
-  FROM nodes n JOIN frames f USING (frame_id)
+  FROM {{nodes}} n JOIN frames f USING (frame_id)
   WHERE n.frame_id BETWEEN $1::BIGINT * {_FRAMES} AND $1::BIGINT * {_FRAMES} + {_FRAMES - 1}
     AND n.kind NOT IN {FIXED_KINDS}"""  # noqa: S608  names of ours
-"""The statement for the states of a trace of which :func:`tracks_of` makes tracks."""
+"""The statement for the states of a trace, in a view ``nodes``, of which :func:`tracks_of` makes tracks."""
+
+KNOWN: Final = "known "
+"""What stands before the name of a measure of all that is known, beyond the graphs, too."""
 
 
 def tracks_of(found: Mapping[str, Any]) -> list[tuple[int, str, bool, Track]]:
@@ -155,6 +158,8 @@ class _Store(Protocol):
 def encounters(store: _Store, trace: str) -> Iterator[tuple[int, int, str, Encounter]]:
     """The ego of a trace with each of those that it could meet: node ids of both, the kind, the tracks.
 
+    They are known beyond the graphs, too, out to ``[range] world``.
+
     Parameters
     ----------
     store : Store
@@ -163,7 +168,8 @@ def encounters(store: _Store, trace: str) -> Iterator[tuple[int, int, str, Encou
     """
     from sgstore.criticality._encounter import Encounter
 
-    tracks = tracks_of(store.file.arrays(TRACKS, [store.file.trace(trace).trace_id]))
+    sql = TRACKS.format(nodes="world_nodes")
+    tracks = tracks_of(store.file.arrays(sql, [store.file.trace(trace).trace_id]))
     for own, _, is_ego, track in tracks:
         for other, kind, _, met in tracks if is_ego else ():
             if other != own:

@@ -114,6 +114,8 @@ class Join:
         Values that are there, as they are computed.
     lanes : set of str
         Aliases of the rows that are joined for attributes of edges.
+    world : bool
+        Whether what was recorded is asked of all that is known.
     """
 
     select: Select = field(default_factory=Select)
@@ -124,6 +126,7 @@ class Join:
     at: dict[str, Aliases] = field(default_factory=dict[str, Aliases])
     texts: dict[Leaf, str] = field(default_factory=dict[Leaf, str])
     lanes: set[str] = field(default_factory=set[str])
+    world: bool = False
 
 
 @dataclass(slots=True)
@@ -192,7 +195,10 @@ class Layers:
         known = [leaf for leaf in kept if leaf not in later]
         text = self._without_later(values, list(dict.fromkeys([*keys, *ends])), known)
         told = Select(["*"], [nested(text, ":tested")])
-        told.columns += [named(recorded_text(one), quoted(column_of(one))) for one in later]
+        told.columns += [
+            named(recorded_text(one, world=self.join.world), quoted(column_of(one)))
+            for one in later
+        ]
         names = ['"frame_id"', *keys, *(quoted(column_of(leaf)) for leaf in wanted)]
         final = Select(list(dict.fromkeys(names)), [nested(told.text(), ":recorded")])
         final.where = [
@@ -402,6 +408,7 @@ def frames(
     ties = edges | {leaf.edge for leaf in needed if isinstance(leaf, EdgeRelation) or _is_own(leaf)}
     join, given = _first_phase(sql, scope, parts, given, bound, ties, needed)
     _second_phase(sql, join, scope, parts, given, needed)
+    join.world = sql.catalog.world
     layers = Layers(join, needed, conditions, _needless(sql.catalog))
     text = layers.text(sql.values, columns_of(nodes, edges), wanted)
     told = {leaf.node for leaf in wanted if isinstance(leaf, NodeValue)}

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from sgstore.criticality import RECORDED
+from sgstore.criticality import KNOWN, RECORDED
 from sgstore.lang._kinds import kind_conditions
 from sgstore.lang._plan import TRACE_OF_FRAME
 from sgstore.lang._sql_masks import in_mask
@@ -198,7 +198,8 @@ def of_later(found: Iterable[Leaf]) -> list[PairNumber]:
     return [leaf for leaf in found if isinstance(leaf, PairNumber) and leaf.function in RECORDED]
 
 
-def recorded_text(value: PairNumber) -> str:
+def recorded_text(value: PairNumber, *, world: bool) -> str:
     """A measure of what was recorded, of the nodes of a row; stores have the function (``_encounters``)."""
+    name = f"{KNOWN if world else ''}{value.function}"
     ends = ", ".join(quoted(f"{key}.id") for key in (value.a, value.b))
-    return f'recorded({literal(value.function)}, "frame_id" >> {TRACE_OF_FRAME}, {ends})'
+    return f'recorded({literal(name)}, "frame_id" >> {TRACE_OF_FRAME}, {ends})'

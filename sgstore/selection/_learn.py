@@ -92,8 +92,8 @@ def _sql() -> str:
         row_number() OVER (
           PARTITION BY c.frame_id ORDER BY c.closing_time NULLS LAST, c.dce_3s NULLS LAST, c.dst
         ) - 1 AS place
-      FROM criticality c
-      JOIN nodes n ON n.frame_id = c.frame_id AND n.node_id = c.dst
+      FROM world_criticality c
+      JOIN world_nodes n ON n.frame_id = c.frame_id AND n.node_id = c.dst
       JOIN nodes e ON e.frame_id = c.frame_id AND e.node_id = c.src
       WHERE {OTHERS} AND c.frame_id BETWEEN ? AND ?
       QUALIFY place < {NEIGHBOURS}

@@ -519,7 +519,7 @@ def _worst_of_pairs(
         parts += ", situation"
     sql = f"""
       SELECT frame_id, blind, {parts} FROM (
-        SELECT {", ".join(columns)} FROM criticality
+        SELECT {", ".join(columns)} FROM world_criticality
         WHERE {OTHERS} AND frame_id BETWEEN ? AND ? GROUP BY frame_id)
     """  # noqa: S608  names of ours
     value, other = (np.full((len(measures), len(units.frame_id)), fill) for fill in (np.inf, -1))

@@ -48,7 +48,7 @@ WHO: Final = """
 """The situation of a frame, of the pairs of :data:`OTHERS` in it, as a number; SQL."""
 
 _SQL: Final = f"""
-  SELECT frame_id, {WHO} FROM criticality WHERE {OTHERS} AND frame_id BETWEEN ? AND ? GROUP BY frame_id
+  SELECT frame_id, {WHO} FROM world_criticality WHERE {OTHERS} AND frame_id BETWEEN ? AND ? GROUP BY frame_id
 """  # noqa: S608  names of ours
 
 

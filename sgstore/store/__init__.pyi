@@ -12,6 +12,8 @@ from ._bundles import write_bundle as write_bundle
 from ._catalog import relations_of_set as relations_of_set
 from ._catalog import subset_catalogs as subset_catalogs
 from ._encounters import measured as measured
+from ._traces import scope_of as scope_of
+from ._traces import scope_text as scope_text
 from ._landed import split_segment as split_segment
 from ._landed import whole_segment as whole_segment
 from ._merge import PartFile as PartFile
@@ -132,6 +134,8 @@ __all__ = [
     "marks",
     "maps_of_traces",
     "measured",
+    "scope_of",
+    "scope_text",
     "merged_arrays",
     "merged_classes",
     "merged_file",

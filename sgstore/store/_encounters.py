@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final
 import duckdb
 from duckdb.func import FunctionNullHandling
 
-from sgstore.criticality import FIXED_KINDS, RECORDED, TRACKS, tracks_of
+from sgstore.criticality import FIXED_KINDS, KNOWN, RECORDED, TRACKS, tracks_of
 from sgstore.errors import ConfigError
 from sgstore.store._lease import stamp_of
 from sgstore.store._schema import INSIDE
@@ -46,11 +46,11 @@ _FUNCTION: Final = "sgstore_recorded"
 _VIEW: Final = f"""
 CREATE TEMP VIEW IF NOT EXISTS encounters AS
 SELECT e.trace_id, t.name AS trace, e.node_id AS src, o.node_id AS dst, o.kind,
-  {", ".join(f"recorded('{name}', e.trace_id, e.node_id, o.node_id) AS {name}" for name in RECORDED)}
+  {", ".join(f"recorded('{KNOWN}{name}', e.trace_id, e.node_id, o.node_id) AS {name}" for name in RECORDED)}
 FROM (SELECT DISTINCT frame_id >> 24 AS trace_id, node_id FROM {INSIDE}.state WHERE is_ego) e
 JOIN (
   SELECT trace_id, node_id, kind FROM {INSIDE}.entity
-  WHERE is_static OR (trace_id, node_id) IN (SELECT DISTINCT frame_id >> 24, node_id FROM {INSIDE}.state)
+  WHERE is_static OR (trace_id, node_id) IN (SELECT DISTINCT frame_id >> 24, node_id FROM {INSIDE}.known_state)
 ) o ON o.trace_id = e.trace_id AND o.node_id <> e.node_id AND o.kind NOT IN {FIXED_KINDS}
 JOIN {INSIDE}.trace t ON t.trace_id = e.trace_id
 """
@@ -61,13 +61,13 @@ class _Known:
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
-        self.tracks: OrderedDict[tuple[int, int], Track | None] = OrderedDict()
+        self.tracks: OrderedDict[tuple[str, int, int], Track | None] = OrderedDict()
         self.states = 0
-        self.whole: set[int] = set()
+        self.whole: set[tuple[str, int]] = set()
         self.values: dict[tuple[str, int, int, int], float | None] = {}
 
-    def keep(self, trace: int, node: int, track: Track | None) -> None:
-        self.tracks[trace, node] = track
+    def keep(self, key: tuple[str, int, int], track: Track | None) -> None:
+        self.tracks[key] = track
         self.states += 0 if track is None else len(track)
 
     def forget(self) -> None:
@@ -97,7 +97,7 @@ class _MeasuredQuestion:
 
     def value(self, measure: str, trace: int, src: int, dst: int) -> float | None:
         """A measure of a pair; ``None``: not known, or there is none."""
-        if measure not in RECORDED:
+        if measure.removeprefix(KNOWN) not in RECORDED:
             raise ConfigError(f"no recorded measure: {measure!r}; expected {', '.join(RECORDED)}")
         key = measure, trace, src, dst
         known = self._known
@@ -113,30 +113,32 @@ class _MeasuredQuestion:
     def _worked_out(self, measure: str, trace: int, src: int, dst: int) -> float | None:
         if src == dst:
             return None
-        a, b = (self._track(trace, node) for node in (src, dst))
+        nodes = "world_nodes" if measure.startswith(KNOWN) else "nodes"
+        a, b = (self._track(nodes, trace, node) for node in (src, dst))
         if a is None or b is None:
             return None
         from sgstore.criticality import Encounter  # with numpy
 
-        value = RECORDED[measure].value(Encounter(a, b))
+        value = RECORDED[measure.removeprefix(KNOWN)].value(Encounter(a, b))
         return None if math.isnan(value) else value
 
-    def _track(self, trace: int, node: int) -> Track | None:
+    def _track(self, nodes: str, trace: int, node: int) -> Track | None:
         known = self._known
-        key = trace, node
-        if key not in known.tracks and trace not in known.whole:
+        key = nodes, trace, node
+        if key not in known.tracks and (nodes, trace) not in known.whole:
             known.forget()
             first, last = trace << 24, ((trace + 1) << 24) - 1
-            sql = "SELECT count(*) FROM state WHERE frame_id BETWEEN ? AND ?"
+            sql = "SELECT count(*) FROM known_state WHERE frame_id BETWEEN ? AND ?"
             ((many,),) = self._reader.execute(sql, [first, last]).fetchall()
+            tracks = TRACKS.format(nodes=nodes)
             if many <= MOST_STATES:
-                known.whole.add(trace)
-                found = self._reader.execute(TRACKS, [trace])
+                known.whole.add((nodes, trace))
+                found = self._reader.execute(tracks, [trace])
             else:
-                found = self._reader.execute(f"{TRACKS} AND n.node_id = $2", [trace, node])
-                known.keep(trace, node, None)
+                found = self._reader.execute(f"{tracks} AND n.node_id = $2", [trace, node])
+                known.keep(key, None)
             for other, _, _, track in tracks_of(found.fetchnumpy()):
-                known.keep(trace, other, track)
+                known.keep((nodes, trace, other), track)
         return known.tracks.get(key)
 
     def close(self) -> None:
@@ -214,10 +216,11 @@ def show_recorded(connection: DuckDBPyConnection, sql: str) -> None:
 def measured(
     ask: Callable[[str, list[Any]], Iterable[tuple[Any, ...]]],
     trace_id: int,
+    scope: str,
     measure: str,
     src: int,
     dst: int,
 ) -> float | None:
     """A measure of a pair of nodes of a trace, given what answers statements; ``None``: not known."""
-    ((value,),) = ask("SELECT recorded(?, ?, ?, ?)", [measure, trace_id, src, dst])
+    ((value,),) = ask("SELECT recorded(?, ?, ?, ?)", [f"{scope}{measure}", trace_id, src, dst])
     return value

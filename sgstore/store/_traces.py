@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import re
+from collections import Counter
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from sgstore.vocabulary import natural, suggestion
 from sgstore.world import tolerance_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from datetime import datetime
 
     from duckdb import DuckDBPyConnection
@@ -280,6 +281,53 @@ def located(
             if found == path or mark_of(found)[0] == size:
                 return found
     return path
+
+
+def scope_of(traces: Iterable[StoredTrace], *, world: bool) -> dict[str, Any]:
+    """What the settings of some traces left out of a question, counted; empty where that is nothing.
+
+    Parameters
+    ----------
+    traces : iterable of StoredTrace
+        Those that are asked.
+    world : bool
+        Whether all that is known is asked, and not the graphs alone.
+
+    Returns
+    -------
+    dict
+        ``scope`` (``graph`` or ``world``), ``radius`` and ``world`` (m; ``None`` where traces differ),
+        ``states``, ``beyond_radius``, ``beyond_world`` and ``excluded`` (kind → states), ``rate`` (Hz).
+    """
+    told = [one.report["scope"] for one in traces if "scope" in one.report]
+    found: dict[str, Any] = {"scope": "world" if world else "graph"}
+    for name in ("radius", "world", "rate"):
+        values = {one[name] for one in told}
+        found[name] = values.pop() if len(values) == 1 else None
+    for name in ("states", "beyond_radius", "beyond_world"):
+        found[name] = sum(one[name] for one in told)
+    excluded: Counter[str] = Counter()
+    for one in told:
+        excluded.update(one["excluded"])
+    found["excluded"] = dict(sorted(excluded.items()))
+    beyond = found["beyond_world" if world else "beyond_radius"]
+    return found if beyond or excluded or found["rate"] else {}
+
+
+def scope_text(found: Mapping[str, Any]) -> str:
+    """What settings left out, as :func:`scope_of` has it, in one line."""
+    if not found:
+        return ""
+    world, states = found["scope"] == "world", f"of {found['states']:,} states"
+    parts: list[str] = []
+    if beyond := found["beyond_world" if world else "beyond_radius"]:
+        what, far = ("the world", found["world"]) if world else ("the graphs", found["radius"])
+        parts.append(
+            f"{beyond:,} {states} lie beyond {what}{'' if far is None else f' ({far:g} m)'}"
+        )
+    parts += [f"{many:,} of {kind} are excluded" for kind, many in found["excluded"].items()]
+    parts += [f"frames are kept at {found['rate']:g} Hz"] if found["rate"] else []
+    return f"scope {found['scope']}: {', '.join(parts)}"
 
 
 def stored_traces(

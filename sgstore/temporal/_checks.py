@@ -24,7 +24,7 @@ from sgstore.lang import (
     value_text,
 )
 from sgstore.matches import Interval, notes_in
-from sgstore.store import IN_NOTEBOOK, trace_of
+from sgstore.store import IN_NOTEBOOK, scope_of, trace_of
 from sgstore.temporal._check_plan import (
     FAVOURABLE,
     SIGNS,
@@ -548,6 +548,13 @@ class CheckRun:
             compared = [pair for one in self._checks for pair in compared_in_check(one.check)]
             found = dict.fromkeys(compared)
             return notes_in(self._file, found, self._text, self._parameters)
+
+    @property
+    def scope(self) -> dict[str, Any]:
+        """What settings left out of the traces that are asked; see :func:`sgstore.store.scope_of`."""
+        world = any(one.check.world for one in self._checks)
+        with self._file.snapshot():
+            return scope_of(self._file.traces(), world=world)
 
     def __iter__(self) -> Iterator[Verdict]:
         with self._file.snapshot():
