@@ -1,9 +1,10 @@
-"""Values as JSON, which has no word for numbers that are infinite or none."""
+"""Values as JSON, which has no word for infinite or missing numbers, and the shortest text of numbers."""
 
 from __future__ import annotations
 
 import json
 import math
+import struct
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -38,3 +39,20 @@ def finite(value: Any, word: Callable[[float], str | None] = lambda _: None) -> 
     if isinstance(value, float) and not math.isfinite(value):
         return word(value)
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def float32(number: float) -> float | None:
+    """Round a number to 32 bits; ``None`` if it is too large for them."""
+    try:
+        return float(struct.unpack("<f", struct.pack("<f", number))[0])
+    except OverflowError:
+        return None
+
+
+def shortest(number: float | None) -> float | None:
+    """Return the number of 64 bits whose text is the shortest one of a number of 32 bits."""
+    if number is None or not math.isfinite(number):
+        return number
+    texts = (f"{number:.{digits}g}" for digits in range(6, 10))
+    kept = float32(number)
+    return next(found for found in map(float, texts) if float32(found) == kept)

@@ -800,6 +800,7 @@ class Store:
     def _view(self, frame: FrameRef, query: Query) -> FrameView:
         """A frame as a pattern in memory sees it, with what it asks that only the store knows."""
         from sgstore.lang import FrameView, events_in, looked_up
+        from sgstore.world import seconds_of
 
         trace = self.file.trace(frame.trace_id)
         about = {f.name: getattr(frame, f.name) for f in fields(frame)} | {"id": frame.frame_id}
@@ -808,8 +809,8 @@ class Store:
             about |= {one.attribute.name: v for one, v in zip(asked, rows.values[0], strict=True)}
         whole = {f.name: getattr(trace, f.name) for f in fields(trace)}
         whole |= {"id": trace.trace_id, "uri": place_named(trace.path), "ego": trace.ego or None}
-        whole |= {"map": trace.map or None, "period": trace.period_ns / 1e9}
-        whole |= {"duration": (trace.end_ns - trace.start_ns) / 1e9}
+        whole |= {"map": trace.map or None, "period": seconds_of(trace.period_ns)}
+        whole |= {"duration": seconds_of(trace.end_ns - trace.start_ns)}
         classes = partial(self.file.abstracted.class_of, frame.frame_id)
         roles = partial(self.file.abstracted.roles_of, frame.frame_id)
         drawn = self.file.graph(frame.frame_id)

@@ -307,7 +307,7 @@ FROM inside.world_lane_repeated r JOIN inside.bits b ON (r.mask & b.m) <> 0;
 -- that joining them with a user's own list of frames stays cheap (static nodes and edges meet the frames as masks of a bucket).
 
 CREATE VIEW main.frames AS
-SELECT f.frame_id, f.trace_id, f.seq, f.time_ns, f.ego, t.name AS trace, (f.time_ns - t.start_ns) / 1e9 AS t, f.log_time_ns, m.name AS map
+SELECT f.frame_id, f.trace_id, f.seq, f.time_ns, f.ego, t.name AS trace, round((f.time_ns - t.start_ns) / 1e3) / 1e6 AS t, f.log_time_ns, m.name AS map
 FROM inside.frame f JOIN inside.trace t ON t.trace_id = f.trace_id LEFT JOIN inside.map m ON m.map_id = f.map_id;
 
 COMMENT ON VIEW main.frames IS 'One row a frame. ego: node_id of the ego, NULL where it is absent; trace: name of the recording; t: seconds since the trace began; log_time_ns: of the leading message; map: name of the road map, NULL without one.';
@@ -324,7 +324,7 @@ SELECT s.frame_id, s.node_id, s.kind, s.is_ego, s.kind || ' ' || s.node_id AS na
        (s.lights & 512) <> 0 AS light_special1, (s.lights & 1024) <> 0 AS light_special2, s.steer, s.throttle, s.brake, s.gear, s.hand_brake,
        (s.derived & 1) <> 0 AS derived_velocity, (s.derived & 2) <> 0 AS derived_acceleration, (s.derived & 4) <> 0 AS derived_yaw_rate,
        NULL::VARCHAR AS lane_type, NULL::VARCHAR AS road, NULL::INTEGER AS section, NULL::INTEGER AS lane, NULL::VARCHAR AS junction,
-       NULL::VARCHAR AS turn, NULL::DOUBLE AS speed_limit, NULL::DOUBLE AS curvature, e.ident, e.type_name, s.carrier
+       NULL::VARCHAR AS turn, NULL::FLOAT AS speed_limit, NULL::DOUBLE AS curvature, e.ident, e.type_name, s.carrier
 FROM inside.state s JOIN inside.entity e ON e.trace_id = s.frame_id >> 24 AND e.node_id = s.node_id JOIN inside.trace t ON t.trace_id = e.trace_id
 UNION ALL
 SELECT f.frame_id, n.node_id, n.kind, false, n.name, n.special, n.subkind, true, n.x, n.y, n.z, degrees(n.heading),
@@ -333,8 +333,8 @@ SELECT f.frame_id, n.node_id, n.kind, false, n.name, n.special, n.subkind, true,
        n.lane_type, n.road, n.section, n.lane, n.junction, n.turn, n.speed_limit, n.curvature, n.ident, n.type_name, NULL
 FROM inside.frame f JOIN (
   SELECT k.bucket, k.mask, k.node_id, k.kind, m.name, NULL::VARCHAR AS special, NULL::VARCHAR AS subkind, m.x, m.y, m.z, m.heading,
-         m.length, m.width, NULL::FLOAT AS height,
-         CASE WHEN k.kind IN ('lane', 'road', 'junction', 'crosswalk', 'off_road', 'waypoint', 'roundabout') THEN NULL ELSE 0::FLOAT END AS still, m.lane_type, m.road, m.section, m.lane, m.junction, m.turn, m.speed_limit, m.curvature,
+         m.length::FLOAT AS length, m.width::FLOAT AS width, NULL::FLOAT AS height,
+         CASE WHEN k.kind IN ('lane', 'road', 'junction', 'crosswalk', 'off_road', 'waypoint', 'roundabout') THEN NULL ELSE 0::FLOAT END AS still, m.lane_type, m.road, m.section, m.lane, m.junction, m.turn, m.speed_limit::FLOAT AS speed_limit, m.curvature,
          NULL::VARCHAR AS ident, NULL::VARCHAR AS type_name
   FROM inside.bucket b JOIN inside.node k ON k.bucket = b.bucket JOIN inside.map_node m ON m.map_id = b.map_id AND m.node_id = k.node_id
   UNION ALL
@@ -457,7 +457,7 @@ COMMENT ON VIEW main.roles IS 'What lanes are to the ego: one row a frame and la
 
 CREATE VIEW main.lanes AS
 SELECT m.name AS map, n.node_id, n.name, n.lane_type, n.road, n.section, n.lane, n.junction, n.turn, n.x, n.y, n.z, degrees(n.heading) AS heading,
-       n.length, n.width, n.speed_limit
+       n.length, n.width, n.speed_limit::FLOAT AS speed_limit
 FROM inside.map_node n JOIN inside.map m ON m.map_id = n.map_id
 WHERE n.kind = 'lane';
 
@@ -481,7 +481,7 @@ FROM inside.frame f JOIN inside.payload p ON p.bucket = f.bucket AND p.bit = f.b
 COMMENT ON VIEW main.payloads IS 'The message of each channel that belongs to a frame, by its place in the recording. channel: topic; offset_s: log time less the frame''s; chunk_offset: of the chunk in the file, -1 if the message is in none; message_offset: of the message record in the chunk''s records, uncompressed, or in the file; length: of the message''s data, bytes.';
 
 CREATE VIEW main.events AS
-SELECT v.frame_id, v.trace_id, t.name AS trace, v.kind, v.time_ns, (v.time_ns - t.start_ns) / 1e9 AS t, v.log_time_ns,
+SELECT v.frame_id, v.trace_id, t.name AS trace, v.kind, v.time_ns, round((v.time_ns - t.start_ns) / 1e3) / 1e6 AS t, v.log_time_ns,
        e.node_id, o.node_id AS other, v.value, v.detail, v.ident, v.other AS other_ident
 FROM inside.event v JOIN inside.trace t ON t.trace_id = v.trace_id
      LEFT JOIN inside.entity e ON e.trace_id = v.trace_id AND e.ident = v.ident

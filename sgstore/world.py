@@ -47,6 +47,15 @@ TOLERANCE_SHARE: Final = 100
 """So are those that differ by no more than this part of the median period of their trace."""
 
 
+def seconds_of(ns: int) -> float:
+    """Return a time in nanoseconds as seconds, rounded to whole microseconds.
+
+    Clocks of simulators lose the last nanosecond: 7.499999999 s is 7.5 s.
+    """
+    whole = (abs(ns) + 500) // 1000 / 1e6
+    return whole if ns >= 0 else -whole
+
+
 def tolerance_ns(period_ns: int) -> int:
     """Greatest difference of two times of a trace that still count as the same: clocks jitter.
 

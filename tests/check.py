@@ -39,7 +39,7 @@ TESTS = {
     "files": "outputs folders moved",
     "geometry": "geometry",
     "ingest": "ingest ingest_* cases",
-    "lang": "lang_* cookbook textmate tck union second_match sql_patterns needs notes library library_data"
+    "lang": "lang_* precision cookbook textmate tck union second_match sql_patterns needs notes library library_data"
     " zones like tolerance",
     "map_files": "cli_map lanelet2 sumo",
     "importing": "importing openlabel",

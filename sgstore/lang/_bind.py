@@ -19,6 +19,7 @@ from sgstore.lang._bind_stages import StageBinder, name_path
 from sgstore.lang._bind_temporal import StepScope, bind_sequence, settled, tense, timespan
 from sgstore.lang._catalog import TRACE_ATTRIBUTES, Catalog, Type
 from sgstore.lang._functions import FUNCTIONS, call, happens
+from sgstore.lang._precision import is_stored
 from sgstore.lang._symbols import (
     RESERVED,
     THE_EGO,
@@ -646,7 +647,7 @@ def _column(item: s.Item, names: SymbolTable) -> b.ReturnColumn:
     if value.type is Type.list and not (isinstance(value, b.Aggregate) or b.is_passed_on(value)):
         names.session.refuse("a list cannot be returned", item.span)
     text = names.session.text[item.value.span.start : item.value.span.end]
-    return b.ReturnColumn(item.name or " ".join(text.split()), value)
+    return b.ReturnColumn(item.name or " ".join(text.split()), value, is_stored(value))
 
 
 def _refuse_mixed(value: b.Bound, span: TextSpan, session: Session) -> None:

@@ -24,6 +24,7 @@ from sgstore.lang._catalog import (
 )
 from sgstore.lang._hints import comparison_hint, hint_at, said_of
 from sgstore.lang._operators import TEXT_TESTS
+from sgstore.lang._precision import chosen, compared
 from sgstore.lang._symbols import (
     CLASSES,
     RESERVED,
@@ -337,7 +338,7 @@ def _comparison(e: s.Comparison, names: SymbolTable) -> b.Operation:
         _canonical(left, right, e.left.span, names),
         _canonical(right, left, e.right.span, names),
     )
-    return b.Operation(e.word, (left, right), Type.boolean)
+    return b.Operation(e.word, compared(left, right), Type.boolean)
 
 
 def _check_sides(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTable) -> None:
@@ -457,7 +458,7 @@ def _membership(e: s.Membership, names: SymbolTable) -> b.Bound:
             )
     items = tuple(_canonical(item, operand, e.choices.span, names) for item in choices.items)
     canonical = b.Choices(tuple(item for item in items if isinstance(item, b.Value)))
-    found = b.Operation("IN", (operand, canonical), Type.boolean)
+    found = b.Operation("IN", chosen(operand, canonical), Type.boolean)
     return b.Operation("NOT", (found,), Type.boolean) if e.negated else found
 
 

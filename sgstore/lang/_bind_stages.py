@@ -15,6 +15,7 @@ from sgstore.lang import ir as b
 from sgstore.lang import syntax as s
 from sgstore.lang._bind_temporal import settled
 from sgstore.lang._catalog import Type
+from sgstore.lang._precision import is_stored, precision_of
 from sgstore.lang._symbols import (
     RESERVED,
     THE_EGO,
@@ -231,7 +232,7 @@ class StageBinder:
             if value is None:
                 continue
             self._checked(value)
-            place = _place(name, value.type, self._session, path=b.is_path(value))
+            place = _place(name, value, self._session)
             values.append(b.ReturnColumn(name, value))
             places.append(place)
             symbols[name] = Symbol(value=place)
@@ -319,10 +320,15 @@ MOST_WAYS: Final = 100
 """So many lengths the paths with names of a pattern may have, all combinations counted."""
 
 
-def _place(name: str, kind: Type, session: Session, *, path: bool) -> b.FrameAttribute:
-    """What stands for a value, or a path, that has a name."""
+def _place(name: str, value: b.Bound | None, session: Session) -> b.FrameAttribute:
+    """What stands for a value, or for a path (``None``), that has a name."""
     session.numbers += 1
-    return b.passed_on(f"{b.PASSED}{name} {'p' * path}{session.numbers}", kind)
+    if value is None or b.is_path(value):
+        return b.passed_on(f"{b.PASSED}{name} p{session.numbers}", Type.list)
+    precision = precision_of(value)
+    word = "" if precision is None else precision.value
+    called = f"{b.PASSED}{name} {session.numbers}"
+    return b.passed_on(called, value.type, word, stored=is_stored(value))
 
 
 def name_path(path: s.Path, nodes: list[str], edges: list[str], names: SymbolTable) -> None:
@@ -341,7 +347,7 @@ def name_path(path: s.Path, nodes: list[str], edges: list[str], names: SymbolTab
         session.refuse("a path has a name in a pattern of one frame, outside of braces", span, hint)
     if path.name in RESERVED or path.name == THE_EGO or names.meaning(path.name) is not None:
         session.refuse(f"'{path.name}' is bound already", span)
-    place = _place(path.name, Type.list, session, path=True)
+    place = _place(path.name, None, session)
     backwards = [edge.direction == "left" for edge in path.edges]
     found = b.PathValue(place, tuple(nodes), tuple(zip(edges, backwards, strict=True)))
     names.paths.append(found)

@@ -152,6 +152,10 @@ class Attribute:
         The enumeration of the vocabulary that its values are of; empty for all others.
     given : str
         The table that tells it where a store is part of a collection: see :attr:`Catalog.part`.
+    precision : str
+        Of a value that ``WITH`` passes on: how it is rounded before it is compared.
+    stored : bool
+        Whether such a value is a number of 32 bits as the store keeps it.
     meaning : str
         For the documentation; with unit.
     table : str
@@ -174,6 +178,8 @@ class Attribute:
     enum: str = ""
     given: str = ""
     whole: bool = False
+    precision: str = ""
+    stored: bool = False
 
     @property
     def kinds(self) -> frozenset[str]:

@@ -342,13 +342,18 @@ def frame_text(leaf: FrameAttribute | TraceAttribute, frame: str, trace: str, ma
         value = f"({of.text()})"
     match attribute.unit:
         case DisplayUnit.seconds:
-            return f"(CAST({value} - {trace}.{quoted('start_ns')} AS DOUBLE) / 1e9)"
+            return "(" + seconds_text(f'{value} - {trace}."start_ns"') + ")"
         case DisplayUnit.span:
-            return f"(CAST({value} AS DOUBLE) / 1e9)"
+            return f"({seconds_text(value)})"
         case DisplayUnit.classed:
             return _class_text(column, frame)
         case _:
             return value
+
+
+def seconds_text(ns: str) -> str:
+    """Return the SQL of a time in nanoseconds as seconds: as :func:`sgstore.world.seconds_of`."""
+    return f"round(CAST({ns} AS DOUBLE) / 1e3) / 1e6"
 
 
 def _class_text(abstraction: str, frame: str) -> str:

@@ -26,6 +26,8 @@ class Value:
         ``s`` or ``frames`` if it was written as a length of time, such as ``2s``; no part of what it is.
     span : TextSpan or None
         Where a length of time was written.
+    written : float or None
+        The number as it was written, if it was rounded for a comparison.
     """
 
     value: int | float | str | bool | None
@@ -33,6 +35,12 @@ class Value:
     closed: bool = False
     unit: str = field(default="", compare=False)
     span: TextSpan | None = field(default=None, compare=False)
+    written: float | None = field(default=None, compare=False)
+
+    @property
+    def shown(self) -> float | str | bool | None:
+        """The constant as the query has it."""
+        return self.value if self.written is None else self.written
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from functools import reduce
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.arrays import np
+from sgstore.json_text import float32
 from sgstore.records import dataclass
 
 if TYPE_CHECKING:
@@ -306,6 +307,20 @@ def _rounded_columns(a: Any) -> Any:
     return np.copysign(np.floor(np.abs(a) + 0.5), a)
 
 
+def _float32_columns(numbers: Any) -> tuple[Any, Any]:
+    rounded = np.asarray(numbers, np.float64).astype(np.float32).astype(np.float64)
+    return rounded, np.isfinite(rounded)
+
+
+def microseconds(seconds: float) -> float:
+    """Round a time to whole microseconds; halves go away from zero."""
+    return _rounded(seconds * 1e6) / 1e6
+
+
+def _microseconds_columns(seconds: Any) -> Any:
+    return _rounded_columns(np.multiply(seconds, 1e6)) / 1e6
+
+
 def _least(*values: Any) -> Any:
     return reduce(np.minimum, values)
 
@@ -589,6 +604,10 @@ OPERATORS: Final[Mapping[str, Operator]] = {
     ),
     "negative": _strict("(- {0})", operator.neg, _ufunc("negative")),
     "length": _strict("(len({0}) - 1)", _edges_between, _no_columns),
+    "float32": _strict(
+        "CAST(TRY_CAST({0} AS FLOAT) AS DOUBLE)", float32, _float32_columns, partial=True
+    ),
+    "microseconds": _strict("(round({0} * 1e6) / 1e6)", microseconds, _microseconds_columns),
     "coalesce": _ruled("coalesce(...)", _first_known, _first_known_columns),
     "case": Operator(_case, _chosen, _chosen_columns),
     "IS NULL": _null_test("IS NULL", null=True),
@@ -597,6 +616,12 @@ OPERATORS: Final[Mapping[str, Operator]] = {
 }
 """All operators by the word that an :class:`~sgstore.lang.ir.Operation` has. The operands of ``IN`` are a value
 and, in memory, its choices as one."""
+
+ROUNDINGS: Final[Mapping[str, Callable[[float], float | None]]] = {
+    "float32": float32,
+    "microseconds": microseconds,
+}
+"""Operators that round a side of a comparison, in :mod:`~sgstore.lang._precision`; no query can name them."""
 
 INFIX: Final = frozenset(word for word, one in OPERATORS.items() if one.infix)
 

@@ -29,6 +29,7 @@ from sgstore.lang._formulas import (
     leaves,
     nested,
     owner_text,
+    seconds_text,
 )
 from sgstore.lang._kinds import Profile
 from sgstore.lang._plan import TRACE_OF_BUCKET, frame_key, name_key, traces_of
@@ -220,7 +221,7 @@ _TRACE_NAME: Final = TraceAttribute(TRACE_ATTRIBUTES["name"], Type.text)
 _FRAME: Final = '":frame"'
 _TRACE: Final = '":trace"'
 _ROWS: Final = '":rows"'
-_T: Final = 'CAST({0} - ":trace"."start_ns" AS DOUBLE) / 1e9'
+_T: Final = seconds_text('{0} - ":trace"."start_ns"')
 
 
 @dataclass(frozen=True, slots=True)
@@ -402,6 +403,12 @@ class _RowStatement:
             for per in (_per(self.result, one) for one in (self.result.sample, self.result.top))
         )
         self.texts = dict[str, str]()  # of the columns by which matches are grouped
+        # Numbers of 32 bits are grouped as they are, and shown as their shortest text.
+        self.shortened = {
+            quoted(column.name): _named(shortest_text(quoted(column.name)), column.name)
+            for column in self.result.columns
+            if column.single and self.grouped
+        }
         # What WITH passed on tells matches apart, too.
         self.passed = told_apart_by(query)
 
@@ -471,7 +478,8 @@ class _RowStatement:
             texts += [f"{_ROWS}.{quoted(f'{key}.type')}" for key in edges]
         for column in self.result.columns:
             whole = self.result.aggregated and not _aggregates(column)
-            texts.append(self._of_group(column.name) if whole else self._text(column.value))
+            text = self._of_group(column.name) if whole else self._text(column.value)
+            texts.append(shortest_text(text) if column.single and not self.grouped else text)
         return list(zip(names_of(self.query), texts, strict=True))
 
     def _names(self) -> list[tuple[str, Bound]]:
@@ -514,14 +522,15 @@ class _RowStatement:
         keys += names if once or grouped else bindings
         sample, top = self.result.sample, self.result.top
         named = self._named_traces(keys, own) if grouped else []
+        shown = [self.shortened.get(name, name) for name in names]
         if sample is not None:
             per = [] if sample.per is None else [self._key(sample.per)]
             per += [self._text(owner) for owner in self.owners]
             chosen = Chosen(sample.number, per, frame, first=own)
-            select, keys = sampled(select, [*names, *tops], names, keys, chosen)
-        elif moved or named or top is not None:
+            select, keys = sampled(select, [*shown, *tops], names, keys, chosen)
+        elif moved or named or top is not None or self.shortened:
             order = keyed(select, names, keys)
-            select = Select([*names, *tops], [nested(select.text(), ":all")])
+            select = Select([*shown, *tops], [nested(select.text(), ":all")])
             for place in named:
                 order[place] = name_key(select, place, keys[place], writer.catalog, writer.values)
             keys = order
@@ -568,7 +577,7 @@ class _IntervalStatement:
         spans = self._spans(wanted)
         clips = self.result.form == "clips"
         own = self._clip_columns() if clips else self._interval_columns()
-        told = dict(own) | {column.name: self._told(column.value) for column in columns}
+        told = dict(own) | {column.name: self._shown(column) for column in columns}
         hidden = self._hidden(told) if self.result.keyed else {}
         select = Select([_named(text, name) for name, text in (told | hidden).items()])
         select.join(nested(self._between(spans), ":runs"), [])
@@ -631,6 +640,10 @@ class _IntervalStatement:
         if value in self.keys and not isinstance(value, NodeAttribute):
             return self.keys[value]
         return expression_text(value, self.keys.__getitem__, self.writer.values)
+
+    def _shown(self, column: ReturnColumn) -> str:
+        text = self._told(column.value)
+        return shortest_text(text) if column.single else text
 
     def _keys(self) -> dict[str, str]:
         """Key → the value that stays the same."""
@@ -734,6 +747,11 @@ def _from_frames(select: Select, relation: str) -> None:
     select.join(nested(relation, ":rows"), [])
     select.join(f'"frame" AS {_FRAME}', [f'{_FRAME}."frame_id" = {_ROWS}."frame_id"'])
     select.join(f'"trace" AS {_TRACE}', [f'{_TRACE}."trace_id" = {_FRAME}."trace_id"'])
+
+
+def shortest_text(text: str) -> str:
+    """Return the SQL of a number of 32 bits as the number of 64 bits with the same shortest text."""
+    return f"CAST(CAST(CAST({text} AS FLOAT) AS VARCHAR) AS DOUBLE)"
 
 
 def _named(text: str, name: str) -> str:

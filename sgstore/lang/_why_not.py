@@ -18,7 +18,7 @@ from sgstore.lang import ir as b
 from sgstore.lang._catalog import FRAME_ATTRIBUTES, DisplayUnit
 from sgstore.lang._evaluate import Binding, FrameView, NodePair
 from sgstore.lang._formulas import happened_in_frame, leaves, told_events
-from sgstore.lang._operators import INFIX
+from sgstore.lang._operators import INFIX, ROUNDINGS
 from sgstore.lang._plan import TRACE_OF_FRAME
 from sgstore.lang._search import ScopeSearch, expression
 from sgstore.pair_numbers import as_written
@@ -196,6 +196,8 @@ class Writer:
 
     def _operation(self, operation: b.Operation, *, inner: bool) -> str:
         word, operands = operation.word, operation.operands
+        if word in ROUNDINGS:
+            return self.expression(operands[0], inner=inner)
         if word == "IS NOT NULL" and isinstance(operands[0], b.NodeValue):
             return f"known({self.expression(operands[0])})"
         if word == "case":
@@ -216,7 +218,7 @@ class Writer:
 
 
 def _constant(value: b.Value, *, inner: bool) -> str:
-    constant = value.value
+    constant = value.shown
     if constant is None:
         return "NULL"
     if isinstance(constant, bool):
@@ -566,7 +568,7 @@ def _gaps(condition: b.Bound, at: Binding, query: b.Query) -> Iterator[tuple[str
 def _constant_of(value: b.Bound) -> float | None:
     """The number that an expression is, if it is one."""
     match value:
-        case b.Value(value=int() | float() as number) if not isinstance(number, bool):
+        case b.Value(shown=int() | float() as number) if not isinstance(number, bool):
             return float(number)
         case b.Operation(word="negative", operands=(b.Value(value=int() | float() as number),)):
             return -float(number)

@@ -324,10 +324,19 @@ Form = Literal["rows", "intervals", "clips", "subgraphs"]
 
 @dataclass(frozen=True, slots=True)
 class ReturnColumn:
-    """A value to return, and what it is called."""
+    """A value to return, and what it is called.
+
+    Attributes
+    ----------
+    name : str
+    value : Bound
+    single : bool
+        Whether the value has 32 bits: it is returned as the shortest text of these.
+    """
 
     name: str
     value: Bound
+    single: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -549,9 +558,12 @@ PASSED: Final = ":with "
 """What the names of values begin with that ``WITH`` passes on."""
 
 
-def passed_on(name: str, kind: Type) -> FrameAttribute:
+def passed_on(
+    name: str, kind: Type, precision: str = "", *, stored: bool = False
+) -> FrameAttribute:
     """What stands for a value that ``WITH`` passes on, each time another."""
-    return FrameAttribute(Attribute(name, kind, {}, "", DisplayUnit.whole), kind)
+    attribute = Attribute(name, kind, {}, "", DisplayUnit.whole, precision=precision, stored=stored)
+    return FrameAttribute(attribute, kind)
 
 
 def is_passed_on(value: Bound) -> TypeGuard[FrameAttribute]:

@@ -377,7 +377,7 @@ class StoreFile:
 
         def ask(connection: DuckDBPyConnection, until: ExitStack) -> Batches:
             rows.give_to_user(connection, given, sql, timeout_s)
-            begin = partial(Batches, connection, sql, size=size)
+            begin = partial(Batches, connection, sql, size=size, shortened=True)
             return until.enter_context(rows.user_statement(connection, sql, timeout_s, begin))
 
         with self._answered(ask, sql, public=True) as found:

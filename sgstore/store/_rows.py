@@ -18,6 +18,7 @@ import duckdb
 from sgstore.arrays import np
 from sgstore.errors import ExportError, MissingExtraError, SqlError
 from sgstore.files import without_controls, working_folder, written_at, written_text
+from sgstore.json_text import shortest
 from sgstore.quoting import literal, quoted
 from sgstore.store._given import Given, give
 from sgstore.store._locking import EngineError, engine_fault, spill_fault
@@ -283,6 +284,8 @@ class Batches:
     ----------
     columns, types : tuple of str
         As in :class:`Rows`.
+    shortened : bool
+        Whether numbers of 32 bits come as those of 64 bits that have the same shortest text.
     """
 
     def __init__(
@@ -291,6 +294,8 @@ class Batches:
         sql: str,
         parameters: Parameters | None = None,
         size: int = BATCH,
+        *,
+        shortened: bool = False,
     ) -> None:
         self._connection = connection
         self._size = size
@@ -301,13 +306,23 @@ class Batches:
         # Faults of the statement come before its first row is given.
         self._next = interruptible(connection, begin)
         self.columns, self.types = _described(connection)
+        self._single = [i for i, kind in enumerate(self.types) if kind == "FLOAT" and shortened]
+
+    def _told(self, values: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+        """Rows whose numbers of 32 bits have their shortest text."""
+        if not self._single:
+            return values
+        columns = list(zip(*values, strict=True))
+        for place in self._single:
+            columns[place] = tuple(map(shortest, columns[place]))
+        return list(zip(*columns, strict=True))
 
     def _more(self) -> list[tuple[Any, ...]]:
         return interruptible(self._connection, lambda: self._connection.fetchmany(self._size))
 
     def __iter__(self) -> Iterator[Rows]:
         while values := self._next:
-            yield Rows(self.columns, self.types, values)
+            yield Rows(self.columns, self.types, self._told(values))
             self._next = self._more() if len(values) == self._size else []
 
 
@@ -355,11 +370,15 @@ def as_told(
     arrow = _package("pyarrow")
     table = arrow.concat_tables(tables).slice(0, most)
     wide = {arrow.int32(): arrow.int64(), arrow.float32(): arrow.float64()}
+    columns_told = (  # the shortest text of 32 bits, as in Python
+        column.cast(arrow.string()) if column.type == arrow.float32() else column
+        for column in table.columns
+    )
     arrays = [
         arrow.nulls(len(column))
         if column.null_count == len(column)
-        else column.cast(wide.get(column.type, column.type))
-        for column in table.columns
+        else column.cast(wide.get(kind, kind))
+        for column, kind in zip(columns_told, table.schema.types, strict=True)
     ]
     return arrow.table(arrays, names=list(columns or table.column_names))
 

@@ -47,7 +47,7 @@ def frame_times(connection: DuckDBPyConnection, trace_id: int, first: int, last:
     """Number, time since the trace began (s) and ego (-1: none) of frames, both ends included."""
     low, high = _ids(trace_id, first, last)
     found = connection.execute(
-        "SELECT f.seq AS seq, (f.time_ns - t.start_ns) / 1e9 AS t, coalesce(f.ego, -1) AS ego"
+        "SELECT f.seq AS seq, round((f.time_ns - t.start_ns) / 1e3) / 1e6 AS t, coalesce(f.ego, -1) AS ego"
         " FROM frame f JOIN trace t ON t.trace_id = f.trace_id"
         " WHERE f.frame_id BETWEEN ? AND ? ORDER BY f.frame_id",
         [low, high],

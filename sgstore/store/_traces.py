@@ -518,7 +518,8 @@ def _frame(
 ) -> FrameRef | None:
     row = connection.execute(
         f"""
-        SELECT f.frame_id, f.trace_id, t.name, f.seq, f.time_ns, f.log_time_ns, (f.time_ns - t.start_ns) / 1e9
+        SELECT f.frame_id, f.trace_id, t.name, f.seq, f.time_ns, f.log_time_ns,
+            round((f.time_ns - t.start_ns) / 1e3) / 1e6
         FROM frame f JOIN trace t ON t.trace_id = f.trace_id WHERE {condition}
         """,
         list(parameters),

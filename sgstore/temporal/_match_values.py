@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.json_text import shortest
 from sgstore.lang import Column, expression
 from sgstore.lang import ir as b
 from sgstore.temporal._windows import exact, rounded
@@ -47,6 +48,7 @@ class ReturnedValues:
     def __init__(self, columns: Sequence[b.ReturnColumn], word: str) -> None:
         self._word = word
         self._columns = [(column.name, self._of_match(column.value)) for column in columns]
+        self._single = frozenset(column.name for column in columns if column.single)
         found = (part for _, value in self._columns for part in b.walk(value))
         self.parts = tuple(dict.fromkeys(part for part in found if isinstance(part, b.OverMatch)))
 
@@ -80,10 +82,11 @@ class ReturnedValues:
             return b.with_operands(value, known)
 
         nothing: Any = None  # constants are asked of no frame
-        return {
+        told = {
             name: expression(known(value), injective=False)(nothing)
             for name, value in self._columns
         }
+        return {n: shortest(v) if n in self._single else v for n, v in told.items()}
 
 
 AT_FRAME: Final = -1

@@ -41,6 +41,7 @@ from sgstore.temporal._expression_monitor import sequence_monitor
 from sgstore.temporal._known_range import SeenRange
 from sgstore.temporal._sequence_monitor import FrameTime, MonitorEvent, SequenceMonitor
 from sgstore.temporal._valuation import NodeNames, QueryCache, StreamClock
+from sgstore.world import seconds_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -344,7 +345,7 @@ class Monitor:
         """Ask all questions of the graphs of a frame."""
         self._pulse.step(graphs[0].time_ns)
         tick, time = self._pulse.tick, self._pulse.told(self._pulse.tick.time)
-        here = FrameTime(tick.number, time, (time - self._pulse.start) / 1e9)
+        here = FrameTime(tick.number, time, seconds_of(time - self._pulse.start))
         people: list[NodeNames] = []
         scopes = zip(self._scopes, self._questions, self._seen, strict=True)
         for (number, world), questions, seen in scopes:

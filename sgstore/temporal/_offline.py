@@ -35,7 +35,7 @@ from sgstore.temporal._plan import Ask, ask_text
 from sgstore.temporal._robustness import MARGIN_CELLS, MarginTable, margin_columns
 from sgstore.temporal._signals import Clock, SignalValues, evaluate_rows
 from sgstore.vocabulary import RELATIONS
-from sgstore.world import JUMP_NS, longest_step_ns, tolerance_ns
+from sgstore.world import JUMP_NS, longest_step_ns, seconds_of, tolerance_ns
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -244,7 +244,7 @@ class TraceReader:
 
     def seconds(self, frame: int) -> float:
         """The time of a frame since the trace began."""
-        return float(self.times[frame] - self.start) / 1e9
+        return seconds_of(int(self.times[frame] - self.start))
 
 
 class PlanValues(SignalValues):

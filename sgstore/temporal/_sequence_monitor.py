@@ -23,6 +23,7 @@ from sgstore.temporal._match_values import AT_FRAME, ReturnedValues
 from sgstore.temporal._match_values_monitor import MatchValues
 from sgstore.temporal._plan import asks_of_steps, plan_of_steps, tied_in_steps
 from sgstore.temporal._valuation import BindingTable, Partial, Valuation
+from sgstore.world import seconds_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -593,7 +594,7 @@ class SequenceMonitor:
 
     def _moment(self, place: StepFrame) -> FrameTime:
         time = self._pulse.told(place.time)
-        return FrameTime(place.number, time, (time - self._pulse.start) / 1e9)
+        return FrameTime(place.number, time, seconds_of(time - self._pulse.start))
 
     # What is kept
 

@@ -34,7 +34,7 @@ from sgstore.temporal._plan import (
     way_text,
 )
 from sgstore.temporal._runs import RunFinder
-from sgstore.world import JUMP_NS
+from sgstore.world import JUMP_NS, seconds_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -728,7 +728,7 @@ class Finder:
         for place in places:
             if isinstance(place, StepTime) and place.step in happen:
                 times = trace.times[frames[:, happen.index(place.step)]] - trace.start
-                found[place] = (times / 1e9).tolist()
+                found[place] = [seconds_of(time) for time in times.tolist()]
             found.setdefault(place, [None] * len(owners))  # of a step of other sequences
         return [found[place] for place in places]
 

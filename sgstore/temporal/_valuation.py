@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 import numpy as np
 
 from sgstore.errors import QueryError
+from sgstore.json_text import shortest
 from sgstore.lang import (
     FUTURE,
     Binding,
@@ -295,17 +296,17 @@ class QueryCache:
         The bindings of the named nodes and edges are told, each with what its first row returns.
         """
         search = StageSearch(query)
-        returned = (
-            {} if query.result.aggregated else {c.name: c.value for c in query.result.columns}
-        )
-        values = [(name, search.value(value)) for name, value in returned.items()]
+        returned = () if query.result.aggregated else query.result.columns
+        single = frozenset(column.name for column in returned if column.single)
+        values = {column.name: search.value(column.value) for column in returned}
 
         def found(view: FrameView, _: NodeNames) -> Mapping[Key, Any]:
             told = dict[Key, Any]()
             for row in search.rows(view):
                 key = tuple(_place(row, name) for name in keys)
                 if key not in told:
-                    told[key] = {name: value(row) for name, value in values}
+                    of_row = {name: value(row) for name, value in values.items()}
+                    told[key] = {n: shortest(v) if n in single else v for n, v in of_row.items()}
             return told
 
         self._all.append(found)

@@ -1,0 +1,153 @@
+"""Precision of values: a number is compared as precisely as the store keeps the other side.
+
+The store keeps most attributes of nodes and edges in 32 bits, so a car whose width is 1.8 m has the width
+1.7999999523162842. A number that is compared with such a value is rounded to 32 bits first. Times since the
+start of a trace count whole microseconds, because clocks of simulators lose the last nanosecond.
+
+Notes
+-----
+A constant is rounded once, here. Another value is rounded by an operator of its own, which each engine has.
+Values of pairs of entities, positions and sums are computed in 64 bits and compared as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from enum import Enum
+from typing import TYPE_CHECKING, Final
+
+from sgstore.lang import ir as b
+from sgstore.lang._catalog import DisplayUnit, Home, Type
+from sgstore.lang._operators import ROUNDINGS
+
+if TYPE_CHECKING:
+    from sgstore.lang._catalog import Attribute
+
+
+class Precision(Enum):
+    """How a value is rounded before it is compared; the value is the word of the operator."""
+
+    float32 = "float32"
+    microseconds = "microseconds"
+
+
+_STORED: Final = frozenset({DisplayUnit.plain, DisplayUnit.velocity})
+_CONVERTED: Final = frozenset({DisplayUnit.degrees, DisplayUnit.along})
+"""Units of numbers that are computed from 32-bit columns of one row."""
+
+_SAME: Final = frozenset({"abs", "negative", "min", "max", "coalesce", "case"})
+"""Operators whose value is one of their operands, but for its sign."""
+
+_CHOSEN: Final = frozenset({"min", "max", "first", "last", "median", "percentile", "avg"})
+"""Functions of many values whose value lies among these."""
+
+_OVER_TIME: Final = frozenset({"prev", "min_over", "max_over", "avg_over"})
+
+
+def precision_of(value: b.Bound) -> Precision | None:
+    """Return the precision with which a value is known; ``None`` if it is computed in 64 bits."""
+    if value.type is not Type.number:
+        return None
+    match value:
+        case b.NodeAttribute(attribute=attribute) | b.EdgeAttribute(attribute=attribute):
+            stored = attribute.unit in _STORED | _CONVERTED and Home.state in attribute.columns
+            return Precision.float32 if stored else None
+        case b.FrameAttribute(attribute=attribute) | b.TraceAttribute(attribute=attribute):
+            return _of_whole(attribute)
+        case b.StepTime():
+            return Precision.microseconds
+        case b.Operation(word=word, operands=operands) if word in _SAME:
+            return _common(operands[1::2] + operands[-1:] if word == "case" else operands)
+        case _:
+            return _of_many(value)
+
+
+def _of_whole(attribute: Attribute) -> Precision | None:
+    """Return the precision of an attribute of a frame or a trace, or of a value that is passed on."""
+    if attribute.precision:
+        return Precision(attribute.precision)
+    timed = attribute.unit in {DisplayUnit.seconds, DisplayUnit.span}
+    return Precision.microseconds if timed else None
+
+
+def _of_many(value: b.Bound) -> Precision | None:
+    """Return the precision of a value that is chosen from many."""
+    match value:
+        case b.OverMatch(word="argmin" | "argmax", at=at) if at is not None:
+            return precision_of(at)
+        case b.OverMatch(word=word, operand=operand) if word in _CHOSEN:
+            return precision_of(operand)
+        case b.Aggregate(word=word, operand=operand) if word in _CHOSEN and operand is not None:
+            return precision_of(operand)
+        case b.BlockValue(word=word, value=inner) if word.lower() in _CHOSEN and inner is not None:
+            return precision_of(inner)
+        case b.SignalCall(word=word, operand=operand) if word in _OVER_TIME:
+            return precision_of(operand)
+        case _:
+            return None
+
+
+def _common(operands: tuple[b.Bound, ...]) -> Precision | None:
+    """Return the precision of values of which one is chosen: that of all but the constants."""
+    found = {precision_of(one) for one in operands if not isinstance(one, b.Value)}
+    return found.pop() if len(found) == 1 else None
+
+
+def is_stored(value: b.Bound) -> bool:
+    """True if a value is a number of 32 bits as the store keeps it, or chosen from such numbers."""
+    return precision_of(value) is Precision.float32 and not any(
+        _is_computed(part) for part in b.walk(value)
+    )
+
+
+def _is_computed(part: b.Bound) -> bool:
+    match part:
+        case b.NodeAttribute(attribute=attribute) | b.EdgeAttribute(attribute=attribute):
+            return attribute.unit in _CONVERTED
+        case b.OverMatch(word=word) | b.Aggregate(word=word) | b.SignalCall(word=word):
+            return word in {"avg", "avg_over"}
+        case b.BlockValue(word=word, value=inner):
+            return word == "AVG" or (inner is not None and not is_stored(inner))
+        case b.FrameAttribute(attribute=attribute):
+            return not attribute.stored
+        case _:
+            return False
+
+
+def compared(*sides: b.Bound) -> tuple[b.Bound, ...]:
+    """Round the sides of a comparison to the least precise of them."""
+    known = {precision_of(side) for side in sides} - {None}
+    for precision in Precision:
+        if precision in known:
+            return tuple(_rounded(side, precision) for side in sides)
+    return sides
+
+
+def chosen(value: b.Bound, choices: b.Choices) -> tuple[b.Bound, b.Choices]:
+    """Round a value and the constants of the list in which it is looked for."""
+    operand, *items = compared(value, *choices.items)
+    return operand, b.Choices(tuple(item for item in items if isinstance(item, b.Value)))
+
+
+def _rounded(value: b.Bound, precision: Precision) -> b.Bound:
+    if value.type is not Type.number or _is_exact(value, precision):
+        return value
+    if isinstance(value, b.Value) and isinstance(value.value, int | float):
+        rounded = ROUNDINGS[precision.value](value.value)
+        if rounded is None or rounded == value.value:
+            return value
+        return replace(value, value=rounded, written=value.shown)
+    return b.Operation(precision.value, (value,), Type.number)
+
+
+def _is_exact(value: b.Bound, precision: Precision) -> bool:
+    """True if a value has the precision as the store keeps it."""
+    if precision_of(value) is not precision:
+        return False
+    if isinstance(value, b.Operation) and value.word in {"abs", "negative"}:
+        return _is_exact(value.operands[0], precision)
+    if isinstance(value, b.NodeAttribute | b.EdgeAttribute):
+        unit, columns = value.attribute.unit, value.attribute.columns
+        return unit is DisplayUnit.velocity or (unit in _STORED and Home.map not in columns)
+    timed = isinstance(value, b.FrameAttribute | b.TraceAttribute | b.StepTime)
+    return timed and not b.is_passed_on(value)
