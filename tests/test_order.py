@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import os
 import random
+import tracemalloc
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import autoware_recordings
 import carla_recordings
+import numpy as np
 import pytest
 import recordings
 from foxglove_scenes import SceneRecorder, cube
+from mcap.records import Channel
 from permuting import Recorded, block_rows, first_difference, permutations, view_rows
 from test_export_mcap import cut
 from test_flavours import EXAMPLES
@@ -20,8 +23,11 @@ from thorough import LONG
 import sgstore.mcap._order as order
 from sgstore.cli import run
 from sgstore.demo import RECORDING
-from sgstore.mcap import Findings, McapFile
+from sgstore.mcap import Findings, McapFile, Messages
 from sgstore.readers import channel_rank, open_trace
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 DATA = Path(os.environ.get("SGSTORE_DATA") or Path(__file__).parents[2] / "shared/data").resolve()
 SHARED = [
@@ -287,3 +293,28 @@ def test_a_topic_may_be_split_over_two_channels(name: str, tmp_path: Path) -> No
 
     assert not first_difference(rows, [row for row in found[0] if row[0] in told])
     assert not any(first_difference(found[0], other) for other in found)
+
+
+def test_an_index_takes_few_bytes_a_message() -> None:
+    count, each = 200_000, 2000
+    draw = np.random.default_rng(0)
+    channels = {i: Channel(i, str(i), "", {}, 0) for i in (1, 2)}
+    ranks = order.ChannelRanks(lambda _: 0, {}, channels)
+
+    def runs() -> Iterator[Messages]:
+        for start in range(0, count, each):
+            times = draw.integers(0, count, each) * 1000
+            zeros = np.zeros(each, np.int64)
+            columns = draw.integers(1, 3, each), zeros, times, times.astype(np.uint64), zeros
+            yield Messages(start, *columns, np.full(each, 20), lambda _at, _length: memoryview(b""))
+
+    tracemalloc.start()
+    try:
+        index = order.TimeOrder(runs(), ranks, lambda _: True, lambda _a, _b: None, Findings())
+        held, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+
+    assert index.findings.losses == []
+    assert held < 24 * count
+    assert peak < 48 * count

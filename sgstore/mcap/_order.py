@@ -41,6 +41,8 @@ BATCH_BYTES: Final = 8 << 20
 """Data that are copied for a batch, at most; bytes. A single message may have more."""
 CACHED: Final = 24 << 20
 """Data of runs of the file that are kept from one batch to the next; bytes."""
+_PARTS: Final = 32
+_SAMPLE: Final = 4096
 OFTEN: Final = 2
 """A run of the file that is read more often in one reading is reported."""
 
@@ -380,16 +382,19 @@ def _no_place(_position: int, _length: int) -> memoryview:
 def _sorted(
     log: Ints, publish: Times, channel: NDArray[Any], ranks: ChannelRanks
 ) -> NDArray[np.uint32]:
-    """Numbers of messages in order of time."""
-    order = np.argsort(log, kind="stable").astype(np.uint32)
-    times = log[order]
-    tied = np.zeros(len(order), np.bool_)
-    same = times[1:] == times[:-1]
-    tied[1:] |= same
-    tied[:-1] |= same
-    at = np.flatnonzero(tied)
-    if len(at):
-        rows = order[at]
-        some = published(log[rows], publish[rows], channel[rows])
-        order[at] = rows[np.lexsort((ranks.of(channel[rows]), some, log[rows]))]
+    """Numbers of messages in order of time, sorted part by part so that little memory is needed."""
+    order = np.empty(len(log), np.uint32)
+    sample = np.sort(log[:: max(len(log) // _SAMPLE, 1)])
+    edges: list[int | None] = [None]
+    if len(sample):
+        at = np.linspace(0, len(sample), _PARTS + 1).astype(np.int64)[1:-1]
+        edges = [*np.unique(sample[at]).tolist(), None]
+    start, rest = 0, np.ones(len(log), np.bool_)
+    for edge in edges:
+        rows = np.flatnonzero(rest if edge is None else rest & (log < edge))
+        rest[rows] = False
+        times, number = log[rows], channel[rows]
+        keys = ranks.of(number), published(times, publish[rows], number), times
+        order[start : start + len(rows)] = rows[np.lexsort(keys)]
+        start += len(rows)
     return order
