@@ -212,7 +212,7 @@ def _at(column: Column, rows: Ints, frames: Ints) -> tuple[Any, Bools]:
 
 
 def _summed(word: str, values: Any, known: Bools, starts: Ints) -> Objects:
-    ends = np.append(starts[1:], len(values)).tolist()
+    ends = np.append(starts[1:], len(values))[: len(starts)].tolist()
     found = np.full(len(starts), None, object)
     for number, (start, end) in enumerate(zip(starts.tolist(), ends, strict=True)):
         some = values[start:end][known[start:end]].tolist()
