@@ -650,7 +650,8 @@ class StoreCheck:
                 self._values.test(part.at)
         self._quantity = self._plan.margin(check.formula, WHOLE) if check.robustness else None
         self._lasting = kept_throughout(check)
-        self._ranked = self._plan.quantity(self._lasting or check.formula) if margins else None
+        ranked = self._lasting or check.formula
+        self._ranked = self._plan.margin(ranked, WHOLE) if margins else None
         self._people: dict[int, dict[str, dict[int, str]]] = {}
 
     @cached_property
@@ -891,8 +892,8 @@ class StoreCheck:
         for low in range(0, len(kinds), size):
             some = kinds[low : low + size]
             value, other = (
-                self._margins(quantity, trace, some, unknown=unknown).value(quantity)
-                for unknown in (-np.inf, np.inf)
+                self._margins(quantity, trace, some, sign, unknown).value(quantity)
+                for sign, unknown in ((UNFAVOURABLE, -np.inf), (FAVOURABLE, np.inf))
             )
             value = np.where(np.isinf(value) & (value != other), np.nan, value)
             if each:
