@@ -67,7 +67,7 @@ TESTS = {
     "serve": "serve live report explorer sandbox_pool",
     "step": "online",
     "store": "store store_* doors events",
-    "temporal": "temporal monitor over_time happens step_expressions robustness shrink windows tolerance",
+    "temporal": "temporal monitor over_time check_verdicts happens step_expressions robustness shrink windows tolerance",
     "trace_parts": "ingest",
     "truth_lanes": "parts timeline",
     "vocabulary": "kinds",

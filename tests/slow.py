@@ -38,6 +38,7 @@ SECONDS: Final = {
     "ingest_many": 19,
     "export_graphs": 19,
     "coverage": 18,
+    "check_verdicts": 30,
     "over_time": 17,
     "docs_queries": 17,
     "store_verify": 16,
