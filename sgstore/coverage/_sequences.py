@@ -28,6 +28,7 @@ from sgstore.errors import ConfigError
 from sgstore.lang import parse, pattern_named, patterns
 from sgstore.lang.syntax import MatchClause
 from sgstore.store import SEQ_BITS, trace_of
+from sgstore.world import JUMP_NS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -83,6 +84,7 @@ class ManoeuvreEvents:
         Which of the names each is.
     frame_id : (H,) int64
     time_ns : (H,) int64
+        Behind a jump back of the clock they are later by a day.
     said : list of str
         What could not be told of which traces, and why.
     """
@@ -137,7 +139,20 @@ def happenings(chosen: ChosenFrames, manoeuvres: Mapping[str, str]) -> Manoeuvre
     names = tuple(sorted({name for *_, name in told}))
     number = {name: i for i, name in enumerate(names)}
     columns = np.array([(f, t, number[n]) for f, t, n in told], np.int64).reshape(-1, 3)
-    return ManoeuvreEvents(chosen, names, columns[:, 2], columns[:, 0], columns[:, 1], said)
+    frame_id, time_ns = columns[:, 0], _ascending(store, columns[:, 0], columns[:, 1])
+    return ManoeuvreEvents(chosen, names, columns[:, 2], frame_id, time_ns, said)
+
+
+def _ascending(store: Store | Collection, frame_id: Ints, time_ns: Ints) -> Ints:
+    """Times of frames, later by a day behind each jump back of the clock of their trace."""
+    found = store.file.rows(
+        "SELECT frame_id FROM (SELECT frame_id,"
+        " time_ns < lag(time_ns) OVER (PARTITION BY trace_id ORDER BY frame_id) AS back FROM frames)"
+        " WHERE back ORDER BY frame_id"
+    ).values
+    back = np.array([frame for (frame,) in found], np.int64)
+    first = np.searchsorted(back, trace_of(frame_id) << SEQ_BITS)
+    return time_ns + JUMP_NS * (np.searchsorted(back, frame_id, "right") - first)
 
 
 def _steps(text: str) -> int:
