@@ -25,6 +25,8 @@ from sgstore.importing import FORMATS, Words, import_graphs
 from sgstore.importing._resolve import Understanding, survey
 from sgstore.importing._run import Blocks, parts_map
 from sgstore.ingest import ingest
+from sgstore.lang import Binding, FrameView, ScopeSearch, compile_query
+from sgstore.query import Store
 from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
@@ -598,3 +600,102 @@ def test_the_verb_imports_and_its_exit_code_says_what_was_lost(
     assert json.loads(out[: out.index("]") + 1])[0]["frames"] == 2
     assert "relation guards: 1 times, cannot be kept" in err
     assert "'elf' is of no kind that is known" in err
+
+
+# Values keep their types ------------------------------------------------------------------------------
+
+
+def nodelink(folder: Path, name: str, *graphs: list[dict[str, Any]]) -> Path:
+    """A file of graphs, each of some nodes; one near the other."""
+    file = folder / f"{name}.jsonl"
+    lines = [
+        {
+            "directed": True,
+            "multigraph": True,
+            "graph": {"name": f"{name}{i}", "t": i},
+            "nodes": [{"id": str(n), "kind": "car"} | node for n, node in enumerate(nodes)],
+            "links": [{"source": "0", "target": "1", "relation": "near", "w": nodes[0].get("n")}]
+            if len(nodes) > 1
+            else [],
+        }
+        for i, nodes in enumerate(graphs)
+    ]
+    file.write_text("".join(f"{json.dumps(line)}\n" for line in lines), encoding="utf-8")
+    return file
+
+
+def held(store: Store, frame: str, text: str, **values: Any) -> int:
+    """How often a pattern is found in a graph in memory."""
+    query = compile_query(text, store.file.catalog(), values).bound
+    at = Binding(FrameView(store.file.graph(store.file.frame(frame).frame_id)))
+    return sum(1 for _ in ScopeSearch(query.scope, injective=True).run(at))
+
+
+LARGE = 2**53 + 1
+"""No float is equal to it."""
+
+
+def test_whole_numbers_that_no_float_is_equal_to_are_compared_and_given_exactly(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = [[{"n": n}, {"n": n - 1}] for n in (LARGE, LARGE - 1, -LARGE, 7, 2**64 + 1)]
+    path = tmp_path / "s.sgstore"
+    (done,) = import_graphs(path, [nodelink(tmp_path, "a", *frames)], "nodelink")
+    assert done.error is None
+    store = Store(path)
+
+    def seqs(condition: str, **values: Any) -> list[int]:
+        text = (
+            f"MATCH (a:Car)-[r:near]->(b:Car) WHERE {condition} RETURN frame.seq ORDER BY frame.seq"
+        )
+        found = [row[0] for row in store.find(text, **values)]
+        assert found == [n for n in range(len(frames)) if held(store, f"a#{n}", text, **values)]
+        return found
+
+    assert seqs(f"a.n = {LARGE}") == [0]
+    assert seqs("a.n = $n", n=LARGE - 1) == [1]
+    assert seqs(f"a.n > {LARGE - 1}") == [0, 4]
+    assert seqs(f"a.n = -{LARGE}") == [2]
+    assert seqs(f"a.n IN [{LARGE}, 7]") == [0, 3]
+    assert seqs("a.n > b.n") == [0, 1, 2, 3, 4]
+    assert seqs("a.n = b.n") == []
+    assert seqs(f"r.w = {LARGE}") == [0]
+    rows = [row[0] for row in store.find("MATCH (a:Car)-[:near]->(b) RETURN a.n ORDER BY a.n")]
+    assert rows == [-LARGE, 7, LARGE - 1, LARGE, 2**64 + 1]
+    values = store.sql("SELECT value::VARCHAR FROM attributes WHERE name = 'n'").values
+    assert {str(LARGE), str(2**64 + 1)} <= {value for (value,) in values}
+    assert run(["find", str(path), f"MATCH (a:Car) WHERE a.n = {LARGE} RETURN a.n", "--json"]) == 0
+    assert str(LARGE) in capsys.readouterr().out
+
+
+def test_a_text_in_one_file_leaves_the_numbers_of_others_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "s.sgstore"
+    numbers = nodelink(tmp_path, "numbers", [{"q": 5}, {"q": 50}, {"q": 9}])
+    texts = nodelink(tmp_path, "texts", [{"q": "n/a"}, {"q": "7"}])
+    other = "MATCH (b:Car) WHERE b.q > 6 RETURN b.q ORDER BY b.q"
+    for file in (numbers, texts):
+        (done,) = import_graphs(path, [file], "nodelink")
+        assert done.error is None
+        store = Store(path)
+        assert [row[0] for row in store.find("MATCH (b:Car) RETURN MAX(b.q)")] == [50]
+        assert [row[0] for row in store.find(other)] == [9, 50]
+        assert held(store, "numbers#0", other) == 2
+    assert held(store, "texts#0", other) == 0
+    kept = store.sql("SELECT text FROM attributes WHERE name = 'q' ORDER BY text").values
+    assert [text for (text,) in kept] == ["5", "50", "7", "9", "n/a"]
+
+
+def test_an_attribute_that_is_mixed_in_one_trace_is_text(tmp_path: Path) -> None:
+    path = tmp_path / "s.sgstore"
+    import_graphs(path, [nodelink(tmp_path, "mixed", [{"q": 5}, {"q": "n/a"}])], "nodelink")
+    found = Store(path).find("MATCH (b:Car) WHERE b.q = 'n/a' RETURN b.q")
+    assert [row[0] for row in found] == ["n/a"]
+
+
+def test_an_imported_size_that_no_body_has_is_a_loss(tmp_path: Path) -> None:
+    path = tmp_path / "s.sgstore"
+    node = {"x": 1.0, "y": 2.0, "length": -4.5, "width": 2.0, "vx": 400.0, "vy": 0.0}
+    (done,) = import_graphs(path, [nodelink(tmp_path, "a", [node])], "nodelink")
+    assert {*done.lost} == {"length is -4.5 m: it", "speed is 400 m/s: it"}
+    rows = Store(path).sql("SELECT length, width, vx FROM nodes WHERE kind = 'car'").values
+    assert [tuple(row) for row in rows] == [(None, 2.0, None)]
