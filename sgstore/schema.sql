@@ -103,7 +103,7 @@ CREATE TABLE entity (                                          -- what does not 
   trace_id BIGINT NOT NULL, node_id INTEGER NOT NULL, kind kind NOT NULL, ident VARCHAR, special VARCHAR, subkind VARCHAR, type_name VARCHAR,
   is_static BOOLEAN NOT NULL, map_ref VARCHAR, parked BOOLEAN, -- parked: of vehicles, NULL where it is not known
   world_parked BOOLEAN,                                        -- the same, as far as what is known beyond the graphs says
-  lifetime SMALLINT,                                           -- 2, 3, …: an id of the simulator that came back as somebody else; NULL: the first
+  lifetime INTEGER NOT NULL,                                   -- 1, 2, …: which of the entities with this ident; an id may return as another one
   x FLOAT, y FLOAT, z FLOAT, heading FLOAT, length FLOAT, width FLOAT, height FLOAT);   -- pose of the static ones, else NULL
 
 -- Frames ----------------------------------------------------------------------------------------------------------
@@ -205,7 +205,8 @@ CREATE TABLE payload (                                         -- the message of
 
 CREATE TABLE event (                                           -- what the simulator says has happened
   trace_id BIGINT NOT NULL, frame_id BIGINT NOT NULL,          -- of the frame that is nearest in time
-  time_ns BIGINT, log_time_ns BIGINT, kind VARCHAR NOT NULL, ident VARCHAR, other VARCHAR, value DOUBLE, detail VARCHAR);
+  time_ns BIGINT, log_time_ns BIGINT, kind VARCHAR NOT NULL, ident VARCHAR, other VARCHAR, value DOUBLE, detail VARCHAR,
+  lifetime INTEGER NOT NULL, other_lifetime INTEGER NOT NULL); -- of the entities with ident and other
 
 CREATE TABLE imported (                                        -- frames that came as graphs: what their file calls them
   bucket BIGINT NOT NULL, bit TINYINT NOT NULL, trace_id BIGINT NOT NULL, graph VARCHAR, place BIGINT NOT NULL, images BIGINT NOT NULL); -- place: row or line
@@ -324,27 +325,27 @@ SELECT s.frame_id, s.node_id, s.kind, s.is_ego, s.kind || ' ' || s.node_id AS na
        (s.lights & 512) <> 0 AS light_special1, (s.lights & 1024) <> 0 AS light_special2, s.steer, s.throttle, s.brake, s.gear, s.hand_brake,
        (s.derived & 1) <> 0 AS derived_velocity, (s.derived & 2) <> 0 AS derived_acceleration, (s.derived & 4) <> 0 AS derived_yaw_rate,
        NULL::VARCHAR AS lane_type, NULL::VARCHAR AS road, NULL::INTEGER AS section, NULL::INTEGER AS lane, NULL::VARCHAR AS junction,
-       NULL::VARCHAR AS turn, NULL::FLOAT AS speed_limit, NULL::DOUBLE AS curvature, e.ident, e.type_name, s.carrier
+       NULL::VARCHAR AS turn, NULL::FLOAT AS speed_limit, NULL::DOUBLE AS curvature, e.ident, e.type_name, s.carrier, e.lifetime
 FROM inside.state s JOIN inside.entity e ON e.trace_id = s.frame_id >> 24 AND e.node_id = s.node_id JOIN inside.trace t ON t.trace_id = e.trace_id
 UNION ALL
 SELECT f.frame_id, n.node_id, n.kind, false, n.name, n.special, n.subkind, true, n.x, n.y, n.z, degrees(n.heading),
        NULL, NULL, n.still, n.still, n.still, n.still, NULL, NULL, NULL, NULL, NULL, n.length, n.width, n.height,
        NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL,
-       n.lane_type, n.road, n.section, n.lane, n.junction, n.turn, n.speed_limit, n.curvature, n.ident, n.type_name, NULL
+       n.lane_type, n.road, n.section, n.lane, n.junction, n.turn, n.speed_limit, n.curvature, n.ident, n.type_name, NULL, n.lifetime
 FROM inside.frame f JOIN (
   SELECT k.bucket, k.mask, k.node_id, k.kind, m.name, NULL::VARCHAR AS special, NULL::VARCHAR AS subkind, m.x, m.y, m.z, m.heading,
          m.length::FLOAT AS length, m.width::FLOAT AS width, NULL::FLOAT AS height,
          CASE WHEN k.kind IN ('lane', 'road', 'junction', 'crosswalk', 'off_road', 'waypoint', 'roundabout') THEN NULL ELSE 0::FLOAT END AS still, m.lane_type, m.road, m.section, m.lane, m.junction, m.turn, m.speed_limit::FLOAT AS speed_limit, m.curvature,
-         NULL::VARCHAR AS ident, NULL::VARCHAR AS type_name
+         NULL::VARCHAR AS ident, NULL::VARCHAR AS type_name, NULL::INTEGER AS lifetime
   FROM inside.bucket b JOIN inside.node k ON k.bucket = b.bucket JOIN inside.map_node m ON m.map_id = b.map_id AND m.node_id = k.node_id
   UNION ALL
   SELECT k.bucket, k.mask, k.node_id, k.kind, k.kind || ' ' || k.node_id, e.special, e.subkind,
          t.origin_x + e.x, t.origin_y + e.y, t.origin_z + e.z, e.heading, e.length, e.width, e.height, 0::FLOAT, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL,
-         e.ident, e.type_name
+         e.ident, e.type_name, e.lifetime
   FROM inside.node k JOIN inside.trace t ON t.trace_id = k.bucket >> 18 JOIN inside.entity e ON e.trace_id = t.trace_id AND e.node_id = k.node_id
 ) n ON n.bucket = f.bucket AND (n.mask & (1::BIGINT << f.bit)) <> 0;
 
-COMMENT ON VIEW main.nodes IS 'One row a node and frame: entities (node_id 0 and above) and parts of the road map in range (below zero). ident, type_name: of an entity, as the simulator has them; x, y, z, length, width, height in m (a lane: a point of its centre line, its length and mean width); heading, pitch, roll in degrees; speed, vx, vy, vz, speed_limit in m/s (what stands for ever has speed 0); accel (signed, along the heading), ax, ay, az in m/s²; yaw_rate in degrees/s; steer -1 … 1, throttle and brake 0 … 1; gear: 1, 2, …, 0 neutral, below 0 backwards; hand_brake: whether it is on; curvature of a waypoint in 1/m, positive to the left. carrier: node_id of what pulls a trailer or carries a rider. What is not known is NULL. derived_…: computed by differences, not read from the recording.';
+COMMENT ON VIEW main.nodes IS 'One row a node and frame: entities (node_id 0 and above) and parts of the road map in range (below zero). ident, type_name: of an entity, as the simulator has them; x, y, z, length, width, height in m (a lane: a point of its centre line, its length and mean width); heading, pitch, roll in degrees; speed, vx, vy, vz, speed_limit in m/s (what stands for ever has speed 0); accel (signed, along the heading), ax, ay, az in m/s²; yaw_rate in degrees/s; steer -1 … 1, throttle and brake 0 … 1; gear: 1, 2, …, 0 neutral, below 0 backwards; hand_brake: whether it is on; curvature of a waypoint in 1/m, positive to the left. carrier: node_id of what pulls a trailer or carries a rider; lifetime: 1, 2, …: which of the entities with this ident, where an id returns as another entity. What is not known is NULL. derived_…: computed by differences, not read from the recording.';
 
 CREATE VIEW main.edges AS
 SELECT f.frame_id, e.src, e.relation, e.dst, e.src_kind, e.dst_kind, e.src_is_ego, e.dst_is_ego
@@ -466,10 +467,10 @@ COMMENT ON VIEW main.lanes IS 'One row a lane of a road map. name: road/section/
 CREATE VIEW main.entities AS
 SELECT e.trace_id, e.node_id, e.kind, e.kind || ' ' || e.node_id AS name, e.ident, e.special, e.subkind, e.type_name, e.is_static, e.map_ref,
        t.origin_x + e.x AS x, t.origin_y + e.y AS y, t.origin_z + e.z AS z, degrees(e.heading) AS heading, e.length, e.width, e.height,
-       e.parked
+       e.parked, e.lifetime
 FROM inside.entity e JOIN inside.trace t ON t.trace_id = e.trace_id;
 
-COMMENT ON VIEW main.entities IS 'One row an entity of a trace. ident, type_name: as the simulator has them; is_static: it never moves, and its pose is here; map_ref: the OpenDRIVE signal or object that it is, of a signal that the map does not have the names of the lanes that it applies to; parked: whether a vehicle does not move in the whole trace and is never on a lane for driving, or is static in the simulator.';
+COMMENT ON VIEW main.entities IS 'One row an entity of a trace. ident, type_name: as the simulator has them; is_static: it never moves, and its pose is here; map_ref: the OpenDRIVE signal or object that it is, of a signal that the map does not have the names of the lanes that it applies to; parked: whether a vehicle does not move in the whole trace and is never on a lane for driving, or is static in the simulator; lifetime: 1, 2, …: which of the entities with this ident: an id that returns as another kind, or where it cannot have moved, is a new entity.';
 
 CREATE VIEW main.payloads AS
 SELECT f.frame_id, c.topic AS channel, p.log_time_ns, (p.log_time_ns - f.log_time_ns) / 1e9 AS offset_s, c.schema, r.uri AS file,
@@ -484,8 +485,8 @@ CREATE VIEW main.events AS
 SELECT v.frame_id, v.trace_id, t.name AS trace, v.kind, v.time_ns, round((v.time_ns - t.start_ns) / 1e3) / 1e6 AS t, v.log_time_ns,
        e.node_id, o.node_id AS other, v.value, v.detail, v.ident, v.other AS other_ident
 FROM inside.event v JOIN inside.trace t ON t.trace_id = v.trace_id
-     LEFT JOIN inside.entity e ON e.trace_id = v.trace_id AND e.ident = v.ident
-     LEFT JOIN inside.entity o ON o.trace_id = v.trace_id AND o.ident = v.other;
+     LEFT JOIN inside.entity e ON e.trace_id = v.trace_id AND e.ident = v.ident AND e.lifetime = v.lifetime
+     LEFT JOIN inside.entity o ON o.trace_id = v.trace_id AND o.ident = v.other AND o.lifetime = v.other_lifetime;
 
 COMMENT ON VIEW main.events IS 'What the simulator says has happened. frame_id: of the frame that is nearest in time; kind: collision, lane_invasion, environment; t: seconds since the trace began; node_id, ident: the vehicle, as an entity and as the simulator calls it; other, other_ident: what it collided with, NULL where that is no entity of the trace or nothing; value: length of the impulse of a collision, N·s; detail: markings that were crossed (broken, solid, other), or weather and light from then on. What is not known is NULL.';
 

@@ -288,13 +288,13 @@ class _EgoView:
     """A recording as one ego has it.
 
     What became of it; what is known of it, with its ego; the folder of its segment, if one was built; the
-    ego's node id, once that is known; whether a frame had it; the frames that have too many pairs.
+    node ids of the ego, of which each frame has one; whether a frame had it; the frames that have too many pairs.
     """
 
     outcome: TraceOutcome
     info: TraceInfo
     sealed: Path | None = None
-    node: int = -1
+    nodes: list[int] = field(default_factory=list[int])
     met: bool = False
     crowds: Crowds = field(default_factory=Crowds)
 
@@ -546,12 +546,13 @@ class SegmentReader:
 
 def _ego_of(block: FrameBlock, one: _EgoView) -> Ints:
     """(F,) int64: node id of an ego in each frame, -1 where it is absent."""
-    if one.node < 0 and one.info.ego in block.entities.ident:
-        one.node = block.entities.first + block.entities.ident.index(one.info.ego)
-    here = np.zeros(len(block), np.bool_)
-    here[block.frame_of[block.states.node == one.node]] = True
-    one.met = one.met or bool(here.any())
-    return np.where(here, one.node, -1)
+    idents = enumerate(block.entities.ident, start=block.entities.first)
+    one.nodes += [node for node, ident in idents if ident == one.info.ego]
+    rows = np.isin(block.states.node, one.nodes)
+    found = np.full(len(block), -1, np.int64)
+    found[block.frame_of[rows]] = block.states.node[rows]
+    one.met = one.met or bool(rows.any())
+    return found
 
 
 def _reached(frames: FrameBlock, size: int) -> int:

@@ -450,7 +450,7 @@ class EntityConstants(NamedTuple):
             "ident": self.ident,
             "is_ego": is_ego,
             "is_static": is_static,
-            **({"lifetime": self.lifetime} if self.lifetime > 1 else {}),
+            "lifetime": self.lifetime,
             **{name: text for name, text in texts.items() if text},
         }
 

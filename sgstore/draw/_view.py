@@ -146,10 +146,17 @@ def called(graph: SceneGraph, names: Names) -> SceneGraph:
         return graph
     key = {"ident": "ident", "type": "type_name"}[names]
     nodes = {
-        node: {CALLED: about[key], **about} if about.get(key) else about
+        node: {CALLED: f"{about[key]}{_lifetime(about, names)}", **about}
+        if about.get(key)
+        else about
         for node, about in graph.nodes.items()
     }
     return replace(graph, nodes=nodes)
+
+
+def _lifetime(about: Mapping[str, Any], names: Names) -> str:
+    """What tells an entity from others that had its id before: ``#2``."""
+    return f"#{about['lifetime']}" if names == "ident" and about.get("lifetime", 1) > 1 else ""
 
 
 def caption(node: int, attributes: Mapping[str, Any]) -> str:

@@ -259,6 +259,14 @@ NODE_ATTRIBUTES: Final = _named(
         _constant("ident", "ident", "the simulator's own id"),
         _constant("type_name", "type_name", "the simulator's type name"),
         Attribute(
+            "lifetime",
+            Type.number,
+            {Home.entity: "lifetime"},
+            "1, 2, …: which of the entities with this id",
+            DisplayUnit.whole,
+            own_kinds=_ENTITIES,
+        ),
+        Attribute(
             "parked",
             Type.boolean,
             {Home.entity: "parked"},

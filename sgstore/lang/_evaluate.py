@@ -316,6 +316,8 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
             if attribute is NODE_ATTRIBUTES["type"]:
                 return lambda at: _type_of(at.view.nodes[at.nodes[node]])
             name = attribute.name
+            if attribute is NODE_ATTRIBUTES["lifetime"]:
+                return lambda at: _lifetime(at.view.nodes[at.nodes[node]])
             if attribute.unit is DisplayUnit.own:
                 of = _OWN[attribute.type]
                 return lambda at: of(at.view.nodes[at.nodes[node]].get(name))
@@ -381,6 +383,11 @@ _OWN: Final[Mapping[Type, Callable[[Any], Any]]] = {
     Type.boolean: lambda value: value if isinstance(value, bool) else None,
 }
 """Type of an attribute of a client's own → what makes the value of one of JSON."""
+
+
+def _lifetime(attributes: Attributes) -> int | None:
+    """Which of the entities with an id it is; the first where a graph of a client's own does not say."""
+    return None if attributes["kind"] in MAP_KINDS else attributes.get("lifetime", 1)
 
 
 def _type_of(attributes: Attributes) -> Any:
@@ -564,10 +571,11 @@ def _of_crowd(part: b.Bound, key: str) -> Columns[Asked] | None:
 
 def _is_derived(attribute: Attribute) -> bool:
     """Tell whether an attribute is not told with the node as a float, or as true or false."""
-    return (
-        attribute.unit in {DisplayUnit.binding, DisplayUnit.role, DisplayUnit.own}
-        or attribute is NODE_ATTRIBUTES["injunction"]
-    )
+    return attribute.unit in {
+        DisplayUnit.binding,
+        DisplayUnit.role,
+        DisplayUnit.own,
+    } or attribute in {NODE_ATTRIBUTES["injunction"], NODE_ATTRIBUTES["lifetime"]}
 
 
 def _of_others(value: b.NodeAttribute | b.PairNumber) -> Columns[Asked]:

@@ -68,7 +68,7 @@ FROM known_state WHERE frame_id >= $low << 6 AND frame_id < $high << 6 ORDER BY 
 _ENTITIES: Final = """
 SELECT e.node_id, enum_code(e.kind) AS kind, e.is_static, coalesce(e.ident, '') AS ident,
        coalesce(e.special, '') AS special, coalesce(e.subkind, '') AS subkind,
-       coalesce(e.type_name, '') AS type_name, coalesce(e.map_ref, '') AS map_ref,
+       coalesce(e.type_name, '') AS type_name, coalesce(e.map_ref, '') AS map_ref, e.lifetime,
        e.x, e.y, e.z, e.heading, e.length, e.width, e.height, coalesce(p.bucket, 1::BIGINT << 62) AS bucket
 FROM entity e LEFT JOIN (
   SELECT node_id, min(bucket) AS bucket FROM (
@@ -445,7 +445,7 @@ class _StateReader:
             static=part["is_static"].astype(np.bool_),
             **{
                 name: tuple(part[name].tolist())
-                for name in ("ident", "special", "subkind", "type_name", "map_ref")
+                for name in ("ident", "special", "subkind", "type_name", "map_ref", "lifetime")
             },
         )
         poses = {name: self._entities[name][rows] for name in _POSE}

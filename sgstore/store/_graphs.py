@@ -94,7 +94,7 @@ SELECT n.* FROM nodes n JOIN {_WANTED} ON n.frame_id = w.frame_id
 WHERE n.frame_id BETWEEN $first AND $last AND NOT n.is_static
 """
 _ENTITIES: Final = """
-SELECT e.node_id, e.kind, false AS is_ego, e.name, e.ident, e.type_name, e.special, e.subkind,
+SELECT e.node_id, e.kind, false AS is_ego, e.name, e.ident, e.type_name, e.special, e.subkind, e.lifetime,
        true AS is_static, e.x, e.y, e.z, e.heading, 0e0 AS speed, 0e0 AS vx, 0e0 AS vy, 0e0 AS vz,
        e.length, e.width, e.height
 FROM entities e JOIN (SELECT unnest($nodes) AS node_id) w ON w.node_id = e.node_id WHERE e.trace_id = $trace_id

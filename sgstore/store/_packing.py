@@ -317,6 +317,7 @@ def entity_columns(graph: GraphBlock, origin: Origin) -> Columns:
         "type_name": texts(entities.type_name),
         "is_static": entities.static,
         "map_ref": texts(entities.map_ref),
+        "lifetime": np.array(entities.lifetime or [1] * len(entities), np.int64),
         **{name: number(values) for name, values in poses.items()},
     }
 

@@ -301,4 +301,6 @@ def _columns(events: Sequence[Event], frame_id: Ints) -> Columns:
         "other": texts(event.other for event in events),
         "value": np.array(value, np.float64),
         "detail": texts(event.detail for event in events),
+        "lifetime": np.array([event.lifetime for event in events], np.int64),
+        "other_lifetime": np.array([event.other_lifetime for event in events], np.int64),
     }
