@@ -42,7 +42,7 @@ from sgstore.world import longest_step_ns
 _log = logger("segments")
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from sgstore.readers import MessageTrace
     from sgstore.roads import RoadMap
@@ -288,7 +288,8 @@ class _EgoView:
     """A recording as one ego has it.
 
     What became of it; what is known of it, with its ego; the folder of its segment, if one was built; the
-    node ids of the ego, of which each frame has one; whether a frame had it; the frames that have too many pairs.
+    node ids of the ego, of which each frame has one; whether a frame had it; the frames that have too many
+    pairs.
     """
 
     outcome: TraceOutcome

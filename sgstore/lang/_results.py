@@ -209,7 +209,9 @@ def _first_of(mask: str) -> str:
 # maximal run of consecutive frames of one trace in which the same binding holds; a gap of more than 2.5
 # median periods ends it.
 
-CONSTANTS: Final = "SELECT node_id, ident, type_name, lifetime, {parked} AS parked FROM inside.entity WHERE trace_id = ?"
+CONSTANTS: Final = """
+SELECT node_id, ident, type_name, lifetime, {parked} AS parked FROM inside.entity WHERE trace_id = ?
+"""
 """What does not change about the entities of a trace, and stands in no frame."""
 
 LOG_TIME: Final = "log_time_ns"
