@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from typing import TYPE_CHECKING, Any, Final
 
+import duckdb
 import pytest
 from graph_blocks import trace_info
 from scenes import NO_MESSAGES, Scene, actor, along, ego, light, path, street
 from thorough import LONG
 
+from sgstore.collection import pack, unpack
 from sgstore.config import Config, RangeSettings, from_dict
 from sgstore.demo import RECORDING
-from sgstore.errors import ConfigError
+from sgstore.errors import ConfigError, StoreError
 from sgstore.ingest import ingest
 from sgstore.query import Store
+from sgstore.rebuild import rebuild
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.step import replayed
 from sgstore.store import StoreFile
+from sgstore.store._schema import BEYOND
 from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
@@ -196,3 +202,82 @@ def test_a_generator_step_by_step_knows_the_world_that_a_store_knows(tmp_path: P
             if "ident" in about
         )
         assert found == rows(near, f"{told} WHERE f.seq = {seq} AND ident IS NOT NULL")
+
+
+# Stores that are copied, sorted, made anew -----------------------------------------------------------
+
+
+def beyond(store: Path) -> dict[str, list[tuple[Any, ...]]]:
+    """All rows about what is beyond the graphs."""
+    with duckdb.connect(str(store), read_only=True) as connection:
+        return {
+            table: connection.execute(f"SELECT * FROM inside.{table} ORDER BY ALL").fetchall()
+            for table in BEYOND.values()
+        }
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store of four seconds of the bundled recording."""
+    place = tmp_path_factory.mktemp("recorded") / "s.sgstore"
+    ingest(place, [RECORDING], until=4.0)
+    assert all(beyond(place)[table] for table in ("world_state", "world_node", "world_lane_single"))
+    return place
+
+
+@pytest.fixture
+def copied(recorded: Path, tmp_path: Path) -> Path:
+    return shutil.copy(recorded, tmp_path / "s.sgstore")
+
+
+def test_a_collection_keeps_the_rows_beyond_graphs(recorded: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.sgstore"
+    ((car, *_), *_) = rows(
+        Store(recorded), "SELECT DISTINCT ident FROM nodes WHERE kind = 'bus' AND NOT is_ego"
+    )
+    ingest(other, [RECORDING], egos=[car], until=4.0)
+    pack(recorded, tmp_path / "fleet")
+    pack(other, tmp_path / "fleet")
+    unpack(tmp_path / "fleet", tmp_path / "all.sgstore")
+    together, apart = (beyond(tmp_path / "all.sgstore"), (beyond(recorded), beyond(other)))
+    for table in BEYOND.values():
+        assert sorted(together[table], key=repr) == sorted(
+            (row for one in apart for row in one[table]), key=repr
+        )
+
+
+def test_a_store_that_is_sorted_keeps_the_rows_beyond_graphs(copied: Path) -> None:
+    before = beyond(copied)
+    StoreFile(copied).compact()
+    assert beyond(copied) == before
+    assert not StoreFile(copied).verify().faults
+
+
+def test_a_trace_goes_with_its_rows_beyond_graphs(copied: Path) -> None:
+    (trace,) = StoreFile(copied).traces()
+    StoreFile(copied).remove(trace.name)
+    assert not any(beyond(copied).values())
+
+
+def test_a_store_of_version_4_is_refused_and_gets_its_rows_beyond_graphs_from_the_recording(
+    copied: Path,
+) -> None:
+    known = beyond(copied)
+    with duckdb.connect(str(copied)) as connection:
+        views = connection.execute(
+            "SELECT schema_name, view_name FROM duckdb_views() WHERE NOT internal"
+            " AND (view_name LIKE 'world%' OR view_name LIKE 'known%')"
+        ).fetchall()
+        for schema, view in views:
+            connection.execute(f"DROP VIEW {schema}.{view}")
+        for table in BEYOND.values():
+            connection.execute(f"DROP TABLE inside.{table}")
+        connection.execute("UPDATE inside.store_info SET value = '4' WHERE key = 'schema_version'")
+        settings = connection.execute("SELECT settings FROM inside.config").fetchall()[0][0]
+        old = json.loads(settings)
+        assert old["range"].pop("world") == 200.0
+        connection.execute("UPDATE inside.config SET settings = ?", [json.dumps(old)])
+    with pytest.raises(StoreError, match=r"a store of version 4, expected 5 .*'sgstore rebuild'"):
+        Store(copied).sql("FROM world_nodes")
+    rebuild(copied)
+    assert beyond(copied) == known
