@@ -121,9 +121,19 @@ def test_a_stamp_of_0_among_others_is_missing(times: Callable) -> None:
     assert found == pytest.approx(LOGS)
 
 
-def test_a_file_without_log_times_loses_a_message_without_a_time(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("stamps", "expected", "lost"),
+    [
+        ([0.0, 0.1, None, 0.3], [0.0, 0.1, 0.2, 0.3], 0),
+        ([EPOCH, None, None, EPOCH + 0.3], [EPOCH, EPOCH + 0.1, EPOCH + 0.2, EPOCH + 0.3], 0),
+        ([None, EPOCH, EPOCH + 0.1], [EPOCH, EPOCH + 0.1], 1),
+        ([EPOCH, EPOCH + 0.1, None], [EPOCH, EPOCH + 0.1, EPOCH + 0.1], 0),
+    ],
+)
+def test_a_file_without_log_times_places_a_message_between_its_neighbours(
+    tmp_path: Path, stamps: list[Stamp], expected: list[float], lost: int
+) -> None:
     path = tmp_path / "a.osi"
-    stamps = [0.0, 0.1, None, 0.3]
     messages = [
         ground_truth(stamp, [car(1, x=i)], host=1).SerializeToString()
         for i, stamp in enumerate(stamps)
@@ -133,8 +143,8 @@ def test_a_file_without_log_times_loses_a_message_without_a_time(tmp_path: Path)
     with open_trace(path) as trace:
         (block,) = trace.blocks()
 
-    assert (block.time_ns / 1e9).tolist() == [0.0, 0.1, 0.3]
-    assert [loss.messages for loss in trace.report.losses] == [1]
+    assert (block.time_ns / 1e9).tolist() == pytest.approx(expected, abs=1e-6)
+    assert sum(loss.messages for loss in trace.report.losses) == lost
 
 
 def test_controls_without_a_stamp_are_of_their_log_time(tmp_path: Path) -> None:

@@ -53,7 +53,8 @@ class Stamps:
     explicit : bool
         Whether the format says that a stamp is missing.
     logged : bool
-        Whether the file has log times of its own. Without them a missing stamp is a loss.
+        Whether the file has log times of its own. Without them a missing stamp is told by the place of its
+        message between two others.
     first : tuple of int or None
         Log time and stamp of the first message with a stamp that is not 0.
     steps : list of int
@@ -166,10 +167,20 @@ class StampReader:
         if stamp_ns == 0 and self._is_time(before, behind):
             return 0
         if not self._stamps.logged:
-            return None
+            return self._placed(run, log_time_ns)
         if before is None and behind is None:
             before = self._clock
         return _between(log_time_ns, before, behind)
+
+    def _placed(self, run: _Unstamped, log_time_ns: int) -> int | None:
+        """The time of a message in a file without log times: by its place between two stamps."""
+        before, behind = run.before, run.behind
+        if before is None:
+            return None
+        if behind is None or behind[1] < before[1]:
+            return log_time_ns  # that of the message before it
+        share = self._number - run.first + 1, run.last - run.first + 2
+        return before[1] + (behind[1] - before[1]) * share[0] // share[1]
 
     def _is_time(self, before: Known | None, behind: Known | None) -> bool:
         """Return whether stamps of 0 between two others are a time."""
