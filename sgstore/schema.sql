@@ -79,7 +79,7 @@ CREATE TABLE trace (
   start_ns   BIGINT NOT NULL,      -- simulation time of the first and of the last frame
   end_ns     BIGINT NOT NULL,
   period_ns  BIGINT NOT NULL,      -- median difference of consecutive frames
-  uneven     TINYINT,              -- bits of what is no pair of bodies: 1 flat things, 2 storeys, 4 trailers and riders; NULL: not known
+  uneven     TINYINT,              -- bits of what is no pair of bodies: 1 flat things, 2 storeys, 4 trailers and riders, 8 and 16 as 1 and 2 among what moves; NULL: not known
   origin_x   DOUBLE NOT NULL,      -- positions in state are relative to it
   origin_y   DOUBLE NOT NULL,
   origin_z   DOUBLE NOT NULL,

@@ -32,6 +32,7 @@ from sgstore.pair_numbers import UNEVEN, all_level, low_and_high
 from sgstore.relations import (
     IS_SIGNAL,
     IS_UPRIGHT,
+    IS_USER,
     NEAR,
     TOUCHING,
     BlockScene,
@@ -298,12 +299,15 @@ class SceneGraphGenerator:
             np.concatenate([getattr(states, name), getattr(scenery, name)])
             for name in ("z", "height")
         )
-        upright = IS_UPRIGHT[kind]
-        level = all_level(*low_and_high(z, height, IS_SIGNAL[kind], upright))
+        flat = ~IS_UPRIGHT[kind] & (height == 0)
+        low, high = low_and_high(z, height, IS_SIGNAL[kind], IS_UPRIGHT[kind])
+        near = (np.arange(len(kind)) < len(states)) | IS_USER[kind]
         found = {
-            "flat": bool((~upright & (height == 0)).any()),
-            "storeys": not level,
+            "flat": bool(flat.any()),
+            "storeys": not all_level(low, high),
             "carried": bool((states.carrier >= 0).any()),
+            "near_flat": bool(flat[near].any()),
+            "near_storeys": not all_level(low[near], high[near]),
         }
         return sum(UNEVEN[name] for name, holds in found.items() if holds)
 

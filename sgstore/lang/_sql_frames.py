@@ -74,8 +74,9 @@ from sgstore.lang.ir import (
     blocks_of,
     nodes_of,
 )
-from sgstore.pair_numbers import MARKS, UNEVEN, WAYS, needed_for, parts_of, stage_of
+from sgstore.pair_numbers import MARKS, STOREYS, UNEVEN, WAYS, needed_for, parts_of, stage_of
 from sgstore.quoting import quoted
+from sgstore.vocabulary import VEHICLES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -409,7 +410,7 @@ def frames(
     join, given = _first_phase(sql, scope, parts, given, bound, ties, needed)
     _second_phase(sql, join, scope, parts, given, needed)
     join.world = sql.catalog.world
-    layers = Layers(join, needed, conditions, _needless(sql.catalog))
+    layers = Layers(join, needed, conditions, _needless(scope, sql.catalog, _pairs(needed)))
     text = layers.text(sql.values, columns_of(nodes, edges), wanted)
     told = {leaf.node for leaf in wanted if isinstance(leaf, NodeValue)}
     told |= {leaf.edge for leaf in wanted if isinstance(leaf, EdgeRelation)}
@@ -424,13 +425,28 @@ def frames(
     return text
 
 
-def _needless(catalog: Catalog) -> frozenset[str]:
-    """Marks of pairs that no pair of some traces needs."""
+def _needless(scope: Scope, catalog: Catalog, pairs: Iterable[PairNumber]) -> frozenset[str]:
+    """Marks that no pair needs whose numbers are asked for, of what the traces have."""
     uneven = 0
     for trace in catalog.traces:
         uneven |= trace.uneven
-    needed = {"level"} if uneven & ~UNEVEN["flat"] else set[str]()
-    return MARKS - needed - ({"solid"} if uneven & UNEVEN["flat"] else set[str]())
+    kinds = {
+        kind
+        for pair in pairs
+        for key in (pair.a, pair.b)
+        for kind in scope.kinds(key).other  # the ego moves, whatever it is
+    }
+    near = "near_" if kinds <= _USERS else ""
+    flat = uneven & UNEVEN["flat"] and not near
+    storeys = uneven & UNEVEN[f"{near}storeys"]
+    left = MARKS - ({"solid"} if flat else set[str]())
+    if storeys:
+        return left - {"level"}
+    return left - {"level"} | {STOREYS} if uneven & UNEVEN["carried"] else left
+
+
+_USERS: Final = frozenset({*VEHICLES, "person", "animal"})
+"""Road users: none of them is flat."""
 
 
 def _kinds_of_edges(

@@ -14,6 +14,7 @@ from ._levels import all_level as all_level
 from ._levels import low_and_high as low_and_high
 from ._levels import low_and_high_sql as low_and_high_sql
 from ._table import MARKS as MARKS
+from ._table import STOREYS as STOREYS
 from ._table import PAIR_FUNCTIONS as PAIR_FUNCTIONS
 from ._table import columns_needed as columns_needed
 from ._table import needed_for as needed_for
@@ -43,6 +44,7 @@ __all__ = [
     "PairFunction",
     "PairNumbers",
     "STOREY",
+    "STOREYS",
     "TOUCH",
     "UNEVEN",
     "UPRIGHT",

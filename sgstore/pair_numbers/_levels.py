@@ -40,8 +40,8 @@ STOREY: Final = 2.5
 """Difference of the lower sides from which on storeys differ, where a height is not known; m."""
 
 
-UNEVEN: Final = {"flat": 1, "storeys": 2, "carried": 4}
-"""Bits of what a trace has that is no pair of bodies."""
+UNEVEN: Final = {"flat": 1, "storeys": 2, "carried": 4, "near_flat": 8, "near_storeys": 16}
+"""Bits of what a trace has that is no pair of bodies; ``near``: among what moves, and static road users."""
 
 
 def all_level(low: Floats, high: Floats) -> bool:

@@ -14,7 +14,7 @@ import sgstore.pair_numbers._evading as evading
 import sgstore.pair_numbers._following as following
 import sgstore.pair_numbers._mild as mild
 import sgstore.pair_numbers._rss as rss
-from sgstore.pair_numbers._levels import OPTIONAL, low_and_high_sql
+from sgstore.pair_numbers._levels import OPTIONAL, UNEVEN, low_and_high_sql
 from sgstore.pair_numbers._ways import WAYS
 
 if TYPE_CHECKING:
@@ -42,6 +42,8 @@ _NAME: Final = re.compile(r"\b[a-z]\w*\b(?!\()")
 
 MARKS: Final = frozenset({"level", "solid"})
 """Parts that almost all numbers have; they make those of what is no pair of bodies NULL."""
+STOREYS: Final = "apart"
+"""Part of ``level`` that tells storeys; what is left of it tells trailers and riders."""
 Marks = frozenset[str]
 
 
@@ -50,7 +52,7 @@ def _expression(name: str, without: Marks) -> str:
     """The SQL of a number or part, without some marks: where no pair needs them they cost time."""
     text = EXPRESSIONS[name]
     for mark in without:
-        text = text.replace(f" + {mark}", "")
+        text = text.replace(f" + {mark}", "").replace(f"{mark} > 0 OR ", "")
     return text
 
 
@@ -76,7 +78,7 @@ def needed_for(name: str, without: Marks = frozenset()) -> frozenset[str]:
     ----------
     name : str
     without : frozenset of str
-        Those of :data:`MARKS` that no pair needs.
+        Those of :data:`MARKS`, and :data:`STOREYS`, that no pair needs.
     """
     if name in WAYS:
         return frozenset()
@@ -147,10 +149,11 @@ def _side(one: str, names: Sequence[str]) -> str:
 
 
 def _no_pairs() -> str:
-    """The pairs that are none, of the traces that have any: with both marks, or ``solid`` alone."""
+    """The pairs that are none, with their marks. Those of storeys take long, where there are any."""
     sides = low_and_high_sql(lambda n: n if n == "kind" else f"{n}::DOUBLE")
     heights = ", ".join(f"{text} AS {name}" for name, text in sides.items())
     side = f"(SELECT frame_id, node_id, carrier, {heights} FROM inside.state)"  # noqa: S608
+    carried = "SELECT frame_id, node_id, carrier FROM inside.state WHERE carrier IS NOT NULL"
 
     def text(name: str) -> str:
         return _NAME.sub(lambda at: column(at[0]), EXPRESSIONS[name])
@@ -158,11 +161,18 @@ def _no_pairs() -> str:
     def column(name: str) -> str:
         return f"({text(name)})" if name in EXPRESSIONS else f"{name[0]}.{name[2:]}"
 
+    bits = UNEVEN["near_flat"] | UNEVEN["near_storeys"]
+    bound = ("a.carrier = b.node_id", "b.carrier = a.node_id", "a.carrier = b.carrier")
     return (
-        f"(SELECT a.frame_id, a.node_id AS one, b.node_id AS other, {text('level')} AS level,"  # noqa: S608
-        f" {text('solid')} AS solid FROM inside.trace t JOIN {side} a ON a.frame_id >> 24 = t.trace_id"
+        "(SELECT frame_id, node_id AS one, carrier AS other, NULL AS level, 0 AS solid"  # noqa: S608
+        f" FROM ({carried}) UNION SELECT frame_id, carrier, node_id, NULL, 0 FROM ({carried})"
+        f" UNION SELECT a.frame_id, a.node_id, b.node_id, NULL, 0 FROM ({carried}) a JOIN ({carried}) b"
+        " ON b.frame_id = a.frame_id AND b.carrier = a.carrier AND b.node_id <> a.node_id"
+        f" UNION ALL SELECT a.frame_id, a.node_id, b.node_id, {text('level')}, {text('solid')}"
+        f" FROM inside.trace t JOIN {side} a ON a.frame_id >> 24 = t.trace_id"
         f" JOIN {side} b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id"
-        " WHERE t.uneven IS NULL OR t.uneven <> 0)"
+        f" WHERE (t.uneven IS NULL OR t.uneven & {bits} <> 0)"
+        f" AND NOT coalesce({' OR '.join(bound)}, FALSE))"
     )
 
 

@@ -26,6 +26,7 @@ from ._registry import relations as relations
 from ._registry import relations_under as relations_under
 from ._scene import IS_SIGNAL as IS_SIGNAL
 from ._scene import IS_UPRIGHT as IS_UPRIGHT
+from ._scene import IS_USER as IS_USER
 from ._scene import BlockScene as BlockScene
 from ._scene import Bodies as Bodies
 from ._scene import BodyPairs as BodyPairs
@@ -49,6 +50,7 @@ __all__ = [
     "Hitches",
     "IS_SIGNAL",
     "IS_UPRIGHT",
+    "IS_USER",
     "Keeping",
     "LaneContact",
     "MapContext",

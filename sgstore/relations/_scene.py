@@ -654,6 +654,7 @@ def kinds_mask(names: tuple[str, ...]) -> Bools:
 IS_SIGNAL: Final = kinds_mask(SIGNALS)
 IS_VEHICLE: Final = kinds_mask(VEHICLES)
 IS_UPRIGHT: Final = kinds_mask(UPRIGHT)
+IS_USER: Final = kinds_mask((*VEHICLES, "person", "animal"))
 
 
 def spread(starts: Ints, counts: Ints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
