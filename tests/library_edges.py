@@ -114,6 +114,18 @@ def intruder(shift: float) -> Scene:
     return Scene(WAYS, ego(along(RIGHT), 15), v, seconds=7)
 
 
+def comes_in_front(speed: float) -> Scene:
+    """A vehicle comes over closely before the ego; it touches the ego's lane from 1.2 s on."""
+    v = actor("v", aside(14, LEFT, RIGHT, 12), 8, start=6.5)
+    return Scene(WAYS, ego(along(RIGHT), speed), v, seconds=8)
+
+
+def draws_away(distance: float) -> Scene:
+    """The ego follows too closely at 8 m/s, and the lead gains 1 m in a second."""
+    v = actor("v", along(RIGHT), 9, start=distance)
+    return Scene(WAYS, ego(along(RIGHT), 8), v, seconds=8)
+
+
 def drawing_away(speed: Any) -> Scene:
     """A faster vehicle comes over 2 m before the ego."""
     over = aside(30, LEFT, RIGHT, 30)
@@ -274,6 +286,7 @@ EDGES: Final[dict[str, tuple[Edge, ...]]] = {
         edge(behind(2.4), 7.01, 7.03),
         edge(behind(2), 6.49, 6.51),
         edge(behind(1), 6.49, 6.51),
+        edge(draws_away, 9.79, 9.81),  # 8 · 1.288 = 10.30 m after 5 s
     ),
     # 10 · (10/12 + 0.35) = 11.83 m when it comes in: nearer it may be hit. One that draws away may not.
     "r157_cut_in": (
@@ -295,9 +308,15 @@ EDGES: Final[dict[str, tuple[Edge, ...]]] = {
     ),
     # 8 · (0.4 + 8/6) + 10 = 23.87 m
     "r157_lane_change": (edge(change(MERGED_BEFORE, "v", "start"), -7.11, -7.12),),
-    "r157_braking_lead": (edge(stands_ahead, 34.49, 34.51),),
+    "r157_braking_lead": (
+        edge(stands_ahead, 34.49, 34.51),
+        edge(lasting(comes_in_front(9)), 4.2, 4.0, None),
+    ),
     # 2.4 + 3.2 - 3.05 = 2.55 m
-    "r_g1_safe_distance": (edge(change(FOLLOWING, "v", "start"), 7.05, 7.06),),
+    "r_g1_safe_distance": (
+        edge(change(FOLLOWING, "v", "start"), 7.05, 7.06),
+        edge(lasting(comes_in_front(8)), 4.4, 4.2, None),
+    ),
     "r_g2_abrupt_braking": (
         edge(lambda decel: ABRUPT.with_actor("ego", speed=braking(15, 2, decel)), 2.01, 1.99),
         edge(brakes_with, 3.99, 4.01, None),
@@ -379,7 +398,7 @@ EDGES: Final[dict[str, tuple[Edge, ...]]] = {
     # From side to side 0.90 m and 0.92 m
     "bicycle_839": (edge(across(BESIDE_BICYCLE), -0.95, -0.93),),
     "pass_843": (
-        edge(lambda x: PASSING.with_actor("w", route=along(1.75, x, -200)), 195.84, 195.86, None),
+        edge(lambda x: PASSING.with_actor("w", route=along(1.75, x, -200)), 203.59, 203.60, None),
     ),
     "follow_emergency_921": (edge(change(BEHIND_BLUE, "u", "start"), 24.99, 25.01, None),),
     "tailgating_816": (edge(change(TAIL, "v", "start"), 6.99, 7.01, None),),
