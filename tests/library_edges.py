@@ -217,6 +217,11 @@ def comes_from_behind(speed: float) -> Scene:
     return Scene(WAYS, ego(along(RIGHT), 10, start=60), v, seconds=4)
 
 
+def pulled_out_before(speed: float) -> Scene:
+    """The ego changes to before a vehicle that accelerates to some speed."""
+    return PULLED_OUT.with_actor("v", speed=[(0, 10), (4, speed)])
+
+
 def lead_brakes(decel: float) -> Scene:
     v = actor("v", along(RIGHT), braking(10, 2, decel), start=40)
     return Scene(WAYS, ego(along(RIGHT), 10), v, seconds=5)
@@ -364,7 +369,7 @@ EDGES: Final[dict[str, tuple[Edge, ...]]] = {
     ),
     "iso_change_cut_in": (edge(change(BOTH_CHANGE, "v", "start"), 30.73, 30.75),),
     "iso_change_cut_out": (edge(change(BOTH_LEAVE, "v", "start"), 23.09, 23.11),),
-    "iso_change_rear_accelerates": (edge(change(PULLED_OUT, "v", "start"), 5.63, 5.61),),
+    "iso_change_rear_accelerates": (edge(pulled_out_before, 11.72, 11.70),),
     "iso_change_lead_brakes": (edge(change(SWERVED, "v", "start"), 29.25, 29.27),),
     # SGSM
     "phi1": (edge(across(STREET), -0.945, -0.955),),

@@ -10,6 +10,7 @@ from library_edges import COLLISIONS, EDGES, RULES, Edge
 from library_scenes import SCENES
 from scenes import store_of
 
+from sgstore.config import from_dict
 from sgstore.lang import patterns
 from sgstore.temporal import Monitor
 
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 
     from sgstore.query import Store
     from sgstore.temporal import Verdict
+
+
+WIDE = from_dict({"range": {"radius": 200.0}})
 
 
 def checked(store: Store, name: str) -> dict[str, Verdict]:
@@ -63,23 +67,27 @@ def test_every_rule_has_scenes_that_break_it_keep_it_and_barely_do_either() -> N
     ],
 )
 def test_a_hair_decides_whether_a_rule_is_kept(tmp_path: Path, name: str, edge: Edge) -> None:
+    # Graphs of 50 m and the world around them say what wide graphs say; a monitor sees wide graphs.
     scenes = {"breaks": edge.breaks, "keeps": edge.keeps}
-    store = store_of(tmp_path / "edge.sgstore", {trace: [one] for trace, one in scenes.items()})
+    traces = {f"{trace}{size}": [one] for trace, one in scenes.items() for size in ("", "-wide")}
+    configs = {trace: WIDE for trace in traces if trace.endswith("-wide")}
+    store = store_of(tmp_path / "edge.sgstore", traces, configs)
 
     with store.file.snapshot():
-        online = [watched(store, name, trace, scene) for trace, scene in scenes.items()]
+        online = [watched(store, name, f"{trace}-wide", one) for trace, one in scenes.items()]
         assert online == [True, False]
         if not patterns()[name].is_check:
             found = {i.trace for i in store.find(patterns()[name].text).intervals()}
-            assert found == {"breaks"}
+            assert found == {"breaks", "breaks-wide"}
             return
         verdicts = checked(store, name)
 
-    assert [verdicts[trace].verdict for trace in scenes] == ["false", "true"]
-    values = [robustness(verdicts[trace]) for trace in scenes]
-    assert values[0] <= 0 <= values[1]
+    told = {trace: one.verdict for trace, one in verdicts.items()}
+    assert told == {trace: "false" if "breaks" in trace else "true" for trace in traces}
+    values = {trace: robustness(one) for trace, one in verdicts.items()}
+    assert all((value <= 0) == ("breaks" in trace) or value == 0 for trace, value in values.items())
     if edge.hair is not None:
-        finite = [value for value in values if math.isfinite(value)]
+        finite = [value for value in values.values() if math.isfinite(value)]
         assert all(abs(value) <= edge.hair + 1e-6 for value in finite)
 
 
