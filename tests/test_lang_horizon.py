@@ -59,6 +59,7 @@ def test_who_is_asked_for_by_every_is_looked_for_so_far(formula: str, metres: fl
         ("CHECK ALWAYS COUNT {(v:Vehicle) WHERE dist(ego, v) < 30} >= 2", 0, 30),
         ("CHECK ALWAYS COUNT {(v:Vehicle) WHERE dist(ego, v) < 30} < 2", 30, 0),
         ("CHECK ALWAYS MIN {(v:Vehicle) WHERE dist(ego, v) < 30 | v.speed} < 2", 30, 30),
+        ("CHECK ALWAYS NOT red_for(ego)", 200, 0),
         ("USING RANGE 80 CHECK FORALL (v:Vehicle) ALWAYS v.speed < 50", 80, 0),
         ("USING RANGE 80 CHECK FORALL (v:Vehicle) ALWAYS dist(ego, v) > 5", 5, 0),
     ],

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 from sgstore.lang import ir as b
 from sgstore.records import dataclass
-from sgstore.vocabulary import PROXIMITY, entity_kinds
+from sgstore.vocabulary import PROXIMITY, SIGNALS, entity_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -31,6 +31,8 @@ FASTEST: Final = 150.0
 """What is said to be faster is not known; m/s."""
 _FAR: Final = 200.0 + BODY
 """How far distances along the lanes are known; m."""
+WAITING: Final = 200.0
+"""How far ahead a light or sign of its lane is at most that somebody has to mind; m."""
 _LINKS: Final = dict.fromkeys(PROXIMITY, 25.0 + BODY) | {
     **dict.fromkeys(("leads", "follows"), 100.0 + BODY),
     "overlaps": 2 * BODY,
@@ -193,6 +195,8 @@ class _Looking:
                 found = found.both(_Place(reach + self.known.get(other, math.inf)))
         if _joined(scope, key, self.known):
             found = found.both(_Place(lanes=True))
+            if scope.kinds(key).every <= frozenset(SIGNALS):
+                found = found.both(_Place(WAITING))
         return found
 
     def place(  # noqa: PLR0911 - a case each

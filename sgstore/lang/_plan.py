@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sgstore.lang._catalog import DisplayUnit
 from sgstore.lang._formulas import Leaf, Select, leaves, nested
 from sgstore.lang._kinds import Profile
-from sgstore.lang._rewrite import counted_block, is_lasting
+from sgstore.lang._rewrite import counted_block, is_lasting, stands_alone
 from sgstore.lang.ir import (
     BlockValue,
     Bound,
@@ -128,6 +128,8 @@ class Phases:
         Edge → conditions on its attributes alone: by masks.
     direct : list
         On node ids, relations and constants: where the edges are joined.
+    alone : list of BlockValue
+        Blocks that are relations of their own: joined as edges are.
     happened : list of Happened
         What must have happened: joined as edges are.
     trace : list
@@ -144,6 +146,7 @@ class Phases:
     single: dict[str, list[Bound]] = field(default_factory=dict[str, list[Bound]])
     lane: dict[str, list[Bound]] = field(default_factory=dict[str, list[Bound]])
     direct: list[Bound] = field(default_factory=list[Bound])
+    alone: list[BlockValue] = field(default_factory=list[BlockValue])
     happened: list[Happened] = field(default_factory=list[Happened])
     trace: list[Bound] = field(default_factory=list[Bound])
     rest: list[Bound] = field(default_factory=list[Bound])
@@ -155,13 +158,16 @@ def phases_of(scope: Scope, query: Query, catalog: Catalog) -> Phases:
     """The conditions of a scope, filed."""
     parts = Phases()
     for condition in scope.where:
-        _file(condition, parts)
+        if stands_alone(condition, catalog):
+            parts.alone.append(condition)
+        else:
+            _file(condition, parts)
     parts.late = set(_late(scope, parts, query, catalog))
     for key in parts.late & set(parts.single):
         parts.rest += parts.single.pop(key)
     parts.rest += [c for c in parts.direct if nodes_of(c) & parts.late]
     parts.direct = [c for c in parts.direct if not nodes_of(c) & parts.late]
-    tied = scope.outer or scope.edges or parts.blocks or parts.happened
+    tied = scope.outer or scope.edges or parts.blocks or parts.happened or parts.alone
     first = tied or set(scope.nodes) - parts.late
     parts.empty = bool(parts.late) and not first
     if parts.empty:

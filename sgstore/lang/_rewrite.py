@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import combinations, pairwise, product
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeGuard
 
 from sgstore.lang._catalog import (
     NODE_ATTRIBUTES,
@@ -48,6 +48,7 @@ from sgstore.lang.ir import (
     any_kinds,
     conjuncts,
     ego_kinds,
+    nodes_of,
     walk,
     with_operands,
 )
@@ -350,11 +351,13 @@ def _label(condition: Bound) -> tuple[str, Kinds]:
             return "", any_kinds()
 
 
-def open_exists(scope: Scope, _: Catalog) -> Scope:
+def open_exists(scope: Scope, catalog: Catalog) -> Scope:
     """An ``EXISTS {…}`` that must be true joins the pattern around it, its nodes hidden, if that binds a node.
 
-    A node that no edge of the pattern binds would otherwise be tried with every entity of the frame.
+    A node that no edge of the pattern binds would otherwise be tried with every entity of the frame. Of several
+    that stand alone each stays: the database would join the ways of all of them before it comes to the edges.
     """
+    alone = [one for one in scope.where if stands_alone(one, catalog)]
     while True:
         free = set(scope.nodes) - _ends(scope)
         opened = next(
@@ -364,12 +367,34 @@ def open_exists(scope: Scope, _: Catalog) -> Scope:
                 if isinstance(condition, BlockValue)
                 and condition.word == "EXISTS"
                 and _ends(condition.scope) & free
+                and (len(alone) < 2 or condition not in alone)
             ),
             None,
         )
         if opened is None:
             return scope
         scope = _merged(scope, opened)
+
+
+LONG_WAY: Final = 3
+"""Edges from which on a block is a relation of its own."""
+
+
+def stands_alone(condition: Bound, catalog: Catalog) -> TypeGuard[BlockValue]:
+    """Tell whether a block, in scope ``world``, is a relation of its own: its edges bind all it speaks of."""
+    if not catalog.world or not isinstance(condition, BlockValue) or condition.word != "EXISTS":
+        return False
+    scope = condition.scope
+    if len(scope.edges) < LONG_WAY or not scope.outer or not scope.outer.keys() <= _ends(scope):
+        return False
+    told = (leaf for one in scope.where for leaf in leaves(one))
+    single = all(len(nodes_of(one)) == 1 for one in scope.where)
+    return single and all(isinstance(leaf, NodeAttribute) and _of_table(leaf) for leaf in told)
+
+
+def _of_table(leaf: NodeAttribute) -> bool:
+    """Tell whether an attribute stands in the table of its node."""
+    return leaf.attribute.unit not in {DisplayUnit.role, DisplayUnit.own, DisplayUnit.owner}
 
 
 def _ends(scope: Scope) -> set[str]:

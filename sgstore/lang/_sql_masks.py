@@ -36,6 +36,7 @@ from sgstore.lang._plan import (
     Phases,
     SharedRelation,
     apart,
+    phases_of,
     traces_of,
 )
 from sgstore.lang._rewrite import (
@@ -63,7 +64,7 @@ if TYPE_CHECKING:
 
     from sgstore.lang._catalog import Catalog
     from sgstore.lang._plan import Gathered, Window
-    from sgstore.lang.ir import Kinds, Query
+    from sgstore.lang.ir import BlockValue, Kinds, Query
 
 
 _BIT: Final = '"bit"'
@@ -474,7 +475,7 @@ def with_blocks(
     return select.text()
 
 
-def base_rows(
+def base_rows(  # noqa: C901 - a step each
     sql: SqlBuilder,
     scope: Scope,
     parts: Phases,
@@ -493,6 +494,8 @@ def base_rows(
     for edge in scope.edges:
         _join_edge(sql, base, scope, edge)
     single = dict(parts.single)
+    for block in parts.alone:
+        _join_alone(sql, base, scope, block)
     for number, happened in enumerate(parts.happened):
         _join_happened(sql, base, happened, f":happened {number}")
     for key in scope.nodes:
@@ -575,6 +578,20 @@ def _join_graph_nodes(sql: SqlBuilder, base: Base, edge: Edge, ends: Mapping[str
     for key in ends:
         alias = quoted(f"{edge.key}:{key}")
         base.join(f'"graph_node" AS {alias}', alias, {key: f'{alias}."node_id"'})
+
+
+def _join_alone(sql: SqlBuilder, base: Base, scope: Scope, block: BlockValue) -> None:
+    """The frames in which a block has a match, and what it binds of the nodes outside."""
+    outer = {key: kinds & scope.kinds(key) for key, kinds in block.scope.outer.items()}
+    inner = replace(block.scope, outer=outer)
+    keys, alias = frozenset(outer), quoted(f":alone {block.number}")
+    parts = phases_of(inner, sql.query, sql.catalog)
+    rows = base_rows(sql, inner, parts, None, keys, frozenset())
+    ends = zip(sorted(keys), columns_of(keys), strict=True)
+    there = set(base.present)
+    shared = sql.share(rows, "alone")
+    base.join(f"{quoted(shared)} AS {alias}", alias, {k: f"{alias}.{c}" for k, c in ends})
+    base.present = there | {key for key in keys if outer[key].every <= entity_kinds()}
 
 
 def _join_happened(sql: SqlBuilder, base: Base, happened: Happened, name: str) -> None:
