@@ -211,9 +211,7 @@ class Told:
             yield
 
     @contextmanager
-    def counting(
-        self, absent: bool, unknown: bool | None, *, due: bool | None
-    ) -> Iterator[None]:
+    def counting(self, absent: bool, unknown: bool | None, *, due: bool | None) -> Iterator[None]:
         """While conditions count so."""
         before = self.absent, self.unknown, self.due
         self.absent, self.unknown, self.due = absent, unknown, due
@@ -230,7 +228,9 @@ class Told:
             case s.Call(name="delta", arguments=(inner, by)):
                 return any(self.is_unknown(inner, j, binding) for j in (i, self.then(by, i)))
             case s.Call(name=name, arguments=(inner, by)) if name in WINDOWS:
-                frames = (j for j in self.last_frames(by, i) if not self.was_away(inner, j, binding))
+                frames = (
+                    j for j in self.last_frames(by, i) if not self.was_away(inner, j, binding)
+                )
                 return any(self.is_unknown(inner, j, binding) for j in frames)
             case s.Comparison() if any(
                 isinstance(one, s.Call) and one.name in {"run_length", "since_true"}
@@ -312,7 +312,9 @@ class Told:
             ways = [way | {name: Edge(r, found[r])} for way in ways for r in sorted(found)]
         return ways
 
-    def tense(self, e: s.Temporal, i: int, binding: Binding) -> bool:
+    def tense(  # noqa: PLR0911 - a case each
+        self, e: s.Temporal, i: int, binding: Binding
+    ) -> bool:
         last = len(self.frames) - 1
         near = [j for j in range(last + 1) if self.within(e, i, j)]
         one = e.operands[-1]

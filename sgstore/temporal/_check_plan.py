@@ -414,7 +414,7 @@ class CheckPlan(Plan):
             case b.Operation("IS NOT NULL", (b.Operation() as difference,)) if test.signals:
                 self._measure(difference, test)  # the value of a margin, which is asked anyway
             case _:
-                Plan._measure(self, expression, test)
+                Plan._measure(self, expression, test)  # noqa: SLF001 - of the base class
 
     def presence(self, node: str) -> str:
         """The name of the atom that says where a node is."""

@@ -253,11 +253,6 @@ def doubt_text(condition: Bound, who: Sequence[str], frame: str) -> str:
     return f"{written} is unknown{' of ' * bool(who)}{', '.join(who)} in {frame}"
 
 
-def doubted(verdict: Verdict, reason: str) -> Verdict:
-    """A verdict, or that it is unknown for a reason that is not empty."""
-    return replace(verdict, verdict="unknown", reason=reason) if reason else verdict
-
-
 def absence_text(frames: int) -> str:
     """Text of the number of frames in which an entity is absent."""
     return f"an entity is absent in {frames} frame{'s' * (frames != 1)}"
@@ -344,7 +339,8 @@ def within_range(found: Verdict, short: ShortRange) -> Verdict:
     reason = short.of(holds=found.verdict == "true")
     if not reason:
         return found
-    return replace(found, verdict="unknown", violations=(), witnesses=(), reason=reason)
+    nothing = {"violations": (), "witnesses": (), "absent_frames": 0}
+    return replace(found, verdict="unknown", reason=reason, **nothing)
 
 
 def verdict_columns(*, margin: bool = False, returned: Sequence[str] = ()) -> tuple[str, ...]:
