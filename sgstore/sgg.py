@@ -28,7 +28,7 @@ from sgstore.abstractions import Classes, GraphColumns, MapColumns, abstraction_
 from sgstore.columns import chained, taken
 from sgstore.errors import ConfigError
 from sgstore.graph import Edges, GraphBlock, LaneStates, LeftOut, StaticPresence, WorldBlock
-from sgstore.pair_numbers import UNEVEN, all_level, low_and_high
+from sgstore.pair_numbers import UNEVEN, all_level
 from sgstore.relations import (
     IS_SIGNAL,
     IS_UPRIGHT,
@@ -288,26 +288,21 @@ class SceneGraphGenerator:
             near=self._near(bodies, part.rows, len(frames)),
             contacts=gathered(partial(contacts, bodies), bodies.frame, len(frames)),
             whole=whole,
-            uneven=self._uneven(frames),
+            uneven=self._uneven(whole.bodies),
         )
 
-    def _uneven(self, frames: FrameBlock) -> int:
-        """What there may be, in range or not, that is no pair of bodies; bits of ``UNEVEN``."""
-        states, scenery = frames.states, self._scenery
-        kind = np.concatenate([self._kinds[states.node], self._kinds[scenery.node]])
-        z, height = (
-            np.concatenate([getattr(states, name), getattr(scenery, name)])
-            for name in ("z", "height")
-        )
-        flat = ~IS_UPRIGHT[kind] & (height == 0)
-        low, high = low_and_high(z, height, IS_SIGNAL[kind], IS_UPRIGHT[kind])
-        near = (np.arange(len(kind)) < len(states)) | IS_USER[kind]
+    @staticmethod
+    def _uneven(known: Bodies) -> int:
+        """What there is among all that is known that is no pair of bodies; bits of ``UNEVEN``."""
+        flat = ~IS_UPRIGHT[known.kind] & (known.height == 0)
+        low, high = known.low_and_high
+        near = known.moves | IS_USER[known.kind]
         found = {
             "flat": bool(flat.any()),
-            "storeys": not all_level(low, high),
-            "carried": bool((states.carrier >= 0).any()),
+            "storeys": not all_level(low, high, known.frame),
+            "carried": bool((known.carrier >= 0).any()),
             "near_flat": bool(flat[near].any()),
-            "near_storeys": not all_level(low[near], high[near]),
+            "near_storeys": not all_level(low[near], high[near], known.frame[near]),
         }
         return sum(UNEVEN[name] for name, holds in found.items() if holds)
 

@@ -44,12 +44,30 @@ UNEVEN: Final = {"flat": 1, "storeys": 2, "carried": 4, "near_flat": 8, "near_st
 """Bits of what a trace has that is no pair of bodies; ``near``: among what moves, and static road users."""
 
 
-def all_level(low: Floats, high: Floats) -> bool:
-    """Return whether no two of some bodies are on different storeys, whichever of them share a frame."""
+def all_level(low: Floats, high: Floats, frame: NDArray[np.int64] | None = None) -> bool:
+    """Return whether no two of some bodies are on different storeys, whichever of them share a frame.
+
+    Parameters
+    ----------
+    low, high : (N,) float64
+    frame : (N,) int64, optional
+        Only those of one frame are compared.
+    """
+    if not len(low):
+        return True
+    frame = np.zeros(len(low), np.int64) if frame is None else frame
     solid, known = high > low, ~np.isnan(low)
-    if solid.any() and low[solid].max() > high[solid].min() + TOUCH:
+    count = int(frame.max()) + 1
+
+    def extremes(rows: Bools, least: Floats) -> Floats:
+        highest, lowest = np.full(count, -np.inf), np.full(count, np.inf)
+        np.maximum.at(highest, frame[rows], low[rows])
+        np.minimum.at(lowest, frame[rows], least[rows])
+        return highest - lowest
+
+    if (extremes(solid, high) > TOUCH).any():
         return False
-    return bool((solid == known).all() or np.ptp(low[known]) <= STOREY)
+    return bool((solid == known).all() or (extremes(known, low) <= STOREY).all())
 
 
 def low_and_high(z: Floats, height: Floats, hung: Bools, upright: Bools) -> tuple[Floats, Floats]:
