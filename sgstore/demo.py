@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from sgstore.draw import draw_stored
+from sgstore.draw import check_installed
 from sgstore.errors import ExportError, MissingExtraError, TraceError
 from sgstore.exporters import Export, WrittenClip, parse_mounts, write_export
 from sgstore.ingest import ingest
@@ -141,6 +141,9 @@ def _answer(
     picture = folder / f"{name}.png"
     middle = (found[0].start_seq + found[0].end_seq) // 2
     try:
+        check_installed()
+        from sgstore.draw import draw_stored  # its files import the drawing packages
+
         draw_stored(store, f"{found[0].trace}#{middle}", picture, matches=matches)
     except MissingExtraError as error:
         say(f"  (no picture: {error})")

@@ -27,7 +27,7 @@ from sgstore.mcap import METADATA, bag_folder, mark_of, parts_of, remote_names
 from sgstore.processes import command
 from sgstore.readers import ENDINGS, is_recording
 from sgstore.segments import Job, Progress, SegmentReader, TraceOutcome
-from sgstore.store import Folder, PresentError, Sealed, StoreFile
+from sgstore.store import Folder, PresentError, Sealed, StoreFile, refuse_name
 from sgstore.trace_parts import TracePart
 from sgstore.world import BUCKET_FRAMES
 
@@ -366,6 +366,7 @@ def ingest(  # noqa: PLR0913  as many options as there are ways to read
         block_frames=BLOCK_FRAMES,
     )
     paths = [Path(path) for path in traces]
+    refuse_name(job.store)
     file = StoreFile(job.store) if job.store.exists() else None
     if file is not None and not dry_run:
         file.settle()

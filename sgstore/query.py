@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
 from sgstore.criticality import KNOWN
-from sgstore.errors import StoreError, place_named
+from sgstore.errors import StoreError, place_named, url_named
 from sgstore.lang import CONSTANTS, about_frame, compile_query, union_parts
 from sgstore.matches import UnionMatches
 from sgstore.records import dataclass
@@ -245,14 +245,19 @@ class Store:
         Raises
         ------
         StoreError
-            A folder holds no recording, nothing fits a pattern, or the store cannot be written.
+            A file does not exist, a folder holds no recording, nothing fits a pattern, or the store cannot
+            be written.
         MapError
             The file given for the road map cannot be read.
         """
         from sgstore.ingest import ingest, recordings
 
         names = [traces] if isinstance(traces, (str, Path)) else traces
-        return ingest(self.file.path, recordings(names), **options)
+        files = recordings(names)
+        for file in files:
+            if url_named(file) is None and not file.exists():
+                raise StoreError(f"{file}: no such file; name a recording, or a folder of some")
+        return ingest(self.file.path, files, **options)
 
     def catalog(self) -> Catalog:
         """The catalog of the store for queries; remembered while the file stays as it is."""

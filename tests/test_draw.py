@@ -315,7 +315,10 @@ def test_a_bad_camera_picture_is_refused(tmp_path: Path, picture: Callable[[], b
 def test_the_title_has_trace_frame_and_time_also_where_it_is_a_date() -> None:
     assert title_of(graph_of({})) == "town   frame 7   0.350 s"
     recorded = graph_of({}, time_ns=1_753_000_000_250_000_000)
-    assert title_of(recorded).endswith("2025-07-20 08:26:40.250 UTC")
+    assert title_of(recorded).endswith("frame 7   2025-07-20 08:26:40.250 UTC")
+    told = title_of(recorded, recorded.time_ns - 30_000_000_000)
+    assert told.endswith("frame 7   30.000 s   2025-07-20 08:26:40.250 UTC")
+    assert title_of(graph_of({}), 100_000_000) == "town   frame 7   0.250 s"
 
 
 def test_a_map_shows_its_lanes_by_type_and_its_parts(tmp_path: Path) -> None:

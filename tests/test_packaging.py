@@ -83,6 +83,18 @@ def test_a_source_distribution_can_run_its_tests(tmp_path: Path) -> None:
     left_out = {*tracked.stdout.splitlines()} - held
     assert left_out == {".gitignore", ".dockerignore"}
 
+    # The wheel that is published is made from this distribution.
+    with tarfile.open(file) as archive:
+        archive.extractall(tmp_path / "unpacked", filter="data")
+    (source,) = (tmp_path / "unpacked").iterdir()
+    made = "from setuptools.build_meta import build_wheel; print(build_wheel('dist'))"
+    subprocess.run([sys.executable, "-c", made], cwd=source, capture_output=True, check=True)
+    (wheel,) = (source / "dist").glob("*.whl")
+    assert wheel.stat().st_size < 3_500_000
+    with zipfile.ZipFile(wheel) as archive:
+        names = {name for name in archive.namelist() if name.startswith("sgstore/")}
+    assert names == packages.shipped() & {*tracked.stdout.splitlines()}
+
 
 @pytest.mark.parametrize("needed", NEEDED)
 def test_every_package_that_is_needed_has_bounds(needed: str) -> None:

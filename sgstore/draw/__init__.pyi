@@ -5,6 +5,7 @@ from ._charts import draw_growth as draw_growth
 from ._charts import draw_matrix as draw_matrix
 from ._charts import draw_rank_sizes as draw_rank_sizes
 from ._view import Relations as Relations
+from ._picture import check_installed as check_installed
 from ._picture import draw_frame as draw_frame
 from ._picture import draw_map as draw_map
 from ._stored import Bindings as Bindings
@@ -34,6 +35,7 @@ __all__ = [
     "Timeline",
     "camera_image",
     "camera_of",
+    "check_installed",
     "draw_clip",
     "draw_curve",
     "draw_frame",

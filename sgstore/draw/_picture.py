@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Final
 
 from sgstore.draw._view import Relations, clean, counted, number, view_of
 from sgstore.errors import ExportError, MissingExtraError
+from sgstore.world import seconds_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Sequence
@@ -180,13 +181,19 @@ def draw_map(road_map: RoadMap, to: str | Path, *, title: str | None = None) -> 
         page.save(to)
 
 
-def title_of(graph: SceneGraph) -> str:
-    """Trace, number of the frame, and its time: in seconds, or as a date if it is one."""
-    seconds = f"{graph.time_ns / 1e9:.3f} s"
-    if graph.time_ns > _NS_OF_A_YEAR:
+def title_of(graph: SceneGraph, start_ns: int | None = None) -> str:
+    """Trace, number of the frame, and its time.
+
+    The time is ``t``, if the start of the trace is known. A time that is a date is shown as such, too.
+    """
+    dated = graph.time_ns > _NS_OF_A_YEAR
+    parts = [clean(graph.trace), f"frame {graph.seq}"]
+    if start_ns is not None or not dated:
+        parts.append(f"{seconds_of(graph.time_ns - (start_ns or 0)):.3f} s")
+    if dated:
         moment = datetime.fromtimestamp(graph.time_ns / 1e9, UTC)
-        seconds = f"{moment:%Y-%m-%d %H:%M:%S.%f}"[:-3] + " UTC"
-    return f"{clean(graph.trace)}   frame {graph.seq}   {seconds}"
+        parts.append(f"{moment:%Y-%m-%d %H:%M:%S.%f}"[:-3] + " UTC")
+    return "   ".join(parts)
 
 
 def check_installed() -> None:

@@ -69,6 +69,7 @@ def filmed(  # noqa: PLR0913  as many options as the picture has
     radius: float | None = None,
     north_up: bool = False,
     diagram: bool = False,
+    start_ns: int | None = None,
 ) -> Iterator[Shot]:
     """Draw shots into an animation, and give each when it is drawn.
 
@@ -82,6 +83,8 @@ def filmed(  # noqa: PLR0913  as many options as the picture has
     shots : iterable of Shot
     relations, radius, north_up, diagram
         As in :func:`sgstore.draw.draw_frame`.
+    start_ns : int, optional
+        Simulation time at which the trace begins.
 
     Raises
     ------
@@ -113,7 +116,7 @@ def filmed(  # noqa: PLR0913  as many options as the picture has
             graph, _, picture = shot
             seen = picture or seen
             start = graph.time_ns if start is None else start
-            scene, title = scene_of(shot), title_of(graph)
+            scene, title = scene_of(shot), title_of(graph, start_ns)
             with own_style():
                 if diagram:
                     page = diagram_page(scene, title, relations, entries, blank)
@@ -210,10 +213,12 @@ def draw_stored(  # noqa: PLR0913  as many options as the picture has
     with store.file.snapshot():
         ref = store.file.frame(frame)
         bindings = matches.bindings(ref) if matches is not None else []
+        graph = called(store.file.graph(ref.frame_id), names)
         draw_frame(
-            called(store.file.graph(ref.frame_id), names),
+            graph,
             map_of(store, ref.trace),
             to,
+            title=title_of(graph, store.file.trace(ref.trace_id).start_ns),
             highlight=bindings[0] if bindings else {},
             picture=None if diagram else _picture(store, ref, camera),
             relations=relations,
@@ -311,6 +316,7 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
     samples = [*shots([chosen[number] for number in spread], seen=False)]
     look: dict[str, Any] = {"relations": relations, "radius": radius}
     look |= {"north_up": north_up, "diagram": diagram}
+    look["start_ns"] = store.file.trace(trace).start_ns
     marked = 0
     drawn = filmed(to, road_map, samples, shots(chosen, seen=True), **look)
     for number, (_, found, _) in enumerate(drawn, start=1):
@@ -466,7 +472,9 @@ def thumbnail(file: StoreFile, frame: FrameRef, side: int = THUMBNAIL) -> bytes:
             media = file.carried(frame.frame_id, topic)
             data = media.data if media.form in _PICTURES else b""
     if not data:
-        data = graph_picture(file.graph(frame.frame_id), _map_in(file, frame.trace))
+        graph = file.graph(frame.frame_id)
+        title = title_of(graph, file.trace(frame.trace_id).start_ns)
+        data = graph_picture(graph, _map_in(file, frame.trace), title=title)
     image = _opened(data, topic).convert("RGB")
     image.thumbnail((side, side))
     small = io.BytesIO()

@@ -33,7 +33,7 @@ from sgstore.importing._resolve import (
 )
 from sgstore.mcap import Loss, check_name, digest_of, mark_of
 from sgstore.roads import MapEdges, MapNodes, Ribbons, RoadMap
-from sgstore.store import Folder, Identity, OnMap, Segment, StoreFile
+from sgstore.store import Folder, Identity, OnMap, Segment, StoreFile, refuse_name
 from sgstore.vocabulary import (
     DIRECTIONS,
     KIND_CODE,
@@ -167,6 +167,7 @@ class _ImportRun:
         self._form = form
         self._words = words
         self._answers = answers
+        refuse_name(store)
         self._store = StoreFile(store) if store.exists() else None
         if self._store is not None:
             self._store.settle()

@@ -42,6 +42,7 @@ from ._given import Given as Given
 from ._given import GivenTable as GivenTable
 from ._joins import UserTables as UserTables
 from ._locking import Folder as Folder
+from ._locking import refuse_name as refuse_name
 from ._packing import BUCKET_BITS as BUCKET_BITS
 from ._packing import trace_of as trace_of
 from ._packing import seq_of as seq_of
@@ -145,6 +146,7 @@ __all__ = [
     "names_of_traces",
     "named_as",
     "parquet_rows",
+    "refuse_name",
     "relations_of_set",
     "remains_of",
     "seq_of",

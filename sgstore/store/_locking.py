@@ -48,6 +48,24 @@ _KINDS: Final = {
 }
 
 
+_NO_NAME: Final = frozenset("?\\")
+"""Characters that DuckDB takes for the end of a path, or for a slash."""
+
+
+def refuse_name(path: Path) -> None:
+    """Refuse a path that DuckDB reads in its own way.
+
+    Raises
+    ------
+    StoreError
+    """
+    found = sorted(_NO_NAME & set(str(path.absolute())))
+    if found and os.name == "posix" and url_named(path) is None:
+        raise StoreError(
+            f"{path}: DuckDB cannot open a path with {found[0]!r}; rename the store, or its folder"
+        )
+
+
 def refuse_special(path: Path) -> None:
     """Refuse what is no file: to open a pipe would wait for somebody to write into it.
 
@@ -57,6 +75,7 @@ def refuse_special(path: Path) -> None:
     """
     if url_named(path) is not None:
         raise one_store_needed(path)
+    refuse_name(path)
     for file in (path.with_name(f"{path.name}.wal"), path):
         try:
             mode = file.stat().st_mode
@@ -525,7 +544,7 @@ class Access:
                         connect = partial(self._shut_in, config, ":memory:", read_only=False)
                         settings = self._file.folder, *self._file.settings
                         return AttachedFile(self.path, connect, settings)
-                    return self._shut_in(config, str(self.path))
+                    return self._shut_in(config, str(self.path.absolute()))
             except BusyError as busy:
                 deadline.pause(busy)
 
@@ -802,6 +821,13 @@ def _lock(gate: int, how: int, path: Path, deadline: _Deadline) -> None:
             return
         except BlockingIOError:
             deadline.pause(StoreError(f"{path}: another process has been writing for too long"))
+        except OSError as error:
+            if how == fcntl.LOCK_SH:
+                return  # a file system without locks: DuckDB decides alone
+            raise StoreError(
+                f"{path}: cannot be locked for writing: {error.strerror}; keep the store on a file"
+                " system that has locks"
+            ) from error
 
 
 def spill_folder() -> Path:

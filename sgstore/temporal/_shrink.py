@@ -7,6 +7,7 @@ in none of its frames is not in it. Values of single frames stay as they are: ti
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -159,7 +160,11 @@ def _span(file: StoreFile, clip: str) -> Span:
     ends = range_of(clip)
     if ends is None:
         raise StoreError(f"{clip}: no clip; expected TRACE@12s..18s or TRACE#120..180")
-    first, last = (file.frame(end) for end in ends)
+    first = file.frame(ends[0])
+    named = re.split("[#@](?=[^#@]*$)", ends[0])[0]
+    if named not in {first.trace, str(first.trace_id)}:
+        raise StoreError(f"no trace {named!r}; did you mean {first.trace!r}?")
+    last = file.frame(ends[1])
     if first.frame_id > last.frame_id:
         raise StoreError(f"{clip}: it ends before it begins")
     return first, last
