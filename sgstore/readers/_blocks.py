@@ -74,7 +74,7 @@ NO_INPUTS: Final = (NAN,) * len(INPUTS)
 """Controls of whom the recording tells none."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class FrameRows:
     """One frame, decoded.
 
@@ -718,18 +718,17 @@ class Lives:
     def follow(self, frames: list[FrameRows], sizes: list[int]) -> list[FrameRows]:
         """The next frames; ``sizes``: how many ids are known with each."""
         runs: list[int] = []
-        timed: list[FrameRows] = []
         for frame in frames:
             seconds = self._seconds(frame.time_ns)
-            timed.append(replace(frame, seconds=seconds, returned=self._roster.returned))
+            frame.seconds, frame.returned = seconds, self._roster.returned
             runs.append(self._run)
-        far = self._leaps(timed, runs)
+        far = self._leaps(frames, runs)
         if not (self._nodes or any(far) or any(frame.kinds for frame in frames)):
             self._seq += len(frames)
-            return timed
+            return frames
         return [
             self._entered(frame, last_seen, size)
-            for frame, last_seen, size in zip(timed, far, sizes, strict=True)
+            for frame, last_seen, size in zip(frames, far, sizes, strict=True)
         ]
 
     def settle(self) -> None:
