@@ -36,11 +36,11 @@ from sgstore.store import (
     IN_NOTEBOOK,
     SEQ_BITS,
     FrameRef,
-    scope_of,
     GivenTable,
     Tabular,
     as_told,
     as_told_batches,
+    scope_of,
     write_batches,
 )
 from sgstore.vocabulary import natural

@@ -475,8 +475,9 @@ class SceneGraphGenerator:
 
     @property
     def losses(self) -> list[Loss]:
-        """Losses in the graphs of the steps so far: the pairs of frames that were too crowded."""
-        return self._crowds.losses(self._config)
+        """Losses of the steps so far: pairs of crowded frames, sizes and speeds that no body has."""
+        faults = self._online.faults.losses() if self._online is not None else []
+        return [*self._crowds.losses(self._config), *faults]
 
     def class_of(self, abstraction: str = "RSV", number: int = 0) -> str | None:
         """The class of the graph of the last step in an abstraction; the one that it would have in a store.

@@ -42,6 +42,7 @@ from sgstore.world import (
     INPUTS,
     POSE,
     Entities,
+    FaultTally,
     FrameBlock,
     MessageRefs,
     Origin,
@@ -710,6 +711,8 @@ class Stepper:
     ----------
     last : tuple or None
         The last graphs as blocks, and the kinds of their entities by the blocks' node ids.
+    faults : FaultTally
+        Sizes and speeds of the frames that no body has.
     """
 
     def __init__(
@@ -724,6 +727,7 @@ class Stepper:
         self.last: tuple[list[GraphBlock], Codes] | None = None
         self._next = 0
         self._moving: OrderedDict[str, _Life] = OrderedDict()  # those of the last frame at the end
+        self.faults = FaultTally()
         self._time_ns: int | None = None
         self._run = 0  # of the clock: it ends where the clock jumps back
         self._standing: dict[str, tuple[Entity, EntityConstants]] = {}
@@ -787,6 +791,8 @@ class Stepper:
         if self._time_ns is not None and frame.time_ns < self._time_ns:
             self._run += 1
         self._time_ns = frame.time_ns
+        for ident, words in frame.losses:
+            self.faults.add(ident, words)
         moving = {entity.ident: entity for entity in frame.entities if not entity.static}
         new: dict[str, Entity] = {}
         for entity in frame.entities:

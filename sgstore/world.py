@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 from sgstore.arrays import np
 from sgstore.columns import taken
 from sgstore.geometry import wrapped
-from sgstore.mcap import Findings
+from sgstore.mcap import Findings, Loss
 from sgstore.records import dataclass
 
 if TYPE_CHECKING:
@@ -172,6 +172,37 @@ def without_implausible(values: Floats) -> tuple[Floats, list[tuple[int, str]]]:
         (row, f"speed is {speed:g} m/s") for row, speed in zip(fast.tolist(), speeds, strict=True)
     ]
     return np.where(found, np.nan, values), faults
+
+
+class FaultTally:
+    """Numbers that no body has, by entity: the first one, and in how many states."""
+
+    MOST: Final = 1000
+    """Numbers of entities that are listed; further ones are counted together."""
+
+    def __init__(self) -> None:
+        self._found: dict[str, tuple[str, int]] = {}
+        self._more = 0
+
+    def add(self, ident: str, words: str) -> None:
+        """Count one: ``length is -4.5 m``."""
+        number, _, value = words.partition(" ")
+        what = f"{number} of entity {ident!r}"
+        if what not in self._found and len(self._found) == self.MOST:
+            self._more += 1
+            return
+        first, count = self._found.get(what, (value, 0))
+        self._found[what] = first, count + 1
+
+    def losses(self) -> list[Loss]:
+        """One loss for each number of an entity."""
+        reasons = [
+            f"{what} {first}: missing in {count} states"
+            for what, (first, count) in self._found.items()
+        ]
+        if self._more:
+            reasons.append(f"{self._more} more sizes and speeds that no body has are missing")
+        return [Loss(reason, 0, 0) for reason in reasons]
 
 
 def is_leap(away: float, seconds: float) -> bool:

@@ -324,7 +324,11 @@ def test_numbers_that_no_body_has_are_missing_in_a_frame() -> None:
     frame.add("b", "car", 9.0, 0.0, length=4.5, width=1001.0, height=1.5, vx=90.0, vy=130.0)
     frame.add("c", "car", 18.0, 0.0, length=0.0, width=1000.0, vx=90.0, vy=110.0)
 
-    graph = SceneGraphGenerator(None, Config()).step(frame)
+    online = SceneGraphGenerator(None, Config())
+    graph = online.step(frame)
+    reasons = [loss.reason for loss in online.losses]
+    assert reasons[0] == "length of entity 'a' is -4.5 m: missing in 1 states"
+    assert len(reasons) == 3
     about = {node["ident"]: node for node in graph.nodes.values()}
     assert "length" not in about["a"]
     assert about["a"]["width"] == pytest.approx(1.9)

@@ -740,7 +740,7 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
             return None
         self.first = frame.ego if self.first is None else self.first
         for ident, words in frame.losses:
-            self.roster.fault(ident, words)
+            self.roster.faults.add(ident, words)
         for entity in frame.entities:
             if entity.static and entity.ident not in self._known:
                 self._stand(entity)

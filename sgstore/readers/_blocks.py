@@ -14,7 +14,6 @@ import math
 from bisect import bisect_right
 from collections import deque
 from dataclasses import dataclass, field, replace
-from itertools import islice
 from typing import TYPE_CHECKING, ClassVar, Final, Generic, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
@@ -28,6 +27,7 @@ from sgstore.world import (
     INPUTS,
     POSE,
     Entities,
+    FaultTally,
     FrameBlock,
     MessageRefs,
     States,
@@ -158,8 +158,8 @@ class EntityTable:
         Numbers that nothing on earth has, in states and poses.
     happened : int
         How many events there were.
-    faults : dict
-        Number of an entity, such as ``length of entity 7`` → its first implausible value, and their number.
+    faults : FaultTally
+        Sizes and speeds that no body has.
     impossible : (2,) int64
         Derived velocities and accelerations that no body has.
 
@@ -174,7 +174,7 @@ class EntityTable:
     size: int = 0
     absurd: int = 0
     happened: int = 0
-    faults: dict[str, tuple[str, int]] = field(default_factory=dict[str, tuple[str, int]])
+    faults: FaultTally = field(default_factory=FaultTally)
     impossible: Ints = field(default_factory=lambda: np.zeros(2, np.int64))
     _events: list[Event] = field(default_factory=list["Event"])
     _rows: list[EntityRow] = field(default_factory=list["EntityRow"])
@@ -297,12 +297,7 @@ class EntityTable:
         warn = self.report.warnings.append
         if self.absurd:
             warn(f"{self.absurd} numbers of {FAR:g} and more are taken as missing")
-        for what, (first, count) in islice(self.faults.items(), LossTally.MOST):
-            reason = f"{what} {first}: missing in {count} states"
-            self.report.losses.append(Loss(reason, 0, 0))
-        if len(self.faults) > LossTally.MOST:
-            reason = f"{len(self.faults)} entities have sizes or speeds that no body has"
-            self.report.losses.append(Loss(reason, 0, 0))
+        self.report.losses += self.faults.losses()
         velocities, accelerations = self.impossible.tolist()
         if velocities:
             warn(f"{velocities} velocities are not derived from jumps faster than {FASTEST:g} m/s")
@@ -323,15 +318,8 @@ class EntityTable:
         """
         values, faults = without_implausible(values)
         for row, words in faults:
-            self.fault(self._rows[int(nodes[row])].ident, words)
+            self.faults.add(self._rows[int(nodes[row])].ident, words)
         return values
-
-    def fault(self, ident: str, words: str) -> None:
-        """Count a number that no body has: ``length is -4.5 m``."""
-        number, _, value = words.partition(" ")
-        what = f"{number} of entity {ident!r}"
-        first, count = self.faults.get(what, (value, 0))
-        self.faults[what] = first, count + 1
 
     def count_unknown(self, type_name: str) -> None:
         """Count an entity whose type name nothing maps to a kind of its own."""
