@@ -128,6 +128,10 @@ _FIRST_LANE: Final = OFF_ROAD - 1
 _QUADRANT: Final = np.pi / 4
 _MOST_PRESENT: Final = 1 << 24
 """Nodes times points that are looked at in one go."""
+_CORNERS: Final = 8
+"""Corners of a shape by which is told that it is near."""
+_TOUCH: Final = 1e-6
+"""What is no closer to a distance than this needs no exact answer; m."""
 _MERGED: Final = " without sections"
 """What the variant of a map ends in whose lanes are one node for all sections."""
 
@@ -452,9 +456,18 @@ class RoadMap:
         finite = np.flatnonzero(np.isfinite(places).all(axis=1))
         low, high = places[finite] - radius, places[finite] + radius
         row, place = tree.query(shapely.box(*low.T, *high.T))
-        points: Any = shapely.points(places[finite])
+        # Most are told by their boxes, and by some of their corners; shapes are asked of the others only.
+        box, corners = self._corners
+        at = places[finite][row]
+        aside = np.maximum(np.maximum(box[place, :2] - at, at - box[place, 2:]), 0)
+        near = ((corners[place] - at[:, None]) ** 2).sum(axis=2).min(axis=1) <= (
+            radius - _TOUCH
+        ) ** 2
+        near &= radius > _TOUCH
+        ask = np.flatnonzero(~near & ((aside**2).sum(axis=1) <= (radius + _TOUCH) ** 2))
+        points: Any = shapely.points(at[ask])
         with _PREPARED:
-            near = shapely.dwithin(tree.geometries[place], points[row], radius)
+            near[ask] = shapely.dwithin(tree.geometries[place[ask]], points, radius)
         row, place = row[near], place[near]
         present = np.zeros((len(places), len(self.nodes)), np.bool_)
         present[finite[row], columns[place]] = True
@@ -689,6 +702,17 @@ class RoadMap:
             for a, b in zip(_floor(low) - 1, _floor(high) + 2, strict=True)
         ]
         return columns, tree, np.unique(_numbered(np.concatenate(around)))
+
+    @cached_property
+    def _corners(self) -> tuple[Floats, Floats]:
+        """Boxes around the shapes of :attr:`_extents`, (M, 4), and some corners of each, (M, C, 2); m."""
+        _, tree = self._extents
+        every, shape = shapely.get_coordinates(tree.geometries, return_index=True)
+        count = np.bincount(shape, minlength=len(tree.geometries))
+        chosen = (count[:, None] * (np.arange(_CORNERS) / _CORNERS)).astype(np.int64)
+        chosen += (np.cumsum(count) - count)[:, None]
+        corners = np.append(every, [[np.inf, np.inf]], axis=0)[np.where(count[:, None], chosen, -1)]
+        return shapely.bounds(tree.geometries), corners
 
     @cached_property
     def _extents(self) -> tuple[Ints, shapely.STRtree]:
