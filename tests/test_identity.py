@@ -17,6 +17,7 @@ import recordings as osi
 import sumo_recordings as sumo
 
 from sgstore import doctor, segments
+from sgstore.cli import run
 from sgstore.config import Config
 from sgstore.ingest import ingest
 from sgstore.query import Store
@@ -491,3 +492,18 @@ def test_any_exception_of_one_recording_fails_it_and_no_other(
     assert str(TraceOutcome.from_dict(outcomes[1].as_dict()).error) == str(outcomes[1].error)
     assert [trace.name for trace in Store(tmp_path / "s.sgstore").info()] == ["a", "c"]
     assert "ZeroDivisionError: by nothing" in doctor.examine(paths[1]).error
+
+
+def test_gaps_are_listed_by_info_and_doctor(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    times = [*(i / 10 for i in range(6)), *(30 + i / 10 for i in range(6))]
+    path = write_osi(tmp_path / "gap", [(t, [Body(7, 0.0)]) for t in times])
+    store = str(tmp_path / "s.sgstore")
+    assert run(["ingest", store, str(path)]) == 0
+    assert "1 gaps of more than three periods" in capsys.readouterr().err
+    assert run(["info", store]) == 0
+    assert "gap: clock jumps: 0, gaps: 1" in capsys.readouterr().err
+    for command in (["info", store, "--trace", "gap"], ["doctor", str(path)]):
+        assert run(command) == 0
+        assert "+29.5 s before #6" in capsys.readouterr().out

@@ -207,6 +207,10 @@ def info(
         _tell_all_of(file, traces, out)
         return 0
     columns = ("trace", "frames", "seconds", "ego", "map", "flavour", "losses", "trace_id", "file")
+    for one in file.traces():
+        jumps, gaps = one.report.get("clock_jumps", 0), one.report.get("gaps", 0)
+        if jumps or gaps:
+            say(f"{one.name}: clock jumps: {jumps}, gaps: {gaps}; info --trace lists them")
     out.write(
         columns,
         (
