@@ -720,7 +720,9 @@ class Catalog:
     beyond_edges : mapping of Triple to int
         Rows of table ``world_edge``, as ``edges``.
     world : bool
-        Whether this is the catalog in scope ``world``.
+        Whether this is the catalog in scope ``world``, of a store that knows something beyond the graphs.
+    around : bool
+        Whether it is asked in scope ``world``, whatever the store knows.
     only : frozenset of int or None
         The traces that are asked; ``None``: all.
     tables : mapping of str to TableFacts
@@ -758,6 +760,7 @@ class Catalog:
     beyond: tuple[tuple[str, str], ...] = ()
     beyond_edges: Mapping[Triple, int] = field(default_factory=dict[Triple, int])
     world: bool = False
+    around: bool = False
     only: frozenset[int] | None = None
     tables: Mapping[str, TableFacts] = field(default_factory=dict[str, TableFacts])
     sets: Mapping[str, Callable[[Catalog], Catalog]] = field(
@@ -784,12 +787,12 @@ class Catalog:
     def in_world(self) -> Catalog:
         """Return the catalog in scope ``world``; the same where nothing is known beyond the graphs."""
         if not self.beyond or self.world:
-            return self
+            return replace(self, around=True)
         edges = dict(self.edges)
         for triple, many in self.beyond_edges.items():
             edges[triple] = edges.get(triple, 0) + many
         shadows = (*(dict(self.shadows) | dict(self.beyond)).items(),)
-        return replace(self, shadows=shadows, edges=edges, world=True)
+        return replace(self, shadows=shadows, edges=edges, world=True, around=True)
 
 
 def attributes_of(catalog: Catalog) -> dict[str, list[Attribute]]:

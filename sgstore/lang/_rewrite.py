@@ -382,7 +382,7 @@ LONG_WAY: Final = 3
 
 def stands_alone(condition: Bound, catalog: Catalog) -> TypeGuard[BlockValue]:
     """Tell whether a block, in scope ``world``, is a relation of its own: its edges bind all it speaks of."""
-    if not catalog.world or not isinstance(condition, BlockValue) or condition.word != "EXISTS":
+    if not catalog.around or not isinstance(condition, BlockValue) or condition.word != "EXISTS":
         return False
     scope = condition.scope
     if len(scope.edges) < LONG_WAY or not scope.outer or not scope.outer.keys() <= _ends(scope):
