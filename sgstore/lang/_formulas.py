@@ -177,13 +177,13 @@ def attribute_text(attribute: Attribute, at: Aliases) -> str:
     return parts[0] if len(parts) == 1 else f"coalesce({', '.join(parts)})"
 
 
-def raw_text(name: str, at: Aliases) -> str:
+def raw_text(name: str, at: Aliases, *, upright: bool = False) -> str:
     """A raw column of a node, wherever it lives; positions about the trace's origin.
 
     What stands for ever has no states, and velocity and acceleration 0.
     """
     if name in {"low", "high"}:
-        return _side_text(name, at)
+        return _side_text(name, at, upright=upright)
     still = name in {"vx", "vy", "ax", "ay"}
     parts: list[str] = []
     if name == "carrier":
@@ -206,7 +206,7 @@ def raw_text(name: str, at: Aliases) -> str:
     return parts[0] if len(parts) == 1 else f"coalesce({', '.join(parts)})"
 
 
-def _side_text(name: str, at: Aliases) -> str:
+def _side_text(name: str, at: Aliases, *, upright: bool) -> str:
     """The height of the lower or upper side of a body; of signals, and those of a map, there is none."""
     parts = [
         low_and_high_sql(
@@ -214,7 +214,8 @@ def _side_text(name: str, at: Aliases) -> str:
                 f"{alias}.{quoted(column)}"
                 if column == "kind"
                 else f"CAST({alias}.{quoted(column)} AS DOUBLE)"
-            )
+            ),
+            upright=upright,
         )[name]
         for alias in (at.state, at.entity)
         if alias

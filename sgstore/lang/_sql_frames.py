@@ -144,6 +144,8 @@ class Layers:
     conditions : list of Bound
     without : frozenset of str
         Marks of pairs that no pair of these traces needs (:data:`sgstore.pair_numbers.MARKS`).
+    users : frozenset of str
+        Nodes that are road users.
     early : set of Part
         What the conditions are made of that no dear number is in.
     tested : int
@@ -154,6 +156,7 @@ class Layers:
     needed: list[Leaf]
     conditions: list[Bound]
     without: frozenset[str] = frozenset()
+    users: frozenset[str] = frozenset()
     early: set[Part] = field(default_factory=set["Part"])
     tested: int = 0
     _stages: dict[Part, int] = field(default_factory=dict["Part", int])
@@ -264,7 +267,7 @@ class Layers:
                 if stage_of(name) == 0:
                     key = pair.a if name[0] == "a" else pair.b
                     columns[pair_column(name, pair.a, pair.b)] = raw_text(
-                        name[2:], self.join.at[key]
+                        name[2:], self.join.at[key], upright=key in self.users
                     )
         return columns
 
@@ -410,7 +413,12 @@ def frames(
     join, given = _first_phase(sql, scope, parts, given, bound, ties, needed)
     _second_phase(sql, join, scope, parts, given, needed)
     join.world = sql.catalog.world
-    layers = Layers(join, needed, conditions, _needless(scope, sql.catalog, _pairs(needed)))
+    # The ego is one, whatever it is.
+    users = frozenset(
+        key for key in {*scope.nodes, *scope.outer} if scope.kinds(key).other <= _USERS
+    )
+    without = _needless(sql.catalog, _pairs(needed), users)
+    layers = Layers(join, needed, conditions, without, users)
     text = layers.text(sql.values, columns_of(nodes, edges), wanted)
     told = {leaf.node for leaf in wanted if isinstance(leaf, NodeValue)}
     told |= {leaf.edge for leaf in wanted if isinstance(leaf, EdgeRelation)}
@@ -425,18 +433,14 @@ def frames(
     return text
 
 
-def _needless(scope: Scope, catalog: Catalog, pairs: Iterable[PairNumber]) -> frozenset[str]:
+def _needless(
+    catalog: Catalog, pairs: Iterable[PairNumber], users: frozenset[str]
+) -> frozenset[str]:
     """Marks that no pair needs whose numbers are asked for, of what the traces have."""
     uneven = 0
     for trace in catalog.traces:
         uneven |= trace.uneven
-    kinds = {
-        kind
-        for pair in pairs
-        for key in (pair.a, pair.b)
-        for kind in scope.kinds(key).other  # the ego moves, whatever it is
-    }
-    near = "near_" if kinds <= _USERS else ""
+    near = "near_" if {key for pair in pairs for key in (pair.a, pair.b)} <= users else ""
     flat = uneven & UNEVEN["flat"] and not near
     storeys = uneven & UNEVEN[f"{near}storeys"]
     left = MARKS - ({"solid"} if flat else set[str]())

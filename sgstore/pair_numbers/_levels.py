@@ -90,12 +90,17 @@ def low_and_high(z: Floats, height: Floats, hung: Bools, upright: Bools) -> tupl
     return low, np.where(hung, np.nan, z + half)
 
 
-def low_and_high_sql(column: Callable[[str], str]) -> dict[str, str]:
-    """Return the same as SQL, given the SQL of the columns ``z``, ``height`` and ``kind``."""
+def low_and_high_sql(column: Callable[[str], str], *, upright: bool = False) -> dict[str, str]:
+    """Return the same as SQL, given the SQL of the columns ``z``, ``height`` and ``kind``.
+
+    ``upright``: whether all are known to be upright, and no signals.
+    """
     z, height, kind = (column(name) for name in ("z", "height", "kind"))
-    hung, upright = (", ".join(f"'{kind}'" for kind in kinds) for kinds in (HUNG, UPRIGHT))
+    if upright:
+        return {"low": f"{z} - coalesce({height}, 0) / 2", "high": f"{z} + nullif({height}, 0) / 2"}
+    hung, standing = (", ".join(f"'{kind}'" for kind in kinds) for kinds in (HUNG, UPRIGHT))
     solid = f"{kind} NOT IN ({hung})"
-    half = f"CASE WHEN {height} <> 0 OR {kind} NOT IN ({upright}) THEN {height} / 2 END"
+    half = f"CASE WHEN {height} <> 0 OR {kind} NOT IN ({standing}) THEN {height} / 2 END"
     return {
         "low": f"CASE WHEN {solid} THEN {z} - coalesce({half}, 0) END",
         "high": f"CASE WHEN {solid} THEN {z} + {half} END",
