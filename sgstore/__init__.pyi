@@ -24,6 +24,7 @@ from .query import StoreFrame as StoreFrame
 from .sgg import SceneGraphGenerator as SceneGraphGenerator
 from .step import Frame as Frame
 from .store import FrameRef as FrameRef
+from .store import duckdb as duckdb
 from .store import Rows as Rows
 from .temporal import CheckRun as CheckRun
 from .temporal import Monitor as Monitor
@@ -64,4 +65,5 @@ __all__ = [
     "Verdict",
     "open",
     "read_map_file",
+    "duckdb",
 ]

@@ -15,7 +15,7 @@ from sgstore.store import Tabular
 PAGE = Path(__file__).parents[1] / "docs" / "api.md"
 
 PARTS: dict[str, tuple[str, ...]] = {
-    "A store": ("open", "Store", "StoreFrame"),
+    "A store": ("open", "Store", "StoreFrame", "duckdb"),
     "A collection of stores": ("Collection",),
     "Answers": (
         *("Matches", "Interval", "Clip", "ClipAnimation", "FrameRef"),

@@ -28,7 +28,7 @@ def test_the_package_has_about_25_names_and_the_page_describes_each_once() -> No
     told = [name for names in PARTS.values() for name in names]
 
     assert sorted(told) == sorted(sgstore.__all__)
-    assert len(told) < 30
+    assert len(told) <= 30
     assert [name for name in told if not getattr(sgstore, name).__doc__] == []
 
 

@@ -62,7 +62,10 @@ def test_a_name_that_duckdb_cannot_open_is_refused_before_work_begins(
 
 
 def test_a_missing_recording_is_an_error(path: Path) -> None:
-    with sgstore.open(path) as store, pytest.raises(StoreError, match=r"missing\.mcap: no such file"):
+    with (
+        sgstore.open(path) as store,
+        pytest.raises(StoreError, match=r"missing\.mcap: no such file"),
+    ):
         store.ingest("missing.mcap")
 
 
@@ -113,3 +116,12 @@ def test_the_demo_runs_without_extras(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "no picture" in done.stdout
     assert (tmp_path / "demo" / "demo.sgstore").is_file()
+
+
+def test_a_connection_of_duckdb_has_no_faulty_optimizer(path: Path) -> None:
+    with sgstore.duckdb(path) as connection:
+        assert connection.sql("SELECT count(*) FROM frames").fetchall() == [(3,)]
+        (off,) = connection.sql("SELECT current_setting('disabled_optimizers')").fetchall()[0]
+        assert "common_subplan" in off
+    with pytest.raises(StoreError):
+        sgstore.duckdb(path.with_name("none.sgstore"))

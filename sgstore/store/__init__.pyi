@@ -42,6 +42,7 @@ from ._given import Given as Given
 from ._given import GivenTable as GivenTable
 from ._joins import UserTables as UserTables
 from ._locking import Folder as Folder
+from ._clients import duckdb as duckdb
 from ._locking import refuse_name as refuse_name
 from ._packing import BUCKET_BITS as BUCKET_BITS
 from ._packing import trace_of as trace_of
@@ -146,6 +147,7 @@ __all__ = [
     "names_of_traces",
     "named_as",
     "parquet_rows",
+    "duckdb",
     "refuse_name",
     "relations_of_set",
     "remains_of",
