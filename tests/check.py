@@ -55,7 +55,7 @@ TESTS = {
     "quoting": "user_tables",
     "readers": "osi osi_* carla carla_* carlasgg autoware foxglove commonroad sumo cdr flavours stamps identity",
     "rebuild": "rebuilding",
-    "relations": "relations relations_* motion",
+    "relations": "relations relations_* motion bodies",
     "roads": "roads roads_* lane_dist lane_places lane_courses roundabouts",
     "schema": "schema views views_page open_names",
     "segments": "ingest ingest_many",
