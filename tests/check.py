@@ -40,7 +40,7 @@ TESTS = {
     "geometry": "geometry",
     "ingest": "ingest ingest_* cases",
     "lang": "lang_* precision cookbook textmate tck union second_match sql_patterns needs notes library library_data"
-    " zones like tolerance",
+    " zones like tolerance library_edges",
     "map_files": "cli_map lanelet2 sumo",
     "importing": "importing openlabel",
     "json_text": "serve export_mcap",
@@ -62,7 +62,7 @@ TESTS = {
     "coverage": "coverage coverage_* sequences",
     "selection": "selection selection_* prioritize sequences",
     "sumo_net": "sumo",
-    "sgg": "sgg sgg_* crowds",
+    "sgg": "sgg sgg_* crowds world_rows",
     "notes": "serve",
     "serve": "serve live report explorer sandbox_pool",
     "step": "online identity",

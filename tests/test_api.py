@@ -145,5 +145,5 @@ def test_public_objects_say_what_they_are(store: sgstore.Store) -> None:
     )
     assert repr(config) == "Config(ego='hero', rate=5.0)"
     assert repr(sgstore.Config()) == "Config()"
-    assert repr(generator) == "<SceneGraphGenerator on no map, 14 relations>"
+    assert repr(generator) == "<SceneGraphGenerator on no map, 15 relations>"
     assert repr(graph) == "<SceneGraph online#0: 0 nodes, 0 edges>"
