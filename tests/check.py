@@ -66,7 +66,7 @@ TESTS = {
     "notes": "serve",
     "serve": "serve live report explorer sandbox_pool",
     "step": "online identity",
-    "store": "everyday store store_* doors events",
+    "store": "everyday store store_* doors events world_rows",
     "temporal": "temporal monitor over_time check_verdicts happens step_expressions robustness shrink windows tolerance clock",
     "trace_parts": "ingest",
     "truth_lanes": "parts timeline",
