@@ -70,7 +70,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.config import Config
-    from sgstore.graph import LaneGaps, SceneGraph
+    from sgstore.graph import LaneGaps, SceneGraph, Whole
     from sgstore.mcap import Loss
     from sgstore.relations import Areas, MapContext, Standing
     from sgstore.roads import RoadMap
@@ -737,7 +737,7 @@ def _rows_apart(one: Edges, other: Edges) -> tuple[Rows, Rows]:
     )
 
 
-def _keys(one: tuple[Ints, ...], other: tuple[Ints, ...]) -> tuple[Ints, Ints]:
+def _keys(one: tuple[Whole | Codes, ...], other: tuple[Whole | Codes, ...]) -> tuple[Ints, Ints]:
     """A number for each row of two tables of the same columns, the same where all of them are."""
     keys = np.zeros(len(one[0]) + len(other[0]), np.int64)
     for columns in zip(one, other, strict=True):

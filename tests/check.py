@@ -39,8 +39,8 @@ TESTS = {
     "files": "outputs folders moved",
     "geometry": "geometry",
     "ingest": "ingest ingest_* cases",
-    "lang": "lang_* precision cookbook textmate tck union second_match sql_patterns needs notes library library_data"
-    " zones like tolerance library_edges",
+    "lang": "lang_* precision cookbook textmate tck union second_match sql_patterns needs notes"
+    " library library_data zones like tolerance library_edges",
     "map_files": "cli_map lanelet2 sumo",
     "importing": "importing openlabel",
     "json_text": "serve export_mcap",
@@ -53,7 +53,8 @@ TESTS = {
     "plugins": "plugins relations abstractions flavours",
     "query": "query api datasets",
     "quoting": "user_tables",
-    "readers": "osi osi_* carla carla_* carlasgg autoware foxglove commonroad sumo cdr flavours stamps identity",
+    "readers": "osi osi_* carla carla_* carlasgg autoware foxglove commonroad sumo cdr flavours"
+    " stamps identity",
     "rebuild": "rebuilding",
     "relations": "relations relations_* motion bodies",
     "roads": "roads roads_* lane_dist lane_places lane_courses roundabouts",
@@ -67,7 +68,8 @@ TESTS = {
     "serve": "serve live report explorer sandbox_pool",
     "step": "online identity",
     "store": "everyday store store_* doors events world_rows",
-    "temporal": "temporal monitor over_time check_verdicts happens step_expressions robustness shrink windows tolerance clock",
+    "temporal": "temporal monitor over_time check_verdicts happens step_expressions robustness shrink"
+    " windows tolerance clock",
     "trace_parts": "ingest",
     "truth_lanes": "parts timeline",
     "vocabulary": "kinds",

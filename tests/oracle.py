@@ -499,9 +499,8 @@ def arithmetic(sign: str, a: Any, b: Any) -> Any:
 
 def pair(name: str, a: dict[str, Any], b: dict[str, Any]) -> float | None:
     """Numbers of a pair that need no more than school geometry; the others have tests of their own."""
-    if any(n["kind"] in {"lane", "road", "junction", "crosswalk", "off_road"} for n in (a, b)):
-        return None
-    if any(axis not in n for n in (a, b) for axis in "xy") or storeys_apart(a, b):
+    parts = {"lane", "road", "junction", "crosswalk", "off_road"} & {a["kind"], b["kind"]}
+    if parts or any(axis not in n for n in (a, b) for axis in "xy") or storeys_apart(a, b):
         return None
     dx, dy = (b[axis] - a[axis] for axis in "xy")
     dz = b["z"] - a["z"] if "z" in a and "z" in b else 0

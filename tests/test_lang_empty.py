@@ -1,4 +1,4 @@
-"""Every construct of the language where nothing matches: an answer, or an error of sgstore, and nothing else."""
+"""Every construct of the language where nothing matches: an answer, or an error of sgstore."""
 
 from __future__ import annotations
 
