@@ -196,6 +196,7 @@ ALTERED = {
     "a kind more": ("ALTER TABLE inside.map_edge ALTER src_kind TYPE ENUM ('car', 'hovercraft')",),
     "a type": (
         "ALTER TABLE inside.state ALTER light_state TYPE VARCHAR",  # a type in use is kept
+        "ALTER TABLE inside.world_state ALTER light_state TYPE VARCHAR",
         "DROP TYPE light_state",
         "CREATE TYPE light_state AS ENUM ('red', 'blue')",
     ),
