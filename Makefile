@@ -13,7 +13,7 @@ help:
 	@echo "make tests   the tests of the core only"
 	@echo "make test-edges  the other tests: what is made of answers, pages, other formats, programs that run long"
 	@echo "make test-ui     the explorer in a browser (Chromium), and the types of its page; without a browser it says so"
-	@echo "make test-wheel  build the wheel, install it elsewhere, and run the short tests there"
+	@echo "make test-wheel  build the wheel from a clone, install it elsewhere, and run the demo and the short tests there"
 	@echo "make test-versions  ingest, verify and find under the lowest and the highest versions of other packages"
 	@echo "make docs    build the documentation as a site, build/site/index.html; a link that leads nowhere is an error"
 	@echo "make lint    format, lint and types only"

@@ -1,9 +1,10 @@
 """The package as people get it: ``python packages.py wheel`` and ``python packages.py versions``.
 
-``wheel`` (``make test-wheel``) builds the wheel, installs it into an environment of its own, and runs the short
-tests there: nothing is imported from the checkout. ``versions`` (``make test-versions``) installs it twice,
-with the lowest and with the highest versions of other packages that ``pyproject.toml`` allows, and runs ingest,
-verify, find and check under both: the answers must be the same.
+``wheel`` (``make test-wheel``) builds the wheel as it is published: from the source distribution of a clone. It
+looks at its size and its files, runs the demonstration where no extra is installed, and runs the short tests in
+an environment of its own: nothing is imported from the checkout. ``versions`` (``make test-versions``) installs
+it twice, with the lowest and with the highest versions of other packages that ``pyproject.toml`` allows. It
+runs ingest, verify, find and check under both: the answers must be the same.
 """
 
 from __future__ import annotations
@@ -14,8 +15,10 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import tempfile
 import tomllib
+import zipfile
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -56,16 +59,43 @@ VARIES = {"seconds", "ingested_at", "file", "path", "uri", "sgstore", "duckdb", 
 """Of a trace: when and where it was read, and how large its store is."""
 
 
+LARGEST = 3_500_000
+"""Bytes of a wheel."""
+
+
 def shipped() -> set[str]:
-    """The files of the package in this checkout that a wheel must hold."""
-    package = REPOSITORY / "sgstore"
-    files = {path.relative_to(REPOSITORY) for path in package.rglob("*") if path.is_file()}
-    left_out = {"sgstore" / RECORDING}
-    return {file.as_posix() for file in files - left_out if "__pycache__" not in file.parts}
+    """The files of the last commit that a wheel must hold: the package without the long recording."""
+    command = ["git", "ls-tree", "-r", "--name-only", "HEAD", "sgstore/"]
+    listed = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    return {*listed.stdout.splitlines()} - {("sgstore" / RECORDING).as_posix()}
+
+
+def clean_copy(folder: Path) -> Path:
+    """A clone of the last commit: nothing that only lies in this checkout."""
+    copy = folder / "clone"
+    command = ["git", "clone", "-q", "--depth", "1", REPOSITORY.as_uri(), str(copy)]
+    subprocess.run(command, check=True)
+    return copy
+
+
+def distribution(source: Path, kind: str) -> Path:
+    """Build one file of a source tree with the installed setuptools; ``kind`` is sdist or wheel."""
+    made = f"from setuptools.build_meta import build_{kind}; build_{kind}('dist')"
+    subprocess.run([sys.executable, "-c", made], cwd=source, capture_output=True, check=True)
+    (file,) = (source / "dist").iterdir()
+    return file
+
+
+def unpacked(archive: Path, folder: Path) -> Path:
+    """The tree of a source distribution."""
+    with tarfile.open(archive) as held:
+        held.extractall(folder / "unpacked", filter="data")
+    (source,) = (folder / "unpacked").iterdir()
+    return source
 
 
 def build(folder: Path, *, isolated: bool) -> Path:
-    """The wheel of this checkout, built in a copy of it: what an earlier build left is not taken up.
+    """The wheel that is published: from the source distribution of a clone.
 
     Parameters
     ----------
@@ -75,17 +105,29 @@ def build(folder: Path, *, isolated: bool) -> Path:
         Whether pip fetches what builds it; otherwise that is what is installed here.
     """
     with tempfile.TemporaryDirectory() as name:
-        copy = Path(name) / "sgstore"
-        (copy / "docs").mkdir(parents=True)
-        for file in ("pyproject.toml", "LICENSE", "NOTICE", "docs/description.md"):
-            shutil.copy(REPOSITORY / file, copy / file)
-        shutil.copytree(
-            REPOSITORY / "sgstore", copy / "sgstore", ignore=shutil.ignore_patterns("__pycache__")
-        )
-        how = () if isolated else ("--no-build-isolation",)
-        pip("wheel", "--no-deps", *how, "--wheel-dir", str(folder), str(copy))
+        archive = distribution(clean_copy(Path(name)), "sdist")
+        if isolated:
+            pip("wheel", "--no-deps", "--wheel-dir", str(folder), str(archive))
+        else:
+            shutil.copy(distribution(unpacked(archive, Path(name)), "wheel"), folder)
     (wheel,) = folder.glob("sgstore-*.whl")
     return wheel
+
+
+def check_contents(wheel: Path, expected: set[str]) -> None:
+    """Compare a wheel with the files that it must hold, and its size with the limit.
+
+    Raises
+    ------
+    AssertionError
+        The wheel is too large, lacks a file, or holds another one.
+    """
+    size = wheel.stat().st_size
+    assert size <= LARGEST, f"{wheel.name}: {size:,} bytes; at most {LARGEST:,}"
+    with zipfile.ZipFile(wheel) as archive:
+        names = {name for name in archive.namelist() if not name.endswith("/")}
+    held = {name for name in names if ".dist-info/" not in name}
+    assert held == expected, f"extra {sorted(held - expected)}, missing {sorted(expected - held)}"
 
 
 def pip(*arguments: str) -> None:
@@ -137,7 +179,9 @@ def lowest() -> list[str]:
 
 
 def try_wheel(folder: Path) -> None:
-    """Run the demonstration and the short tests from an installed wheel, in a folder without the package.
+    """Run the demonstration without extras and the short tests from the published wheel.
+
+    The folder of the tests is without the package.
 
     Raises
     ------
@@ -147,6 +191,12 @@ def try_wheel(folder: Path) -> None:
         What was tested is not what was installed.
     """
     wheel = build(folder, isolated=True)
+    check_contents(wheel, shipped())
+    bare = environment(folder / "bare", str(wheel))
+    missing = [str(bare / "python"), "-c", "import PIL"]
+    assert subprocess.run(missing, check=False, capture_output=True).returncode, "PIL is installed"
+    demo = [str(bare / "sgstore"), "demo", "demonstration"]
+    subprocess.run(demo, check=True, cwd=folder, stdout=subprocess.DEVNULL)
     needs = ("pytest>=8.3", "pytest-xdist>=3.8", "hypothesis>=6.100", "polars>=1")
     programs = environment(folder / "env", f"{wheel}[viz,arrow]", *needs)
     where = [str(programs / "python"), "-c", "import sgstore; print(sgstore.__path__[0])"]
@@ -154,7 +204,7 @@ def try_wheel(folder: Path) -> None:
     shown = subprocess.run(where, check=True, capture_output=True, text=True, cwd=folder / "copy")
     package = Path(shown.stdout.strip())
     assert package.is_relative_to(folder / "env"), package
-    demo = [str(programs / "sgstore"), "demo", "demonstration"]
+    demo = [str(programs / "sgstore"), "demo", "pictures"]
     subprocess.run(demo, check=True, cwd=folder, stdout=subprocess.DEVNULL)
     shutil.copy(REPOSITORY / "sgstore" / RECORDING, package / RECORDING)
     for name in ("tests", "docs", "bench", "samples"):
