@@ -436,11 +436,11 @@ RULES = {
     "Result": parts.MERGED,
     "Query": {
         *("scope", "result", "relations", "injective", "ego", "unknown_is_false"),
-        *("steps", "links", "alternatives", "policy", "gaps", "stages"),
+        *("steps", "links", "alternatives", "policy", "gaps", "stages", "world"),
     },
     "BoundCheck": {
         *("name", "scope", "quantifiers", "formula", "reset", "relations", "injective", "ego"),
-        *("unknown_is_false", "end", "gaps", "robustness", "returns"),
+        *("unknown_is_false", "end", "gaps", "robustness", "returns", "world", "range"),
     },
     "Scope": {"nodes", "outer", "edges", "where", "distinct"},
     "Aggregate": {"word", "operand", "distinct", "type", "share"},

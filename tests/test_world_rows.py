@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from typing import TYPE_CHECKING, Any, Final
@@ -13,7 +14,7 @@ from graph_blocks import trace_info
 from scenes import NO_MESSAGES, Scene, actor, along, ego, light, path, street
 from thorough import LONG
 
-from sgstore.collection import pack, unpack
+from sgstore.collection import Collection, pack, unpack
 from sgstore.config import Config, RangeSettings, from_dict
 from sgstore.demo import RECORDING
 from sgstore.errors import ConfigError, StoreError
@@ -71,14 +72,25 @@ def ranged(radius: float, world: float, **more: Any) -> Config:
 
 def of_scene(folder: Path, config: Config) -> Store:
     """A store of it, with the numbers that a recording would have: rounded before graphs are made."""
+    return of_scenes(folder, config, {"scene": SCENE})
+
+
+def of_scenes(folder: Path, config: Config, scenes: dict[str, Scene]) -> Store:
+    """A store of scenes on one map, by their names."""
     file = StoreFile.create(folder / "s.sgstore")
-    generator = SceneGraphGenerator(WAYS, config)
-    info = trace_info("/scene.mcap", flavour="scene", channels=(), ego="ego", context=NO_MESSAGES)
-    with file.segment(info, config, road_map=WAYS, answers=generator.answers) as segment:
-        for piece in generator.pieces(segment.as_kept(SCENE.block())):
-            segment.append(generator.block(piece))
-        parked = generator.parked, generator.world_parked
-        file.publish(segment.seal(TraceReport(frames=len(SCENE.times)), None, parked))
+    for name, scene in scenes.items():
+        generator = SceneGraphGenerator(WAYS, config)
+        about = {
+            "digest": hashlib.sha256(name.encode()).hexdigest(),
+            "flavour": "scene",
+            "context": NO_MESSAGES,
+        }
+        info = trace_info(f"/{name}.mcap", channels=(), ego="ego", **about)
+        with file.segment(info, config, road_map=WAYS, answers=generator.answers) as segment:
+            for piece in generator.pieces(segment.as_kept(scene.block())):
+                segment.append(generator.block(piece))
+            parked = generator.parked, generator.world_parked
+            file.publish(segment.seal(TraceReport(frames=len(scene.times)), None, parked))
     return Store(file.path)
 
 
@@ -245,6 +257,76 @@ def test_a_collection_keeps_the_rows_beyond_graphs(recorded: Path, tmp_path: Pat
         assert sorted(together[table], key=repr) == sorted(
             (row for one in apart for row in one[table]), key=repr
         )
+
+
+FAR: Final = {
+    "apart": [actor("bus", along(-1.75), 10, "bus", start=90)],
+    "together": [
+        actor("bus", along(-1.75), 10, "bus", start=90),
+        actor("truck", along(-1.75), 10, "truck", start=105),
+    ],
+    "alone": [],
+}
+"""Scenes in which only what lies beyond the graphs differs."""
+
+OF_WORLD: Final = (
+    "USING SCOPE world MATCH (a:Bus) RETURN trace.name, a.name, a.x",
+    "USING SCOPE world MATCH (a:Bus) WHERE EXISTS {(a)-[:follows]->(b:Truck)} RETURN trace.name, a.x",
+    "USING SCOPE world MATCH (a:Bus) WHERE NOT EXISTS {(a)-[:follows]->(b:Truck)} RETURN trace.name, COUNT(*)",
+    "USING SCOPE world MATCH (a:Bus), (b:Truck) RETURN trace.name, MIN(gap(a, b)), COUNT(*)",
+    "MATCH (a:Bus) WHERE EXISTS {(a)-[:follows]->(b:Truck)} RETURN trace.name, COUNT(*)",
+)
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> tuple[Store, Collection]:
+    """A store of the scenes, and a collection with each of them in a bundle."""
+    folder = tmp_path_factory.mktemp("fleet")
+    scenes = {name: Scene(WAYS, ego(along(-1.75), 10), *far) for name, far in FAR.items()}
+    store = of_scenes(folder, ranged(50, 200), scenes)
+    assert len(pack(store.file.path, folder / "many", bundle_traces=1).bundles) == len(FAR)
+    return store, Collection(folder / "many")
+
+
+@pytest.mark.parametrize("text", OF_WORLD)
+def test_a_collection_looks_beyond_graphs_as_a_store_does(
+    fleet: tuple[Store, Collection], text: str
+) -> None:
+    store, whole = fleet
+    wanted = store.find(text).rows()
+    assert bool(wanted) == text.startswith("USING")
+    assert list(map(tuple, whole.find(text).rows())) == list(map(tuple, wanted))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "CHECK apart: FORALL (a:Bus) ALWAYS NOT EXISTS {(a)-[:follows]->(b:Truck)}",
+        "CHECK free: FORALL (a:Bus) ALWAYS gap(ego, a) > 100",
+        "USING SCOPE graph CHECK free: FORALL (a:Bus) ALWAYS gap(ego, a) > 100",
+        "USING RANGE 300 CHECK wide: FORALL (a:Bus) ALWAYS gap(ego, a) > 10",
+    ],
+)
+def test_a_collection_checks_beyond_graphs_as_a_store_does(
+    fleet: tuple[Store, Collection], text: str
+) -> None:
+    store, whole = fleet
+    wanted = list(store.check(text))
+    assert ("false" in {one.verdict for one in wanted}) == text.startswith("CHECK")
+    found = list(whole.check(text))
+    assert [str(one) for one in found] == [str(one) for one in wanted]
+    assert [one.reason for one in found] == [one.reason for one in wanted]
+    assert [one.violations for one in found] == [one.violations for one in wanted]
+    assert [one.witnesses for one in found] == [one.witnesses for one in wanted]
+
+
+def test_bundles_that_cannot_answer_beyond_graphs_stay_closed(
+    fleet: tuple[Store, Collection],
+) -> None:
+    _, whole = fleet
+    whole.find(OF_WORLD[1]).rows()
+    home = {row["name"]: row["bundle"] for row in whole.traces()}
+    assert whole.opened == [home["together"]]
 
 
 def test_a_store_that_is_sorted_keeps_the_rows_beyond_graphs(copied: Path) -> None:

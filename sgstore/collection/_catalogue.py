@@ -213,12 +213,13 @@ class Snapshot:
 
     def contents(self, bundles: Sequence[str], name: str = "") -> Catalog:
         """The triples and kinds of some bundles, in a derived set or as they were ingested; no traces."""
-        edges, map_edges = Counter[Any](), Counter[Any]()
+        edges, map_edges, beyond = Counter[Any](), Counter[Any](), Counter[Any]()
+        tables = {True: edges, False: map_edges, None: beyond}
         kinds: dict[str, set[str]] = {home: set() for home in ("moving", "fixed", "mapped")}
         for bundle in bundles:
             for _, of, moving, relation, src, dst, rows in self.of("triple", bundle):
                 if of == name:
-                    (edges if moving else map_edges)[relation, src, dst] += rows
+                    tables[moving][relation, src, dst] += rows
             for _, home, kind in self.of("kind", bundle):
                 kinds[home].add(kind)
         return Catalog(
@@ -227,25 +228,31 @@ class Snapshot:
             moving=frozenset(kinds["moving"]),
             fixed=frozenset(kinds["fixed"]),
             mapped=frozenset(kinds["mapped"]),
+            beyond_edges=dict(beyond),
             sets=subset_catalogs(),
         )
 
-    def triples(self, name: str, matters: Callable[[Triple], bool]) -> dict[str, frozenset[Triple]]:
-        """Bundle → its triples that matter, in a derived set or as they were ingested."""
-        if name not in self._triples:
+    def triples(
+        self, name: str, matters: Callable[[Triple], bool], *, world: bool
+    ) -> dict[str, frozenset[Triple]]:
+        """Bundle → its triples that matter, in a derived set or as they were ingested.
+
+        ``world``: those beyond the graphs count, too.
+        """
+        if (name, world) not in self._triples:
             held: dict[str, list[Triple]] = {}
             known: dict[Triple, Triple] = {}  # one object for each, so that they are soon compared
             for row in self.facts["triple"]:
-                if row[1] == name:
+                if row[1] == name and (world or row[2] is not None):
                     triple = row[3:6]
                     held.setdefault(row[0], []).append(known.setdefault(triple, triple))
-            self._triples[name] = {bundle: frozenset(some) for bundle, some in held.items()}
-        of_bundles = self._triples[name]
+            self._triples[name, world] = {bundle: frozenset(some) for bundle, some in held.items()}
+        of_bundles = self._triples[name, world]
         wanted = frozenset(filter(matters, frozenset().union(*of_bundles.values())))
         return {bundle: held & wanted for bundle, held in of_bundles.items()}
 
     @cached_property
-    def _triples(self) -> dict[str, dict[str, frozenset[Triple]]]:
+    def _triples(self) -> dict[tuple[str, bool], dict[str, frozenset[Triple]]]:
         return {}
 
     @cached_property
@@ -293,11 +300,7 @@ class Snapshot:
 
     def _derived(self, name: str, bundles: frozenset[str], whole: Catalog) -> Catalog:
         """The catalog of a derived set, of the traces that have it."""
-        edges = Counter[Any]()
-        for bundle in bundles:
-            for _, of, moving, relation, src, dst, rows in self.of("triple", bundle):
-                if of == name and moving:
-                    edges[relation, src, dst] += rows
+        held = self.contents([*bundles], name)
         own = {row[2]: row for row in self.sets[name] if row[0] in bundles}
         traces = tuple(
             TraceFacts(
@@ -314,7 +317,13 @@ class Snapshot:
         )
         relations = self.relations_of(name)
         return replace(
-            whole, name=name, edges=dict(edges), traces=traces, relations=relations, lacks={}
+            whole,
+            name=name,
+            edges=held.edges,
+            beyond_edges=held.beyond_edges,
+            traces=traces,
+            relations=relations,
+            lacks={},
         )
 
     def relations_of(self, name: str) -> frozenset[str] | None:

@@ -467,24 +467,25 @@ class Collection:
         asked = (every if chosen is None else chosen) - left
         homes = {row["bundle"] for row in self.snapshot.traces if row["trace_id"] in asked}
         pruning = Pruning(compiled)
-        held = self._held(compiled.catalog.name, pruning)
+        held = self._held(compiled.catalog, pruning)
         return [b for b in self.bundles() if b in homes and pruning.may_answer(*held(b))]
 
     def _held(
-        self, name: str, pruning: Pruning
+        self, catalog: Catalog, pruning: Pruning
     ) -> Callable[[str], tuple[frozenset[Triple], Sequence[frozenset[str]]]]:
         """Tell of a bundle the triples that matter, and its kinds, under an abstraction."""
-        snapshot = self.snapshot
+        snapshot, name, world = self.snapshot, catalog.name, catalog.world
         if name and name not in snapshot.sets:
 
             def narrowed(bundle: str) -> Any:
                 whole = snapshot.contents([bundle])
                 seen = whole.under(name) or whole
+                seen = seen.in_world() if world else seen
                 triples = frozenset(filter(pruning.matters, (*seen.edges, *seen.map_edges)))
                 return triples, (seen.moving, seen.fixed, seen.mapped)
 
             return narrowed
-        triples, kinds = snapshot.triples(name, pruning.matters), snapshot.kinds
+        triples, kinds = snapshot.triples(name, pruning.matters, world=world), snapshot.kinds
         nothing = frozenset["Triple"]()
         return lambda bundle: (triples.get(bundle, nothing), kinds[bundle])
 

@@ -786,7 +786,7 @@ class Catalog:
 
     def in_world(self) -> Catalog:
         """Return the catalog in scope ``world``; the same where nothing is known beyond the graphs."""
-        if not self.beyond or self.world:
+        if self.world or not (self.beyond or self.beyond_edges):
             return replace(self, around=True)
         edges = dict(self.edges)
         for triple, many in self.beyond_edges.items():

@@ -319,6 +319,8 @@ _INFO: Final = "SELECT key, value FROM store_info"
 def facts_of(file: StoreFile, bundle: str, size: int) -> Facts:
     """Rows of a catalogue that say what is in a store.
 
+    Of triples beyond the graphs, ``moving`` is NULL.
+
     Parameters
     ----------
     file : StoreFile
@@ -357,7 +359,13 @@ def facts_of(file: StoreFile, bundle: str, size: int) -> Facts:
     }
     for name in ["", *sorted({row[0] for row in sets})]:
         seen = catalog.under(name) if name else catalog
-        for moving, table in ((True, seen.edges), (False, seen.map_edges)) if seen else ():
+        if seen is None:
+            continue
+        for moving, table in (
+            (True, seen.edges),
+            (False, seen.map_edges),
+            (None, seen.beyond_edges),
+        ):
             found["triple"] += [
                 (bundle, name, moving, *triple, n) for triple, n in sorted(table.items())
             ]
