@@ -21,7 +21,6 @@ from verb_lines import LINES, verbs
 
 import sgstore
 import sgstore.cli._process as ending
-import sgstore.store._lease as lease
 import sgstore.store._rows as rows
 from sgstore.cli import application, run
 from sgstore.demo import RECORDING
@@ -161,78 +160,82 @@ ENDLESS_IN_PYTHON: dict[str, Callable[[Store], object]] = {
 }
 
 
+ALARMED = """
+import signal, sys, threading, time
+sys.path[:0] = {paths!r}
+from sgstore.query import Store
+
 class TimeIsUpError(Exception):
-    """What a caller's own handler raises."""
+    pass
+
+def up(*_):
+    raise TimeIsUpError
+
+def alarmed(task, after=0.5):
+    signal.signal(signal.SIGALRM, up)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, after)
+        task()
+    except TimeIsUpError:
+        return
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+    raise AssertionError("nothing was interrupted")
+
+store = Store({store!r})
+"""
+"""Alarms reach the process that sets them: each test has one of its own."""
 
 
-def interrupt_readers() -> None:
-    """End whatever this process is asking of stores."""
-    for door in tuple(lease.files.values()):
-        for connection in tuple(door.cursors):
-            connection.interrupt()
+def in_a_process(code: str, store: Path) -> None:
+    """Run code after :data:`ALARMED`, and fail with what it prints."""
+    head = ALARMED.format(paths=[str(Path(__file__).parent)], store=str(store))
+    command = [sys.executable, "-c", head + code]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "done\n", "")
 
 
 @pytest.mark.parametrize("face", ENDLESS_IN_PYTHON)
 def test_what_a_handler_of_signals_raises_ends_a_question_of_the_library(
     face: str, town_store: Path
 ) -> None:
-    def up(*_: object) -> None:
-        raise TimeIsUpError
-
-    store = Store(town_store)
-    late = threading.Timer(20, interrupt_readers)
-    before = signal.signal(signal.SIGALRM, up)
-    late.start()
-    try:
-        signal.setitimer(signal.ITIMER_REAL, 0.5)
-        start = time.monotonic()
-        with pytest.raises(TimeIsUpError):
-            ENDLESS_IN_PYTHON[face](store)
-        assert time.monotonic() - start < 15
-    finally:
-        late.cancel()
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-
-    assert store.sql("SELECT count(*) FROM frames").values == [(750,)]
+    code = f"""
+from test_cli_ending import ENDLESS_IN_PYTHON
+alarmed(lambda: ENDLESS_IN_PYTHON[{face!r}](store))
+assert store.sql("SELECT count(*) FROM frames").values == [(750,)]
+print("done")
+"""
+    in_a_process(code, town_store)
 
 
 def test_a_handler_that_raises_nothing_changes_no_answer(town_store: Path) -> None:
-    came = []
-    before = signal.signal(signal.SIGALRM, lambda *_: came.append(1))
-    try:
-        signal.setitimer(signal.ITIMER_REAL, 0.01, 0.01)
-        found = Store(town_store).sql("SELECT count(*), sum(a.x) > 0 FROM nodes a, range(100)")
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-
-    (nodes,) = Store(town_store).sql("SELECT count(*) FROM nodes").values[0]
-    assert came
-    assert found.values[0][0] == 100 * nodes
+    code = """
+came = []
+signal.signal(signal.SIGALRM, lambda *_: came.append(1))
+signal.setitimer(signal.ITIMER_REAL, 0.01, 0.01)
+found = store.sql("SELECT count(*), sum(a.x) > 0 FROM nodes a, range(100)")
+signal.setitimer(signal.ITIMER_REAL, 0)
+(nodes,) = store.sql("SELECT count(*) FROM nodes").values[0]
+assert came
+assert found.values[0][0] == 100 * nodes
+print("done")
+"""
+    in_a_process(code, town_store)
 
 
 def test_one_thread_does_the_steps_of_all_questions_even_after_an_interruption(
     town_store: Path,
 ) -> None:
-    def up(*_: object) -> None:
-        raise TimeIsUpError
-
-    store = Store(town_store)
-    assert store.sql("SELECT 1").values == [(1,)]
-    threads = threading.active_count()
-    before = signal.signal(signal.SIGALRM, up)
-    try:
-        with store.file.snapshot():  # opened before: only a step is interrupted
-            signal.setitimer(signal.ITIMER_REAL, 0.5)
-            with pytest.raises(TimeIsUpError):
-                store.sql(PAIRS)
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-
-    assert [store.sql(f"SELECT {n}").values for n in range(20)] == [[(n,)] for n in range(20)]
-    assert threading.active_count() == threads
+    code = f"""
+assert store.sql("SELECT 1").values == [(1,)]
+threads = threading.active_count()
+with store.file.snapshot():  # opened before: only a step is interrupted
+    alarmed(lambda: store.sql({PAIRS!r}))
+assert [store.sql(f"SELECT {{n}}").values for n in range(20)] == [[(n,)] for n in range(20)]
+assert threading.active_count() == threads
+print("done")
+"""
+    in_a_process(code, town_store)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="nothing is forked off here")
@@ -356,13 +359,13 @@ def test_every_verb_that_asks_heeds_its_bounds_and_leaves_nothing_where_time_is_
         given = [word.format(**files, new=tmp_path / folder / "new") for word in words]
         return run([*verb.split(), *given, *bounds])
 
-    assert end("whole", "--max-spill", "3GB", "--timeout", "60s") == 0
+    assert end("whole", "--max-spill", "3GB", "--timeout", "600s") == 0
     assert {bound for bound in opened if bound} == {"2929687KiB"}
     assert any((tmp_path / "whole").iterdir()) == (verb != "why-not")
     capsys.readouterr()
     asked[0], last[0] = 0, asked[0]
-    assert end("late", "--timeout", "60s") == 2
-    assert "stopped after 60 s" in capsys.readouterr().err
+    assert end("late", "--timeout", "600s") == 2
+    assert "stopped after 600 s" in capsys.readouterr().err
     assert not list((tmp_path / "late").iterdir())
 
 
@@ -403,7 +406,7 @@ LARGE = "SELECT repeat('x', 1000) || i AS t FROM range(300000) r(i) ORDER BY has
 def test_a_question_that_needs_more_disk_than_it_may_says_what_to_do(
     town_store: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(["sql", str(town_store), LARGE, "--max-spill", "2MB", "--timeout", "60s"]) == 2
+    assert run(["sql", str(town_store), LARGE, "--max-spill", "2MB", "--timeout", "600s"]) == 2
     told = " ".join(capsys.readouterr().err.split())
     assert told.startswith("sgstore: stopped: it needs more")
     assert "--max-spill 50GB" in told
