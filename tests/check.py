@@ -56,7 +56,7 @@ TESTS = {
     "readers": "osi osi_* carla carla_* carlasgg autoware foxglove commonroad sumo cdr flavours"
     " stamps identity",
     "rebuild": "rebuilding",
-    "relations": "relations relations_* motion bodies",
+    "relations": "relations relations_* motion bodies bounds",
     "roads": "roads roads_* lane_dist lane_places lane_courses roundabouts",
     "schema": "schema views views_page open_names",
     "segments": "ingest ingest_many",

@@ -1,0 +1,79 @@
+"""Bounds of relations: ingest, ``derive`` and ``dist`` agree on entities that are exactly at a bound."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from recordings import Recorder, car
+
+import sgstore
+from sgstore.config import configured
+from sgstore.derive import derive
+from sgstore.ingest import ingest
+
+BOUNDS = st.integers(21, 400).map(lambda tenths: tenths / 10)
+"""In metres; 32 bits hold most of them as less or more than the text."""
+ORIGINS = st.sampled_from([0.0, 0.1, -3.7, 1234.5, 691_608.3, 5_334_000.7])
+
+DIRECTIONS = ((1.0, 0.0), (0.0, -1.0), (0.6, 0.8), (-0.8, 0.6), (math.sqrt(0.5), math.sqrt(0.5)))
+STEPS = (-1, 0, 1)
+"""Of the last of 32 bits, from the bound."""
+
+EDGES = "SELECT frame_id, src, dst FROM edges WHERE relation = 'near_coll'"
+DERIVED = """
+SELECT (e.bucket << 6) + b.bit, e.src, e.dst FROM inside.derived_edge e
+JOIN inside.bits b ON (e.mask & b.m) <> 0 WHERE e.set_name = 'bound' AND e.relation = 'near_coll'
+"""
+PAIRS = "SELECT frame_id, src, dst FROM pairs WHERE distance <= {0!r}"
+FOUND = "MATCH (a:Vehicle), (b:Vehicle) WHERE dist(a, b) <= {0!r} RETURN frame.id, a.id, b.id"
+
+
+def _record(path: Path, bound: float, origin: float) -> None:
+    """In each frame a car is at the bound from the ego, or one step beside it."""
+    near = [float(np.float32(bound) + step * np.spacing(np.float32(bound))) for step in STEPS] + [
+        bound
+    ]
+    with Recorder(path) as recorder:
+        for number, (distance, (x, y)) in enumerate((d, way) for d in near for way in DIRECTIONS):
+            things = [
+                car(1, origin, -origin),
+                car(2, origin + x * distance, -origin + y * distance),
+            ]
+            recorder.ground_truth(number / 10, things, host=1)
+
+
+def _store(folder: Path, name: str, config: Any) -> Any:
+    (outcome,) = ingest(folder / name, [str(folder / "drive.mcap")], config=config)
+    assert outcome.error is None
+    return sgstore.open(folder / name)
+
+
+@given(bound=BOUNDS, origin=ORIGINS)
+@example(bound=6.5, origin=0.0)
+@example(bound=8.3, origin=0.1)
+@example(bound=6.7, origin=5_334_000.7)
+@settings(max_examples=6, deadline=None)
+def test_what_is_exactly_at_a_bound_is_the_same_by_ingest_derive_and_dist(
+    bound: float, origin: float
+) -> None:
+    of = configured(proximity={"names": ["near_coll"], "upper": [bound]}, pairs={"within": bound})
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        _record(folder / "drive.mcap", bound, origin)
+        ingested, plain = _store(folder, "of.sgstore", of), _store(folder, "plain.sgstore", None)
+        derive(folder / "plain.sgstore", of, "bound")
+
+        edges = set(ingested.sql(EDGES).values)
+        assert edges == set(plain.sql(DERIVED).values)
+        assert edges == set(plain.sql(PAIRS.format(bound)).values)
+        found = [tuple(row) for row in ingested.find(FOUND.format(bound)).rows()]
+        assert len(found) == len(edges)
+        assert {frame for frame, _, _ in found} == {frame for frame, _, _ in edges}
+        # Something is on either side of the bound.
+        assert 0 < len(edges) < 2 * len(DIRECTIONS) * (len(STEPS) + 1)
