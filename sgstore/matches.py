@@ -269,7 +269,7 @@ class Matches(Tabular):
         with self._compiled() as compiled:
             chosen = {trace.trace_id for trace in compiled.chosen}
             traces = (one for one in self._file.traces() if one.trace_id in chosen)
-            return scope_of(traces, world=compiled.bound.world)
+            return scope_of((one.report for one in traces), world=compiled.bound.world)
 
     def __iter__(self) -> Iterator[Row]:
         return self._rows(whole=False)

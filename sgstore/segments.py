@@ -104,6 +104,8 @@ class TraceOutcome:
         What is odd but lost nothing.
     losses : list of Loss
         What of the recording could not be used.
+    scope : dict
+        States that settings cut, as the report of the trace counts them; empty if it failed.
     error : SgstoreError or None
         Why it failed.
     """
@@ -120,6 +122,7 @@ class TraceOutcome:
     seconds: float = 0.0
     warnings: list[str] = field(default_factory=list[str])
     losses: list[Loss] = field(default_factory=list[Loss])
+    scope: dict[str, Any] = field(default_factory=dict[str, Any])
     error: SgstoreError | None = None
 
     def __repr__(self) -> str:
@@ -444,7 +447,8 @@ class SegmentReader:
         if name is None:
             return True
         outcome.status, outcome.name = "present", name
-        outcome.frames = store.trace(name).frames
+        stored = store.trace(name)
+        outcome.frames, outcome.scope = stored.frames, stored.report.get("scope", {})
         return False
 
     # Building -------------------------------------------------------------------------------------------------
@@ -537,6 +541,7 @@ class SegmentReader:
             outcome.warnings += warnings
             outcome.losses += [*report.losses, *one.crowds.losses(self._job.config)]
             kept = replace(report, warnings=outcome.warnings, losses=outcome.losses, about_ego=[])
+            outcome.scope = segment.scope.get("scope", {})
             segment.seal(kept, told, parked)
             outcome.status = "sealed"
 

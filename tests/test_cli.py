@@ -608,3 +608,32 @@ def test_find_and_check_say_what_settings_left_out(
         scope |= {"scope": cut.split()[1][:-1], "radius": 50.0, "world": 200.0, "excluded": {}}
         assert told == [{"scope": scope}]
         assert json.loads(out)
+
+
+def test_ingest_and_info_say_what_settings_cut(tmp_path: Path, sgstore: Any) -> None:
+    short = tmp_path / "short.toml"
+    short.write_text("[range]\nradius = 10\nworld = 20")
+    place = tmp_path / "new.sgstore"
+    read = ("ingest", place, SAMPLE, "--config", short)
+    lines = [
+        [line for line in sgstore(*words)[2].splitlines() if "lie beyond" in line]
+        for words in (read, read, ("info", place))
+    ]
+    scopes: list[Any] = []
+    for words in (read, ("info", place)):
+        _, out, err = sgstore(*words, "--json")
+        (row,) = json.loads(out)
+        told = [json.loads(line)["scope"] for line in err.splitlines() if line.startswith("{")]
+        assert told == [row["scope"]]
+        scopes += told
+
+    scope = scopes[0]
+    assert scopes == [scope, scope]
+    assert scope["beyond_radius"] > scope["beyond_world"] > 0
+    assert lines == 3 * [
+        [
+            f"sgstore: scope: {scope['beyond_radius']:,} of {scope['states']:,} states"
+            " lie beyond the graphs (10 m),"
+            f" {scope['beyond_world']:,} of {scope['states']:,} states lie beyond the world (20 m)"
+        ]
+    ]

@@ -185,7 +185,7 @@ def _reported(
         typer.echo(run.explain())
         return 0
     say_notes(run.notes)
-    say_scope(run, ask)
+    say_scope(getattr(run, "scope", {}), ask.chosen)
     tally = {"true": 0, "false": 0}
     kept: list[Verdict] = []
     absent: dict[str, int] = {}

@@ -828,14 +828,13 @@ def say_left_out(
     say_notes(getattr(matches, "notes", ()))
 
 
-def say_scope(asked: object, ask: AskOptions) -> None:
+def say_scope(found: Mapping[str, Any], chosen: Format) -> None:
     """Say in one line what settings left out of what is asked; as JSON where results are."""
     from sgstore.store import scope_text
 
-    found = getattr(asked, "scope", {})
     if not found:
         return
-    if ask.chosen in {Format.json, Format.ndjson}:
+    if chosen in {Format.json, Format.ndjson}:
         say_json({"scope": found})
     else:
         say(scope_text(found))

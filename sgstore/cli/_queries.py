@@ -119,7 +119,7 @@ def find(
             number = matches.count()
             typer.echo(number)
             return NO_MATCH if require and not number else 0
-        say_scope(matches, ask)
+        say_scope(getattr(matches, "scope", {}), ask.chosen)
         if ask.chosen in BINARY and not matches.graphs:
             number = write_binary(matches.parquet, ask.chosen, ask.output)
         elif not each_frame and on_terminal(ask) and _returns_nothing(text):

@@ -25,6 +25,7 @@ from sgstore.cli._options import (
     app,
     jobs_of,
     lines_of,
+    say_scope,
     seconds_of,
 )
 from sgstore.cli._output import Format, complain, quiet, say, write_document, write_report
@@ -32,7 +33,7 @@ from sgstore.cli._places import note_asked, url_of
 from sgstore.errors import StoreError, place_named
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterator
+    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 
     from sgstore.segments import TraceOutcome
     from sgstore.store import StoreFile
@@ -118,13 +119,32 @@ def ingest(
 
 def _told(outcomes: list[TraceOutcome], out: PrintedRows) -> int:
     """Print what became of recordings; the exit code."""
+    from sgstore.store import scope_of
+
     for outcome in outcomes:
         _say_what_was_odd(outcome)
+    reports = [{"scope": outcome.scope} if outcome.scope else {} for outcome in outcomes]
+    say_scope(scope_of(reports, world=None), out.chosen)
     columns = ("trace", "status", "ego", "frames", "entities", "seconds", "losses", "file")
-    out.write(columns, map(_outcome_row, outcomes), totals={"frames": "frames", "losses": "losses"})
+    rows = map(_outcome_row, outcomes)
+    totals = {"frames": "frames", "losses": "losses"}
+    out.write(*_with_scopes(columns, rows, reports, out), totals=totals)
     if any(outcome.error for outcome in outcomes):
         return ERROR
     return LOSS if any(outcome.losses for outcome in outcomes) else 0
+
+
+def _with_scopes(
+    columns: tuple[str, ...],
+    rows: Iterable[tuple[Any, ...]],
+    reports: Iterable[Mapping[str, Any]],
+    out: PrintedRows,
+) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
+    """Columns and rows with the counts of what settings cut, where programs read them."""
+    if out.chosen not in {Format.json, Format.ndjson}:
+        return columns, rows
+    scopes = (one.get("scope") for one in reports)
+    return (*columns, "scope"), ((*row, its) for row, its in zip(rows, scopes, strict=True))
 
 
 def _landed(
@@ -200,35 +220,30 @@ def info(
     if (url := url_of(store)) is not None:
         _tell_of_collection(url, traces or [], out)
         return 0
-    from sgstore.store import StoreFile
+    from sgstore.store import StoreFile, scope_of
 
     file = StoreFile(store)
     if traces:
         _tell_all_of(file, traces, out)
         return 0
     columns = ("trace", "frames", "seconds", "ego", "map", "flavour", "losses", "trace_id", "file")
-    for one in file.traces():
+    stored = file.traces()
+    reports = [one.report for one in stored]
+    say_scope(scope_of(reports, world=None), out.chosen)
+    for one in stored:
         jumps, gaps = one.report.get("clock_jumps", 0), one.report.get("gaps", 0)
         if jumps or gaps:
             say(f"{one.name}: clock jumps: {jumps}, gaps: {gaps}; info --trace lists them")
-    out.write(
-        columns,
+    rows = (
         (
-            (
-                one.name,
-                one.frames,
-                round((one.end_ns - one.start_ns) / 1e9, 3),
-                one.ego,
-                one.map,
-                one.flavour,
-                len(one.report["losses"]),
-                one.trace_id,
-                str(one.path),
-            )
-            for one in file.traces()
-        ),
-        totals={"frames": "frames", "seconds": "s", "losses": "losses"},
+            *(one.name, one.frames, round((one.end_ns - one.start_ns) / 1e9, 3)),
+            *(one.ego, one.map, one.flavour, len(one.report["losses"])),
+            *(one.trace_id, str(one.path)),
+        )
+        for one in stored
     )
+    totals = {"frames": "frames", "seconds": "s", "losses": "losses"}
+    out.write(*_with_scopes(columns, rows, reports, out), totals=totals)
     return 0
 
 

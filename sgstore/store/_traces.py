@@ -283,24 +283,25 @@ def located(
     return path
 
 
-def scope_of(traces: Iterable[StoredTrace], *, world: bool) -> dict[str, Any]:
+def scope_of(reports: Iterable[Mapping[str, Any]], *, world: bool | None) -> dict[str, Any]:
     """What the settings of some traces left out of a question, counted; empty where that is nothing.
 
     Parameters
     ----------
-    traces : iterable of StoredTrace
-        Those that are asked.
-    world : bool
-        Whether all that is known is asked, and not the graphs alone.
+    reports : iterable of mapping
+        Reports of the traces that are asked.
+    world : bool or None
+        Whether all that is known is asked, and not the graphs alone; ``None``: no question is asked.
 
     Returns
     -------
     dict
-        ``scope`` (``graph`` or ``world``), ``radius`` and ``world`` (m; ``None`` where traces differ),
-        ``states``, ``beyond_radius``, ``beyond_world`` and ``excluded`` (kind → states), ``rate`` (Hz).
+        ``scope`` (``graph`` or ``world``; not without a question), ``radius`` and ``world`` (m; ``None`` where
+        traces differ), ``states``, ``beyond_radius``, ``beyond_world`` and ``excluded`` (kind → states),
+        ``rate`` (Hz).
     """
-    told = [one.report["scope"] for one in traces if "scope" in one.report]
-    found: dict[str, Any] = {"scope": "world" if world else "graph"}
+    told = [one["scope"] for one in reports if "scope" in one]
+    found: dict[str, Any] = {} if world is None else {"scope": "world" if world else "graph"}
     for name in ("radius", "world", "rate"):
         values = {one[name] for one in told}
         found[name] = values.pop() if len(values) == 1 else None
@@ -318,16 +319,16 @@ def scope_text(found: Mapping[str, Any]) -> str:
     """What settings left out, as :func:`scope_of` has it, in one line."""
     if not found:
         return ""
-    world, states = found["scope"] == "world", f"of {found['states']:,} states"
+    scope, states = found.get("scope", ""), f"of {found['states']:,} states"
     parts: list[str] = []
-    if beyond := found["beyond_world" if world else "beyond_radius"]:
-        what, far = ("the world", found["world"]) if world else ("the graphs", found["radius"])
-        parts.append(
-            f"{beyond:,} {states} lie beyond {what}{'' if far is None else f' ({far:g} m)'}"
-        )
+    for of, what, reach in (("graph", "the graphs", "radius"), ("world", "the world", "world")):
+        beyond, far = found[f"beyond_{reach}"], found[reach]
+        if beyond and scope in {of, ""}:
+            range_text = "" if far is None else f" ({far:g} m)"
+            parts.append(f"{beyond:,} {states} lie beyond {what}{range_text}")
     parts += [f"{many:,} of {kind} are excluded" for kind, many in found["excluded"].items()]
     parts += [f"frames are kept at {found['rate']:g} Hz"] if found["rate"] else []
-    return f"scope {found['scope']}: {', '.join(parts)}"
+    return f"{f'scope {scope}'.rstrip()}: {', '.join(parts)}"
 
 
 def stored_traces(

@@ -277,7 +277,7 @@ class Segment:
             "origin_y": origin.y,
             "origin_z": origin.z,
             "answers": list(self._answers),
-            "report": packing.as_json(asdict(report) | self._scope() | dict(more or {})),
+            "report": packing.as_json(asdict(report) | self.scope | dict(more or {})),
             "version": version("sgstore"),
         }  # fmt: skip
         words, path = staging.words(self._answers), self._info.path
@@ -285,8 +285,9 @@ class Segment:
         sealed.write()
         return sealed
 
-    def _scope(self) -> dict[str, Any]:
-        """What settings left out of the recording, as the report has it; nothing of an import."""
+    @property
+    def scope(self) -> dict[str, Any]:
+        """What settings left out so far, as the report has it; nothing of an import."""
         counts, settings = self._left_out, json.loads(self._identity.settings)
         if not counts.states:
             return {}

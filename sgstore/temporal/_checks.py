@@ -550,7 +550,7 @@ class CheckRun:
         """What settings left out of the traces that are asked; see :func:`sgstore.store.scope_of`."""
         world = any(one.check.world for one in self._checks)
         with self._file.snapshot():
-            return scope_of(self._file.traces(), world=world)
+            return scope_of((one.report for one in self._file.traces()), world=world)
 
     def __iter__(self) -> Iterator[Verdict]:
         with self._file.snapshot():
