@@ -265,6 +265,61 @@ def test_an_abstraction_has_a_world_around_it(near: Store, wide: Store) -> None:
     assert found == rows(wide, text)
 
 
+TWO_FAR: Final = Scene(
+    WAYS,
+    ego(along(RIGHT), 20),
+    actor("v", along(RIGHT), 20, start=80),
+    actor("w", along(LEFT), 20, start=82),
+    seconds=1,
+)
+
+
+def judged(folder: Path, text: str, limit: float) -> str:
+    """The verdict of a store and of a monitor on two vehicles 80 m ahead of the ego."""
+    config = ranged(limit, 200)
+    store = store_of(folder / f"{len(text)}.sgstore", {"road": [TWO_FAR]}, {"road": config})
+    monitor = Monitor(text, TWO_FAR.road, config)
+    for frame in replayed([TWO_FAR.block()]):
+        monitor.step(frame)
+    (watched,), (found,) = monitor.finish(), store.check(text)
+    assert found.verdict == watched.verdict
+    return found.verdict
+
+
+@pytest.mark.parametrize(
+    ("asked", "expected"),
+    [
+        ("NOT EXISTS {(ego)-[:sees]->(v)}", "unknown"),
+        ("EXISTS {(ego)-[:sees]->(v)}", "unknown"),
+        ("EXISTS {(v)-[:sees]->(w:Vehicle)}", "unknown"),
+        ("NOT EXISTS {(v)-[:inDFrontOf]->(ego)}", "unknown"),
+        ("NOT EXISTS {(v)-[:toLeftOf|toRightOf]-(ego)}", "unknown"),
+        ("COUNT {(ego)-[:sees]->(w:Vehicle)} < 1", "unknown"),
+        ("NOT EXISTS {(v)-[:near|overlaps]-(ego)}", "true"),
+        ("EXISTS {(v)-[:near|overlaps]-(ego)}", "false"),
+        ("(dist(ego, v) > 50 OR EXISTS {(ego)-[:sees]->(v)})", "true"),
+    ],
+)
+def test_a_relation_that_was_not_computed_beyond_the_graph_is_unknown(
+    tmp_path: Path, asked: str, expected: str
+) -> None:
+    text = f"CHECK c: FORALL (v:Vehicle) ALWAYS {asked}"
+    assert judged(tmp_path, text, 50) == expected
+
+
+def test_nothing_is_beyond_a_graph(tmp_path: Path) -> None:
+    text = "CHECK c: FORALL (v:Vehicle) ALWAYS NOT EXISTS {(v)-[:sees]->(ego)}"
+    assert judged(tmp_path, text, 50) == "unknown"
+    assert judged(tmp_path, f"USING SCOPE graph {text}", 50) == "true"
+
+
+@pytest.mark.parametrize(("limit", "expected"), [(50, "unknown"), (200, "false")])
+def test_two_beyond_the_graph_may_be_near(tmp_path: Path, limit: float, expected: str) -> None:
+    rungs = "near|very_near|super_near|near_coll"
+    text = f"CHECK c: ALWAYS NOT EXISTS {{(v:Vehicle)-[:{rungs}]->(w:Vehicle)}}"
+    assert judged(tmp_path, text, limit) == expected
+
+
 # Recordings ----------------------------------------------------------------------------------------
 
 

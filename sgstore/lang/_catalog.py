@@ -234,6 +234,15 @@ def _named(attributes: Iterable[Attribute]) -> Mapping[str, Attribute]:
     return {normalize_name(attribute.name): attribute for attribute in attributes}
 
 
+IN_GRAPH: Final = Attribute(
+    "in_graph",
+    Type.boolean,
+    {Home.state: "in_graph"},
+    "whether it is in the graph of the frame, in scope ``world``",
+    own_kinds=_ENTITIES,
+)
+"""Of queries made here alone: who writes one has the scope."""
+
 NODE_ATTRIBUTES: Final = _named(
     (
         Attribute("id", Type.number, {}, "node id, unique in its trace", DisplayUnit.binding),

@@ -33,7 +33,7 @@ _FAR: Final = 200.0 + BODY
 """How far distances along the lanes are known; m."""
 WAITING: Final = 200.0
 """How far ahead a light or sign of its lane is at most that somebody has to mind; m."""
-_LINKS: Final = dict.fromkeys(PROXIMITY, 25.0 + BODY) | {
+LINKS: Final = dict.fromkeys(PROXIMITY, 25.0 + BODY) | {
     **dict.fromkeys(("leads", "follows"), 100.0 + BODY),
     "overlaps": 2 * BODY,
 }
@@ -189,9 +189,9 @@ class _Looking:
             found = found.both(self.place(part, key, wanted=True))
         for edge in scope.edges:
             ends = {edge.src, edge.dst}
-            if key in ends and edge.relations <= _LINKS.keys():
+            if key in ends and edge.relations <= LINKS.keys():
                 other = next(iter(ends - {key}), key)
-                reach = max(_LINKS[name] for name in edge.relations)
+                reach = max(LINKS[name] for name in edge.relations)
                 found = found.both(_Place(reach + self.known.get(other, math.inf)))
         if _joined(scope, key, self.known):
             found = found.both(_Place(lanes=True))

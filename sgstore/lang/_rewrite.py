@@ -12,6 +12,7 @@ from itertools import combinations, pairwise, product
 from typing import TYPE_CHECKING, Any, Final, TypeGuard
 
 from sgstore.lang._catalog import (
+    IN_GRAPH,
     NODE_ATTRIBUTES,
     Attribute,
     Catalog,
@@ -81,6 +82,7 @@ def rewritten(query: Query, catalog: Catalog) -> Query:
 def _ruled(query: Query, catalog: Catalog) -> Query:
     unfold = partial(unfold_paths, injective=query.injective)
     for rule in (
+        nothing_beyond,
         push_negations,
         counts_to_existence,
         unfold,
@@ -198,6 +200,17 @@ def _in_scopes(rule: _Rule, query: Query, catalog: Catalog) -> Query:
 
 
 # Conditions ----------------------------------------------------------------------------------------
+
+
+def nothing_beyond(scope: Scope, catalog: Catalog) -> Scope:
+    """In scope ``graph``, and where nothing is known beyond the graphs, all are in the graph."""
+
+    def known(value: Bound) -> Bound:
+        if isinstance(value, NodeAttribute) and value.attribute is IN_GRAPH:
+            return Value(value=True, type=Type.boolean)
+        return with_operands(value, known)
+
+    return scope if catalog.world else replace(scope, where=tuple(map(known, scope.where)))
 
 
 def push_negations(scope: Scope, _: Catalog) -> Scope:

@@ -1,7 +1,8 @@
 """Conditions under which a value of one frame is unknown, though its entities are there.
 
 A value is *unknown* where something that is measured (a speed, a size, the weather) is not recorded of an
-entity. A value that does not exist is not unknown: two vehicles that draw apart have no time to collision.
+entity, or where a relation was not computed, as an entity is beyond the graph. A value that does not exist is
+not unknown: two vehicles that draw apart have no time to collision.
 """
 
 from __future__ import annotations
@@ -11,10 +12,11 @@ from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Final
 
 from sgstore.lang import ir as b
-from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit, Type
+from sgstore.lang._catalog import IN_GRAPH, NODE_ATTRIBUTES, DisplayUnit, Type
+from sgstore.lang._horizon import LINKS
 from sgstore.lang._needs import MEASURED, MOTION
 from sgstore.pair_numbers import columns_needed
-from sgstore.vocabulary import normalize_name
+from sgstore.vocabulary import BEYOND, MAP_ONLY, entity_kinds, normalize_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -26,6 +28,8 @@ _ANSWERS: Final = frozenset({"IS NULL", "IS NOT NULL", "coalesce", "case"})
 """Operations whose value is known even of unknown operands."""
 
 _FLIPPED: Final = {"<": ">=", "<=": ">", ">": "<=", ">=": "<", "=": "<>", "<>": "="}
+_COMPUTED: Final = frozenset({*BEYOND, *MAP_ONLY, "mayAffect"})
+"""Relations that are known beyond the graphs as they are in them."""
 _FALSE: Final = b.Value(value=False, type=Type.boolean)
 _LOOSE: Final = 1 << 20
 """Added to the number of a block that also has the matches of which too little is known."""
@@ -234,20 +238,62 @@ def _unmeasured(node: str, name: str, value: b.Bound) -> b.Bound:
 
 @lru_cache(maxsize=1024)
 def _of_block(block: b.BlockValue) -> tuple[b.Bound, ...]:
-    """The condition that braces have a match of which too little is known, once as one object."""
+    """The conditions that braces have a match of which too little is known, each once as one object."""
     where = tuple(map(pushed, block.scope.where))
     doubts = [one for part in where for leaf in _smallest(part) for one in _unknown(leaf)]
     if block.value is not None:
         doubts += _unknown(block.value)
-    if not doubts:
-        return ()
-    found = (*map(possible, where), any_of(dict.fromkeys(doubts)))
-    exists = replace(
+    found: list[b.Bound] = []
+    if doubts:
+        wanted = (*map(possible, where), any_of(dict.fromkeys(doubts)))
+        found.append(_exists(block, block.scope.edges, wanted, _LOOSE))
+    apart = {edge.key: one for edge in block.scope.edges if (one := _not_computed(edge, block))}
+    if apart:
+        rest = tuple(edge for edge in block.scope.edges if edge.key not in apart)
+        told = (one for one in where if not _edges_of(one) & apart.keys())
+        wanted = (*map(possible, told), any_of(dict.fromkeys(apart.values())))
+        found.append(_exists(block, rest, wanted, 2 * _LOOSE))
+    return tuple(found)
+
+
+def _exists(
+    block: b.BlockValue, edges: tuple[b.Edge, ...], where: tuple[b.Bound, ...], number: int
+) -> b.Bound:
+    """The condition that braces have a match, with other edges and conditions."""
+    if not block.scope.nodes and not edges:
+        return where[0] if len(where) == 1 else b.Operation("AND", where, Type.boolean)
+    scope = replace(block.scope, edges=edges, where=where)
+    return replace(
         block,
         word="EXISTS",
-        scope=replace(block.scope, where=found),
+        scope=scope,
         value=None,
         type=Type.boolean,
-        number=block.number + _LOOSE,
+        number=block.number + number,
     )
-    return (exists,)
+
+
+def _edges_of(condition: b.Bound) -> frozenset[str]:
+    """Keys of the edges that a condition speaks of."""
+    parts = (part for part in b.walk(condition))
+    return frozenset(p.edge for p in parts if isinstance(p, b.EdgeRelation | b.EdgeAttribute))
+
+
+def _not_computed(edge: b.Edge, block: b.BlockValue) -> b.Bound | None:
+    """The condition that an edge in braces was not computed, as an end of it is beyond the graph.
+
+    A relation that ends at some distance does not hold of entities that are farther apart.
+    """
+    names = edge.relations - _COMPUTED
+    ends = [block.scope.kinds(key).every & entity_kinds() for key in (edge.src, edge.dst)]
+    if not edge.known or not names or not all(ends):
+        return None
+    far = any_of(
+        [_not(b.NodeAttribute(key, IN_GRAPH, Type.boolean)) for key in (edge.src, edge.dst)]
+    )
+    limits = [LINKS.get(name) for name in names]
+    if edge.high > 1 or None in limits:
+        return far
+    limit = b.Value(max(one for one in limits if one is not None), Type.number)
+    apart = b.PairNumber("dist", edge.src, edge.dst)
+    return _both(far, b.Operation("<=", (apart, limit), Type.boolean))
