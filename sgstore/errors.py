@@ -103,6 +103,22 @@ class TraceError(SgstoreError):
         super().__init__(f"{', '.join(where)}: {reason}" if where else reason)
 
 
+INTERRUPTIONS: Final = ("Query interrupted", "KeyboardInterrupt", "INTERRUPT Error")
+"""Words of the database for an interruption, which it turns into errors of its own."""
+
+
+def is_interruption(error: BaseException | None) -> bool:
+    """Return true if an error is due to the end of the run."""
+    while error is not None:
+        of_database = isinstance(error, RuntimeError) or "duckdb" in type(error).__module__
+        if of_database and any(words in str(error) for words in INTERRUPTIONS):
+            return True
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
 def failure(error: Exception, path: str | Path) -> SgstoreError:
     """The error for which one recording of a batch fails.
 
@@ -112,7 +128,14 @@ def failure(error: Exception, path: str | Path) -> SgstoreError:
         Any exception that reading the recording raised; an :class:`SgstoreError` is returned as it is.
     path : str or Path
         The recording.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        The error is due to the end of the run.
     """
+    if is_interruption(error):
+        raise KeyboardInterrupt from error
     if isinstance(error, SgstoreError):
         return error
     words = f"unexpected {type(error).__name__}: {error}; report it to the developers of sgstore"

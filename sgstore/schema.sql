@@ -223,7 +223,7 @@ CREATE TABLE map_node (
   map_id BIGINT NOT NULL, node_id INTEGER NOT NULL, kind kind NOT NULL, name VARCHAR, -- name: 'road/section/lane' of a lane, else the id in the map
   x DOUBLE, y DOUBLE, z DOUBLE, heading DOUBLE,                -- a point on it, and its direction there
   lane_type VARCHAR, road VARCHAR, section INTEGER, lane INTEGER, junction VARCHAR, turn VARCHAR,
-  length DOUBLE, width DOUBLE, speed_limit DOUBLE, curvature DOUBLE);   -- m, m (mean), m/s, 1/m
+  length FLOAT, width FLOAT, speed_limit FLOAT, curvature DOUBLE);   -- m, m (mean), m/s, 1/m
 
 CREATE TABLE map_edge (                                        -- holds in a frame where both its ends are present
   map_id BIGINT NOT NULL, relation relation NOT NULL, src_kind kind NOT NULL, dst_kind kind NOT NULL, src INTEGER NOT NULL, dst INTEGER NOT NULL);

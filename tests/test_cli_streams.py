@@ -172,7 +172,7 @@ def test_a_process_as_a_shell_starts_it_ends_in_order(redirection: str, files) -
 @pytest.mark.parametrize("form", some(["table", "csv", "arrow", "ndjson", "json", "parquet"], 2))
 def test_a_reader_that_has_seen_enough_is_no_error(form: str, files) -> None:
     find = f"'{sys.executable}' -m sgstore find '{files['store']}' 'MATCH (e:Ego), (v:Vehicle)'"
-    line = f"set -o pipefail; {find} --format {form} | head -c 10 > /dev/null"
+    line = f"set -o pipefail; {find} --quiet --format {form} | head -c 10 > /dev/null"
 
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=False)
 

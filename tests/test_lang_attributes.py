@@ -6,6 +6,7 @@ import math
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 from thorough import LONG, some
 
@@ -19,6 +20,7 @@ from sgstore.lang._catalog import (
     DisplayUnit,
 )
 from sgstore.lang._evaluate import evaluator
+from sgstore.lang._precision import Precision, precision_of
 from sgstore.lang.ir import FrameAttribute, NodeAttribute, TraceAttribute
 from sgstore.pair_numbers import PAIR_FUNCTIONS
 from sgstore.vocabulary import MAP_KINDS
@@ -210,6 +212,12 @@ def forms(name: str, some: Any, kind: Type) -> dict[str, Any]:
     return found
 
 
+def in_store(value: Any, attribute: Attribute) -> Any:
+    """A number of 32 bits as the store keeps it: results print its shortest text."""
+    is_kept = precision_of(NodeAttribute("n", attribute, attribute.type)) is Precision.float32
+    return float(np.float32(value)) if is_kept and value is not None else value
+
+
 def some_of(values: list[Any], attribute: Attribute) -> Any:
     """A value that occurs; if nothing of the sample has one, one that could."""
     known = [value for value in values if value is not None]
@@ -224,7 +232,7 @@ def test_an_attribute_in_every_form(
     asking = plainly(name, pattern)
     keys = asking.split(" RETURN ")[1].removesuffix(f", {name} AS value")
     plain = found(asking)
-    values = [row[-1] for row in plain]
+    values = [in_store(row[-1], attribute) for row in plain]
     some = some_of(values, attribute)
     asked = forms(name, some, attribute.type)
     wanted = [tuple(test(value) for test in asked.values()) for value in values]
@@ -266,7 +274,7 @@ def test_an_attribute_in_what_is_returned(
         wanted += [min(known, default=None), max(known, default=None)]
     if attribute.type is Type.number:
         counts.append(f"SUM({name})")
-        wanted.append(sum(known) if known else None)
+        wanted.append(sum(in_store(one, attribute) for one in known) if known else None)
     (row,) = store.find(f"{pattern} RETURN {', '.join(counts)}").rows()
     assert all(map(same, row, wanted)), (row, wanted)
     grouped = store.find(f"{pattern} RETURN {name} AS value, COUNT(*) AS many").rows()

@@ -91,7 +91,7 @@ def test_values_over_matches_are_what_their_definition_says(asked: tuple[World, 
             compare(*asked, rng)
             for compare in (compare_over_sequence, compare_over_pattern, compare_over_check)
         ]
-        for _ in range(2)
+        for _ in range(4)
     ]
 
     assert all(sum(one) > 3 for one in zip(*found, strict=True))

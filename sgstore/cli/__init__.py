@@ -23,7 +23,7 @@ from sgstore.cli._options import ERROR, USAGE, Verbs, app
 from sgstore.cli._output import complain, talk_as_usual, write_error
 from sgstore.cli._places import forget_asked, with_missing
 from sgstore.cli._process import take_streams
-from sgstore.errors import ConfigError, QueryError, SgstoreError, SqlError
+from sgstore.errors import ConfigError, QueryError, SgstoreError, SqlError, is_interruption
 from sgstore.files import ReaderGoneError
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ def _ran(arguments: list[str]) -> int:
             sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as error:
         ended = isinstance(error, typer.Abort) or ending.was_ended()
-        if not (ended or ending.is_interruption(error)):
+        if not (ended or is_interruption(error)):
             raise
         code = ending.INTERRUPTED
     if ending.was_ended():  # an interruption may end as the error of one recording

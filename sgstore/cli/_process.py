@@ -36,8 +36,6 @@ INTERRUPTED: Final = 128 + 2
 _ENDS: Final = tuple(
     number for name in ("SIGTERM", "SIGHUP") if (number := getattr(signal, name, None)) is not None
 )
-_WORDS: Final = ("Query interrupted", "KeyboardInterrupt", "INTERRUPT Error")
-"""How the database tells of an interruption, which it turns into errors of its own."""
 
 
 @dataclass(slots=True)
@@ -123,18 +121,6 @@ def _too_late(_number: int, _frame: FrameType | None) -> None:
 def was_ended() -> bool:
     """Return true if a signal or the deadline has ended the run, even if its interruption was lost."""
     return bool(_run.signal) or _run.late
-
-
-def is_interruption(error: BaseException | None) -> bool:
-    """Return true if an error is due to the end of the run."""
-    while error is not None:
-        of_database = isinstance(error, RuntimeError) or "duckdb" in type(error).__module__
-        if of_database and any(words in str(error) for words in _WORDS):
-            return True
-        if isinstance(error, KeyboardInterrupt):
-            return True
-        error = error.__cause__ or error.__context__
-    return False
 
 
 def refuse_late() -> None:

@@ -323,7 +323,7 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
                 return lambda at: at.view.draws(at.nodes[node])
             name = attribute.name
             if attribute is NODE_ATTRIBUTES["lifetime"]:
-                return lambda at: _lifetime(at.view.nodes[at.nodes[node]])
+                return lambda at: _lifetime(at.nodes[node], at.view.nodes[at.nodes[node]])
             if attribute.unit is DisplayUnit.own:
                 of = _OWN[attribute.type]
                 return lambda at: of(at.view.nodes[at.nodes[node]].get(name))
@@ -391,9 +391,9 @@ _OWN: Final[Mapping[Type, Callable[[Any], Any]]] = {
 """Type of an attribute of a client's own → what makes the value of one of JSON."""
 
 
-def _lifetime(attributes: Attributes) -> int | None:
+def _lifetime(node: int, attributes: Attributes) -> int | None:
     """Which of the entities with an id it is; the first where a graph of a client's own does not say."""
-    return None if attributes["kind"] in MAP_KINDS else attributes.get("lifetime", 1)
+    return None if node < 0 else attributes.get("lifetime", 1)
 
 
 def _type_of(attributes: Attributes) -> Any:
