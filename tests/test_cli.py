@@ -637,3 +637,16 @@ def test_ingest_and_info_say_what_settings_cut(tmp_path: Path, sgstore: Any) -> 
             f" {scope['beyond_world']:,} of {scope['states']:,} states lie beyond the world (20 m)"
         ]
     ]
+
+
+def test_prioritize_and_coverage_say_what_settings_cut(store: str, sgstore: Any) -> None:
+    graph = "scope graph: 25,349 of 36,189 states lie beyond the graphs (50 m)"
+    world = "scope world: 3,153 of 36,189 states lie beyond the world (200 m)"
+    for words, cut in (
+        (("prioritize", store, "--budget", "3frames"), world),
+        (("coverage", "classes", store), graph),
+        (("coverage", "venn", store, store), graph),
+    ):
+        code, _, err = sgstore(*words)
+        assert code == 0, err
+        assert [line for line in err.splitlines() if "lie beyond" in line] == [f"sgstore: {cut}"]

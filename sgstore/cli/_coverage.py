@@ -31,6 +31,7 @@ from sgstore.cli._options import (
     parameters_of,
     pattern_option,
     say_left_out,
+    say_scope,
     seconds_of,
 )
 from sgstore.cli._output import count_bar, say
@@ -135,9 +136,13 @@ class WindowOptions:
         from sgstore.coverage import classed
 
         found: list[Classed] = []
+        places = set[str]()
         declared = None if slots is None else _one_specification(slots)
         for chosen in ask.frames(*texts):
             say_left_out(chosen)
+            if chosen.place not in places:
+                say_scope(chosen.scope(world=False), ask.chosen)
+            places.add(chosen.place)
             found.append(classed(chosen, self.abstraction, self.window, self.incomplete, declared))
         return found
 
@@ -315,6 +320,7 @@ def sequences_(
     named = manoeuvres_named(manoeuvres or ())
     ours, *others = ask.frames(*(text for text in (a, by) if text is not None))
     say_left_out(ours)
+    say_scope(ours.scope(world=False), ask.chosen)
     found = sequences(ours, k, others[0] if others else None, named, _within(within))
     listed = found.missing if missing else found.covered if covered else found.shares
     for text in found.shares.said if listed is not found.shares else ():

@@ -22,6 +22,7 @@ from sgstore.cli._options import (
     StorePath,
     app,
     parameters_of,
+    say_scope,
     seconds_of,
 )
 from sgstore.cli._output import count_bar, say
@@ -201,6 +202,7 @@ def prioritize(
     if given.learn_from is not None:
         others = ChosenFrames(str(given.learn_from), bounds.opened(given.learn_from))
     chosen = chosen_frames(bounds.opened(store), str(store), query, parameters)
+    say_scope(chosen.scope(world=True), out.chosen)
     found = put_in_order(chosen, spec, lessons, others)
     for text in found.said:
         say(text)

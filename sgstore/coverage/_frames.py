@@ -17,7 +17,7 @@ from sgstore.lang import node_of_kind
 from sgstore.locks import ENDING as LOCK
 from sgstore.locks import frames_of_lock, read_lock, store_beside
 from sgstore.query import Store
-from sgstore.store import begins, seq_of, trace_of
+from sgstore.store import begins, scope_of, seq_of, trace_of
 from sgstore.vocabulary import KINDS
 from sgstore.world import longest_step_ns
 
@@ -189,6 +189,16 @@ class ChosenFrames:
     def left_out(self) -> tuple[str, ...]:
         """Traces that cannot answer the query."""
         return tuple(self.reasons)
+
+    def scope(self, *, world: bool) -> dict[str, Any]:
+        """States that settings cut, as :func:`sgstore.store.scope_of` has them; none of a collection."""
+        if not isinstance(self.store, Store):
+            return {}
+        traces = self.store.info()
+        if self.frame_id is not None:
+            chosen = set(np.unique(trace_of(self.frame_id)).tolist())
+            traces = [one for one in traces if one.trace_id in chosen]
+        return scope_of((one.report for one in traces), world=world)
 
     @property
     def one_store(self) -> Store:
