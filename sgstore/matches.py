@@ -610,6 +610,14 @@ class UnionMatches(Matches):
         return fewer
 
     @property
+    def scope(self) -> dict[str, Any]:
+        """What settings left out of the traces that any part is asked of."""
+        ready = [part._ready for part in self._parts]  # noqa: SLF001
+        chosen = {trace.trace_id for one in ready for trace in one.chosen}
+        traces = (one for one in self._file.traces() if one.trace_id in chosen)
+        return scope_of((one.report for one in traces), world=any(one.bound.world for one in ready))
+
+    @property
     def reasons(self) -> dict[str, str]:
         """The reasons of all parts for each of the traces in :attr:`left_out`, by name."""
         found: dict[str, list[str]] = {}

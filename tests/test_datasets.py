@@ -33,7 +33,8 @@ def path(town_store: Path) -> Path:
         for seq, detail in DETAILS:
             connection.execute(
                 "INSERT INTO inside.event BY NAME SELECT trace_id, frame_id, time_ns, log_time_ns,"
-                " 'environment' AS kind, ? AS detail, 1 AS lifetime, 1 AS other_lifetime FROM inside.frame WHERE seq = ?",
+                " 'environment' AS kind, ? AS detail, 1 AS lifetime, 1 AS other_lifetime"
+                " FROM inside.frame WHERE seq = ?",
                 [detail, seq],
             )
     return town_store

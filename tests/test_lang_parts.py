@@ -152,7 +152,7 @@ def test_why_not_and_explain_speak_of_the_parts(store: Store) -> None:
 
 
 def test_a_monitor_tells_when_rows_of_parts_begin() -> None:
-    """Three cars stand behind one another; in the third frame one is gone, and another far away."""
+    """Three cars stand behind one another; in the third frame one is gone, and one id returns far away."""
     monitor = Monitor(
         "MATCH (e:Ego) OPTIONAL MATCH (v:Car) WHERE v.x - e.x > 20;"
         "MATCH (e:Ego), (v:Car) WITH e, COUNT(v) AS many WHERE many > 1;"
@@ -173,5 +173,5 @@ def test_a_monitor_tells_when_rows_of_parts_begin() -> None:
         (0, "3", {"e": "car 0", "v": "car 1"}, {"edges": 1, "ids": [0, 1]}),
         (0, "3", {"e": "car 0", "v": "car 2"}, {"edges": 2, "ids": [0, 1, 2]}),
         (0, "4", {"e": "car 1"}, {}),
-        (2, "1", {"e": "car 0", "v": "car 1"}, {}),
+        (2, "1", {"e": "car 0", "v": "car 3"}, {}),
     ]
