@@ -24,6 +24,8 @@ def boxes(rows: np.ndarray, first: int) -> np.ndarray:
     """The columns of boxes from one on, with headings in radians."""
     found = rows[:, first : first + len(COLUMNS)].copy()
     found[:, 3] = np.radians(found[:, 3])
+    # Results print the shortest text of numbers that are kept in 32 bits: sizes and velocities.
+    found[:, 4:] = found[:, 4:].astype(np.float32)
     return found
 
 
