@@ -579,6 +579,10 @@ def _map_node(road_map: RoadMap, node: int) -> Attributes:
     nodes, row = road_map.nodes, -1 - node
     texts = {name: getattr(nodes, name)[row] for name in _MAP_TEXTS}
     numbers = {name: float(getattr(nodes, name)[row]) for name in _MAP_NUMBERS}
+    # A store keeps these in 32 bits.
+    numbers |= {
+        name: float(np.float32(numbers[name])) for name in ("length", "width", "speed_limit")
+    }
     numbers["heading"] = math.degrees(numbers["heading"])
     about: Attributes = {"kind": KINDS[nodes.kind[row]], "is_ego": False, "is_static": True}
     about |= {name: text for name, text in texts.items() if text} | _numbers(numbers)

@@ -214,7 +214,9 @@ def forms(name: str, some: Any, kind: Type) -> dict[str, Any]:
 
 def in_store(value: Any, attribute: Attribute) -> Any:
     """A number of 32 bits as the store keeps it: results print its shortest text."""
-    is_kept = precision_of(NodeAttribute("n", attribute, attribute.type)) is Precision.float32
+    of_graphs = attribute in {*NODE_ATTRIBUTES.values(), *EDGE_ATTRIBUTES.values()}
+    is_kept = of_graphs and attribute.unit is not DisplayUnit.degrees
+    is_kept &= precision_of(NodeAttribute("n", attribute, attribute.type)) is Precision.float32
     return float(np.float32(value)) if is_kept and value is not None else value
 
 

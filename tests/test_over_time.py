@@ -84,17 +84,17 @@ def test_conditions_over_time_are_what_their_definition_says(asked: tuple[World,
 
 def test_values_over_matches_are_what_their_definition_says(asked: tuple[World, Store]) -> None:
     """Of sequences, of patterns and of violations; over a store, frame by frame, and as they are defined."""
-    rng = random.Random(10)
+    rng = random.Random(11)
 
     found = [
         [
             compare(*asked, rng)
             for compare in (compare_over_sequence, compare_over_pattern, compare_over_check)
         ]
-        for _ in range(4)
+        for _ in range(2)
     ]
 
-    assert all(sum(one) > 3 for one in zip(*found, strict=True))
+    assert all(sum(one) > 3 for one in zip(*found, strict=True)), found
 
 
 @pytest.mark.parametrize("construct", ASKED)
