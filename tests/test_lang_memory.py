@@ -89,7 +89,13 @@ TABLES = {
         "mtime_ns": "0",
         "digest": f"'{TRACE}'",
     },
-    "entity": {"trace_id": TRACE, "node_id": "k", "kind": "'car'", "is_static": "FALSE"},
+    "entity": {
+        "trace_id": TRACE,
+        "node_id": "k",
+        "kind": "'car'",
+        "is_static": "FALSE",
+        "lifetime": "1",
+    },
     "bucket": {
         "bucket": BUCKET,
         "trace_id": TRACE,
