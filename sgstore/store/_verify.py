@@ -72,22 +72,16 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
     *(
         (
             "masks",
-            "an edge holds in no frame, or in frames that the trace does not have",
+            f"{what} in no frame, or in frames that the trace does not have",
             f"""
-            SELECT e.bucket >> 18 FROM {edges} e LEFT JOIN bucket b ON b.bucket = e.bucket
-            WHERE b.bucket IS NULL OR e.mask = 0 OR (e.mask & ~b.valid) <> 0""",
+            SELECT r.bucket >> 18 FROM {table} r LEFT JOIN bucket b ON b.bucket = r.bucket
+            WHERE b.bucket IS NULL OR r.mask = 0 OR (r.mask & ~b.valid) <> 0""",
         )
-        for edges in ("edge", "world_edge")
-    ),
-    *(
-        (
-            "masks",
-            "a static node is present in no frame, or in frames that the trace does not have",
-            f"""
-            SELECT n.bucket >> 18 FROM {nodes} n LEFT JOIN bucket b ON b.bucket = n.bucket
-            WHERE b.bucket IS NULL OR n.mask = 0 OR (n.mask & ~b.valid) <> 0""",
+        for what, tables in (
+            ("an edge holds", ("edge", "world_edge")),
+            ("a static node is present", ("node", "world_node")),
         )
-        for nodes in ("node", "world_node")
+        for table in tables
     ),
     *(
         (
