@@ -274,9 +274,8 @@ CREATE VIEW inside.known_node AS
 SELECT *, true AS in_graph FROM inside.node UNION ALL SELECT *, false FROM inside.world_node;
 
 CREATE VIEW inside.known_edge AS
-SELECT * FROM inside.edge WHERE relation <> 'leads' AND relation <> 'follows'
-UNION ALL
-SELECT * FROM inside.world_edge WHERE relation <> 'leads' AND relation <> 'follows'
+SELECT * FROM (SELECT * FROM inside.edge UNION ALL SELECT * FROM inside.world_edge)
+WHERE relation <> 'leads' AND relation <> 'follows'
 UNION ALL
 SELECT relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst, bit_xor(mask) AS mask
 FROM (SELECT * FROM inside.edge UNION ALL SELECT * FROM inside.world_edge)
@@ -286,23 +285,27 @@ GROUP BY relation, src_is_ego, dst_is_ego, src_kind, dst_kind, bucket, src, dst;
 CREATE VIEW inside.known_lane_gap AS
 SELECT * FROM inside.lane_gap
 UNION ALL
-SELECT bucket * 64 + bit, bucket, bit, src, dst, gap FROM inside.world_gap_single
-UNION ALL
-SELECT r.bucket * 64 + b.bit, r.bucket, b.bit, r.src, r.dst, r.gap FROM inside.world_gap_repeated r JOIN inside.bits b ON (r.mask & b.m) <> 0;
+SELECT * FROM (
+  SELECT bucket * 64 + bit AS frame_id, bucket, bit, src, dst, gap FROM inside.world_gap_single
+  UNION ALL
+  SELECT r.bucket * 64 + b.bit, r.bucket, b.bit, r.src, r.dst, r.gap FROM inside.world_gap_repeated r JOIN inside.bits b ON (r.mask & b.m) <> 0
+);
 
 CREATE VIEW inside.known_lane_state AS
 SELECT *, true AS in_graph FROM inside.lane_state
 UNION ALL
-SELECT kind, bucket * 64 + bit, bucket, bit, node_id, lane, overlap, lane_offset, heading_error, is_primary, along, is_own, is_ego, false
-FROM inside.world_lane_single
-UNION ALL
-SELECT r.kind, r.bucket * 64 + b.bit, r.bucket, b.bit, r.node_id, r.lane, r.overlap, r.lane_offset, r.heading_error, r.is_primary, r.along,
-       r.is_own, r.is_ego, false
-FROM inside.world_lane_repeated r JOIN inside.bits b ON (r.mask & b.m) <> 0;
+SELECT *, false FROM (
+  SELECT kind, bucket * 64 + bit AS frame_id, bucket, bit, node_id, lane, overlap, lane_offset, heading_error, is_primary, along, is_own, is_ego
+  FROM inside.world_lane_single
+  UNION ALL
+  SELECT r.kind, r.bucket * 64 + b.bit, r.bucket, b.bit, r.node_id, r.lane, r.overlap, r.lane_offset, r.heading_error, r.is_primary, r.along,
+         r.is_own, r.is_ego
+  FROM inside.world_lane_repeated r JOIN inside.bits b ON (r.mask & b.m) <> 0
+);
 
 -- The public views -------------------------------------------------------------------------------------------------
 --
--- No NOT IN: versions of DuckDB write it down in different ways, and views are compared by their text.
+-- No NOT IN, and no UNION of three: versions of DuckDB write them down in different ways, and views are compared by their text.
 -- One row per thing per frame; metres, seconds, m/s, degrees; a heading or bearing is counter-clockwise, in (-180, 180].
 -- They are written so that filters on relation and kinds, and on frame_id where a table has it, reach the scans of the tables, and so
 -- that joining them with a user's own list of frames stays cheap (static nodes and edges meet the frames as masks of a bucket).

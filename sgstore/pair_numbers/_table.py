@@ -164,10 +164,10 @@ def _no_pairs() -> str:
     bits = UNEVEN["near_flat"] | UNEVEN["near_storeys"]
     bound = ("a.carrier = b.node_id", "b.carrier = a.node_id", "a.carrier = b.carrier")
     return (
-        "(SELECT frame_id, node_id AS one, carrier AS other, NULL AS level, 0 AS solid"  # noqa: S608
-        f" FROM ({carried}) UNION SELECT frame_id, carrier, node_id, NULL, 0 FROM ({carried})"
-        f" UNION SELECT a.frame_id, a.node_id, b.node_id, NULL, 0 FROM ({carried}) a JOIN ({carried}) b"
-        " ON b.frame_id = a.frame_id AND b.carrier = a.carrier AND b.node_id <> a.node_id"
+        "(SELECT *, NULL AS level, 0 AS solid FROM (SELECT frame_id, unnest([node_id, carrier]) AS one,"  # noqa: S608
+        f" unnest([carrier, node_id]) AS other FROM ({carried})"
+        f" UNION SELECT a.frame_id, a.node_id, b.node_id FROM ({carried}) a JOIN ({carried}) b"
+        " ON b.frame_id = a.frame_id AND b.carrier = a.carrier AND b.node_id <> a.node_id)"
         f" UNION ALL SELECT a.frame_id, a.node_id, b.node_id, {text('level')}, {text('solid')}"
         f" FROM inside.trace t JOIN {side} a ON a.frame_id >> 24 = t.trace_id"
         f" JOIN {side} b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id"
