@@ -99,9 +99,9 @@ def low_and_high_sql(column: Callable[[str], str], *, upright: bool = False) -> 
     if upright:
         return {"low": f"{z} - coalesce({height}, 0) / 2", "high": f"{z} + nullif({height}, 0) / 2"}
     hung, standing = (", ".join(f"'{kind}'" for kind in kinds) for kinds in (HUNG, UPRIGHT))
-    solid = f"{kind} NOT IN ({hung})"
-    half = f"CASE WHEN {height} <> 0 OR {kind} NOT IN ({standing}) THEN {height} / 2 END"
+    flat = f"{height} = 0 AND {kind} IN ({standing})"
+    half = f"CASE WHEN {flat} THEN NULL ELSE {height} / 2 END"
     return {
-        "low": f"CASE WHEN {solid} THEN {z} - coalesce({half}, 0) END",
-        "high": f"CASE WHEN {solid} THEN {z} + {half} END",
+        "low": f"CASE WHEN {kind} IN ({hung}) THEN NULL ELSE {z} - coalesce({half}, 0) END",
+        "high": f"CASE WHEN {kind} IN ({hung}) THEN NULL ELSE {z} + {half} END",
     }

@@ -164,8 +164,9 @@ def _no_pairs() -> str:
     bits = UNEVEN["near_flat"] | UNEVEN["near_storeys"]
     bound = ("a.carrier = b.node_id", "b.carrier = a.node_id", "a.carrier = b.carrier")
     return (
-        "(SELECT *, NULL AS level, 0 AS solid FROM (SELECT frame_id, unnest([node_id, carrier]) AS one,"  # noqa: S608
-        f" unnest([carrier, node_id]) AS other FROM ({carried})"
+        "(SELECT *, NULL AS level, 0 AS solid FROM (SELECT frame_id,"  # noqa: S608
+        " unnest(list_value(node_id, carrier)) AS one, unnest(list_value(carrier, node_id)) AS other"
+        f" FROM ({carried})"
         f" UNION SELECT a.frame_id, a.node_id, b.node_id FROM ({carried}) a JOIN ({carried}) b"
         " ON b.frame_id = a.frame_id AND b.carrier = a.carrier AND b.node_id <> a.node_id)"
         f" UNION ALL SELECT a.frame_id, a.node_id, b.node_id, {text('level')}, {text('solid')}"
