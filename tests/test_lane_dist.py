@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import cmath
 import math
+import re
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import networkx as nx
@@ -18,13 +21,13 @@ from sgstore.lang import FrameView
 from sgstore.opendrive import read_map
 from sgstore.query import Store
 from sgstore.sgg import SceneGraphGenerator
+from sgstore.step import Frame
 from sgstore.store import StoreFile
 from sgstore.temporal import Monitor, MonitorEvent
 from sgstore.vocabulary import RELATION_CODE, SIGNALS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from sgstore.roads import RoadMap
 
@@ -132,8 +135,10 @@ def test_the_view_the_language_the_graph_and_networkx_say_the_same_to_the_last_b
 
 
 def test_the_time_to_collision_along_the_lanes_is_that_of_its_definition(open_town: Store) -> None:
-    parts = ("lane_dist(a, b)", "a.speed", "b.speed", "a.length", "b.length", "ttc_lane(a, b)")
-    query = f"MATCH (a:Entity), (b:Entity) RETURN frame.id, a.id, b.id, {', '.join(parts)}"
+    states = {row[:2]: row[2:] for row in open_town.sql(LANE_STATES).values}
+    query = (
+        "MATCH (a:Entity), (b:Entity) RETURN frame.id, a.id, b.id, lane_dist(a, b), ttc_lane(a, b)"
+    )
     asked = {row[:3]: row[3:] for row in open_town.find(query).rows()}
     known = {frame for (frame, *_), (*_, found) in asked.items() if found is not None}
     assert len(known) > 100
@@ -144,18 +149,74 @@ def test_the_time_to_collision_along_the_lanes_is_that_of_its_definition(open_to
         monitor.look([open_town.file.graph(frame)])
         monitor.finish()
         told = {(e.nodes["a"], e.nodes["b"]): next(iter(e.values.values())) for e in events}
-        for (at, a, b), (far, *kept, found) in asked.items():
+        for (at, a, b), (far, found) in asked.items():
             if at != frame:
                 continue
+            one, other = states.get((at, a)), states.get((at, b))
             expected = None
-            # Results print the shortest text of numbers that are kept in 32 bits.
-            speed, other, length, others = (
-                None if one is None else float(np.float32(one)) for one in kept
-            )
-            if None not in {far, speed, other} and far > 0 and speed > other:
-                gap = None if None in {length, others} else max(far - (length + others) / 2, 0)
-                expected = None if gap is None else gap / (speed - other)
-            assert found == expected == told[a, b]
+            if far is not None and far > 0 and one is not None and other is not None:
+                faster = _speed_along(*one) - _speed_along(*other)
+                between = far - _half_along(*one) - _half_along(*other)
+                expected = max(between, 0) / faster if faster > 0 else None
+            assert found == pytest.approx(expected)
+            assert told[a, b] == pytest.approx(expected)
+    (written,) = re.findall(r"```sql\n(WITH moving.*?)```", PAGE.read_text("utf-8"), re.DOTALL)
+    egos = {
+        row[0] for row in open_town.sql("SELECT DISTINCT src FROM pairs WHERE src_is_ego").values
+    }
+    times = {row[:2]: row[2] for row in open_town.sql(written).values if row[2] is not None}
+    own = {(at, b): t for (at, a, b), (_, t) in asked.items() if t is not None and a in egos}
+    assert times == pytest.approx(own)
+
+
+LANE_STATES = """SELECT l.frame_id, l.src, n.vx::DOUBLE, n.vy::DOUBLE, n.heading, n.length::DOUBLE, n.width::DOUBLE, heading_error
+  FROM lane_states l JOIN nodes n ON n.node_id = l.src AND n.frame_id = l.frame_id WHERE is_primary"""
+PAGE = Path(__file__).parents[1] / "docs" / "criticality.md"
+
+
+STRAIGHT = PaperMap(Patch("on", -100, -4, 300, 0))
+
+
+def _speed_along(
+    vx: float, vy: float, heading: float, _length: float, _width: float, error: float
+) -> float:
+    return (complex(vx, vy) * cmath.exp(-1j * math.radians(heading - error))).real
+
+
+def _half_along(*state: float) -> float:
+    *_, length, width, error = state
+    corners = [
+        complex(u * length, v * width) / 2 * cmath.exp(1j * math.radians(error))
+        for u in (1, -1)
+        for v in (1, -1)
+    ]
+    return max(corner.real for corner in corners)
+
+
+@pytest.mark.parametrize(
+    ("other", "expected"),
+    [
+        pytest.param((30.0, 5.0, 0.0, 4.0, 2.0), 26 / 5, id="drives ahead"),
+        pytest.param((30.0, -5.0, 0.0, 4.0, 2.0), 26 / 15, id="reverses towards a"),
+        pytest.param((30.0, -15.0, 180.0, 4.0, 2.0), 26 / 25, id="drives against the lane"),
+        pytest.param((30.0, 0.0, 90.0, 4.0, 2.0), 27 / 10, id="stands across the lane"),
+        pytest.param((30.0, 15.0, 0.0, 4.0, 2.0), None, id="is faster"),
+    ],
+)
+def test_a_time_along_the_lanes_goes_by_the_speeds_along_them(
+    other: tuple[float, ...], expected: float | None
+) -> None:
+    x, vx, heading, length, width = other
+    frame = Frame(0, ego="a")
+    frame.add("a", "car", 0, -2, heading=0, vx=10, vy=0, length=4, width=2)
+    frame.add("b", "car", x, -2, heading=heading, vx=vx, vy=0, length=length, width=width)
+    events: list[MonitorEvent] = []
+    online = "MATCH (a:Ego), (b:Car {is_ego: FALSE}) RETURN FIRST(ttc_lane(a, b)) OVER match"
+    monitor = Monitor(online, period_s=0.1, on_event=events.append)
+    monitor.look([SceneGraphGenerator(STRAIGHT, Config()).step(frame)])
+    monitor.finish()
+
+    assert [next(iter(e.values.values())) for e in events] == [pytest.approx(expected)]
 
 
 def test_a_time_along_the_lanes_is_of_two_entities(store: Store) -> None:

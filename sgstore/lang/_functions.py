@@ -46,9 +46,23 @@ _COURSES: Final = (
 )
 _TEMPORAL: Final = frozenset(map(normalize_name, _COURSES))
 TTC_LANE: Final = "ttc_lane"
+_IN_LANE: Final = "MAX {(@)-[at:isIn {is_primary: TRUE}]->(l:Lane) | "
+_LANE_SPEED: Final = (
+    f"{_IN_LANE}@.vx * cos(radians(@.heading - at.heading_error))"
+    " + @.vy * sin(radians(@.heading - at.heading_error))}"
+)
+"""Speed along the lane: below 0 of an entity that reverses, or drives against the lane."""
+_LANE_HALF: Final = (
+    f"{_IN_LANE}@.length * abs(cos(radians(at.heading_error)))"
+    " + @.width * abs(sin(radians(at.heading_error)))} / 2"
+)
+"""Half the extent of a footprint along the lane."""
 _ALONG_LANES: Final = """DEFINE PREDICATE ttc_lane(a, b) AS
-  CASE WHEN lane_dist(a, b) > 0 AND a.speed > b.speed
-  THEN max(lane_dist(a, b) - (a.length + b.length) / 2, 0) / (a.speed - b.speed) END"""
+  CASE WHEN lane_dist(a, b) > 0 AND {speeds} > 0
+  THEN max(lane_dist(a, b) - {halves}, 0) / ({speeds}) END""".format(
+    speeds=" - ".join(_LANE_SPEED.replace("@", one) for one in "ab"),
+    halves=" - ".join(_LANE_HALF.replace("@", one) for one in "ab"),
+)
 """It is no column, for it is made of what is looked up, and of attributes."""
 FUNCTIONS: Final = frozenset(
     {
@@ -183,9 +197,14 @@ def _ttc_lane(e: s.Call, names: SymbolTable) -> b.Bound:
     _expect(e, 2, 2, names)
     keys = [_entity(TTC_LANE, argument, names) for argument in e.arguments]
     meanings = {name: Symbol(node=key) for name, key in zip("ab", keys, strict=True)}
+    relations = names.session.relations
+    before = {*relations}
     match parse(_ALONG_LANES):
         case (s.Define(body=s.Case() as body),):
-            return names.body(meanings).bind(body)
+            bound = names.body(meanings).bind(body)
+            # Without a map it is NULL, as lane_dist is: no trace is left out for it.
+            relations.intersection_update(before)
+            return bound
         case other:
             raise TypeError(other)
 

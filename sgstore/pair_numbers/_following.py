@@ -31,8 +31,8 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
         " and b goes on braking as it does, until it stands",
         "s",
         "CASE WHEN lead <= 0 AND brakes IS NOT NULL AND closing IS NOT NULL THEN 0"
-        " WHEN v2 > 0 AND braking > v2 / brakes"
-        " THEN CASE WHEN v1 > 0 THEN (lead + v2 * v2 / (2 * brakes)) / v1 END ELSE braking END",
+        " WHEN braking <= abs(v2) / abs(brakes) THEN braking"
+        " WHEN v1 > 0 THEN (lead - v2 * v2 / (2 * brakes)) / v1 END",
         f"{_AHEAD} or does not brake",
         "Wakabayashi et al., Traffic Conflict Analysis and Modeling, 2003",
     ),
@@ -134,15 +134,18 @@ PARTS: Final[Mapping[str, str]] = {
     "closing": "v1 - v2",
     "slack": "closing * closing - 2 * lead * (a2 - a1)",
     "slack_root": "CASE WHEN slack >= 0 THEN sqrt(slack) END",
-    "brakes": "CASE WHEN a2 < 0 THEN -a2 END",
-    "braking": "2 * lead / nullif(closing + sqrt(closing * closing + 2 * lead * brakes), 0)",
+    # b's acceleration where it makes b slower along a's axis, whichever way b moves
+    "brakes": "CASE WHEN v2 * a2 < 0 THEN a2 END",
+    "brakes_root": "sqrt(CASE WHEN closing * closing >= 2 * lead * brakes"
+    " THEN closing * closing - 2 * lead * brakes END)",
+    "braking": "CASE WHEN closing + brakes_root > 0 THEN 2 * lead / (closing + brakes_root) END",
     "reached": "CASE WHEN closing > 0 THEN lead / closing END",
     "short_by": "reach2 - abs(lat + drift2 * reached)",
     # Two that are no farther apart than the rounding of places touch.
     "room": f"CASE WHEN lead > {TOUCH:.0e} THEN lead END",
     # b comes to a stand, whichever way it moves, before a that brakes as hard as it must is as slow as b.
     "required": "CASE WHEN room > 0 AND a2 IS NOT NULL THEN CASE WHEN closing <= 0 THEN 0"
-    " WHEN v1 > 0 AND v2 * a2 < 0 AND 2 * room * abs(a2) > abs(v2) * closing"
+    " WHEN v1 > 0 AND (v2 * a2 < 0 OR v2 = 0 AND a2 < 0) AND 2 * room * abs(a2) > abs(v2) * closing"
     " THEN -v1 * v1 / (2 * room - v2 * v2 / a2) ELSE a2 - closing * closing / (2 * room) END END",
     "aside": "lat + drift2 * ttc_accel + (b_ay * ca - b_ax * sa) * ttc_accel * ttc_accel / 2",
 }

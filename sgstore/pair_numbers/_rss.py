@@ -15,6 +15,9 @@ _RSS: Final = (
     "Shalev-Shwartz et al., On a Formal Model of Safe and Scalable Self-driving Cars, 2017"
 )
 
+_STANDS: Final = "1e-3"
+"""Speed up to which an entity stands: more than rounding leaves of one that drives across; m/s."""
+
 NUMBERS: Final[Mapping[str, PairFunction]] = {
     # Response 1 s, in it accelerating by 3.5 m/s² (0.2 sideways), then braking by at least 4 m/s² (0.8 aside, 3
     # in one's own lane against who comes), who is ahead by at most 8; 0.1 m between: as in ad-rss-lib.
@@ -22,9 +25,9 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
         "safe distance of RSS along a's axis: that the one behind, or both who come towards one another, must"
         " keep",
         "m",
-        "CASE WHEN toward_a + toward_b IS NULL THEN NULL WHEN least(toward_a, toward_b) >= 0 THEN head_on"
+        "CASE WHEN toward_a + toward_b IS NULL THEN NULL WHEN meets_head_on > 0 THEN head_on"
         " WHEN chase > 0 THEN chase ELSE 0 END + solid",
-        "",
+        "one that stands ahead is a leader; what is slower than 1 mm/s along a's axis stands",
         _RSS,
         worse="",
     ),
@@ -52,6 +55,10 @@ PARTS: Final[Mapping[str, str]] = {
     # goes away sideways even after the response, the way of stopping counts with its sign.
     "toward_a": "CASE WHEN lon > 0 THEN v1 WHEN lon <= 0 THEN -v1 END",
     "toward_b": "CASE WHEN lon > 0 THEN -v2 WHEN lon <= 0 THEN v2 END",
+    # Definition 2 of the source: b comes towards a, which drives towards b, or stands and faces it. All others
+    # are of one direction (definition 1), with a standing leader, too.
+    "meets_head_on": f"CASE WHEN toward_b > {_STANDS} AND (toward_a > {_STANDS}"
+    f" OR lon > 0 AND toward_a >= -{_STANDS}) THEN 1 ELSE 0 END",
     "faster": "greatest(toward_a, toward_b, 0)",
     "flees": "CASE WHEN toward_a < 0 AND toward_b < 0 THEN greatest(toward_a, toward_b)"
     " ELSE least(toward_a, toward_b) END",
