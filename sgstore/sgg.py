@@ -610,6 +610,7 @@ class SceneGraphGenerator:
             length=length,
             width=width,
             height=np.where(IS_UPRIGHT[kind] & (height == 0), np.nan, height),
+            pitch=np.concatenate([states.pitch[rows], np.full(len(row), np.nan)]),
             carrier=np.concatenate([states.carrier[rows], scenery.carrier[row]]),
         )
 

@@ -524,9 +524,16 @@ def storeys_apart(a: dict[str, Any], b: dict[str, Any]) -> bool:
     if {a["kind"], b["kind"]} & set(SIGNALS) or "z" not in a or "z" not in b:
         return False
     half_a, half_b = (n.get("height", 0) / 2 for n in (a, b))
+    higher, away = (
+        abs((b["z"] - half_b) - (a["z"] - half_a)),
+        math.dist(*((n["x"], n["y"]) for n in (a, b))),
+    )
+    pitches = [0.0 if n.get("is_static") else n.get("pitch", 0.0) for n in (a, b)]
+    tilt = max(abs(math.sin(math.radians(pitch))) for pitch in pitches)
+    climb = max(min(0.1 * away, 2.5), min(tilt, 0.25) * away)
     if half_a and half_b:
-        return abs(b["z"] - a["z"]) > half_a + half_b + 1e-4
-    return abs((b["z"] - half_b) - (a["z"] - half_a)) > 2.5
+        return abs(b["z"] - a["z"]) > half_a + half_b + 1e-4 and higher > climb
+    return higher > max(2.5, climb)
 
 
 def assignments(

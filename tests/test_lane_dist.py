@@ -169,7 +169,8 @@ def test_the_time_to_collision_along_the_lanes_is_that_of_its_definition(open_to
     assert times == pytest.approx(own)
 
 
-LANE_STATES = """SELECT l.frame_id, l.src, n.vx::DOUBLE, n.vy::DOUBLE, n.heading, n.length::DOUBLE, n.width::DOUBLE, heading_error
+LANE_STATES = """SELECT l.frame_id, l.src, n.vx::DOUBLE, n.vy::DOUBLE, n.heading, n.length::DOUBLE,
+    n.width::DOUBLE, heading_error
   FROM lane_states l JOIN nodes n ON n.node_id = l.src AND n.frame_id = l.frame_id WHERE is_primary"""
 PAGE = Path(__file__).parents[1] / "docs" / "criticality.md"
 

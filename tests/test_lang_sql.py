@@ -66,13 +66,14 @@ def test_numbers_of_pairs_are_those_of_arrays(world: World) -> None:
 
     def boxes(side: int) -> np.ndarray:
         chosen = [states[row[0], row[side]] for row in rows]
-        wanted = (*COLUMNS, "height")
+        wanted = (*COLUMNS, "pitch", "height")
         told = np.array([[np.nan if s.get(c) is None else s[c] for c in wanted] for s in chosen])
         told = told.astype(np.float32).astype(float)  # FLOAT in the tables, as in every store
         of_kind = [kinds[row[0], row[side]] for row in rows]
         hung, upright = (np.isin(of_kind, some) for some in (HUNG, UPRIGHT))
         sides = low_and_high(told[:, 2], told[:, -1], hung, upright)
-        return np.column_stack([told[:, :-1], *sides])
+        unknown = np.full((len(told), 2), np.nan)
+        return np.column_stack([told[:, : len(COLUMNS)], *sides, unknown, told[:, -2]])
 
     numbers = PairNumbers(boxes(1), boxes(2))
     assert len(rows) > 300

@@ -409,6 +409,7 @@ def test_a_number_as_an_array_is_what_the_database_computes(name: str) -> None:
     state |= {"frame_id": np.tile(np.arange(len(a)), 2), "node_id": np.repeat([0.0, 1.0], len(a))}
     count = 2 * len(a)
     state["height"] = rng.choice([0, 1.5, 2, 3, math.nan], count, p=[0.05, 0.3, 0.3, 0.3, 0.05])
+    state["pitch"] = rng.choice([0, 0.1, -0.2, 0.4, math.nan], count)
     state["carrier"] = rng.choice([0, 1, 7, math.nan], count, p=[0.05, 0.05, 0.05, 0.85])
     kinds = rng.choice(["car", "prop", "traffic_light"], count, p=[0.6, 0.3, 0.1])
     hung, upright = (np.isin(kinds, some) for some in (HUNG, UPRIGHT))
@@ -416,7 +417,7 @@ def test_a_number_as_an_array_is_what_the_database_computes(name: str) -> None:
     told = {**state, **dict(zip(("low", "high"), sides, strict=True))}
     a, b = np.split(np.stack([told[c] for c in (*COLUMNS, *OPTIONAL)], axis=1), 2)
     state["kind"] = kinds
-    given = (*COLUMNS, "height", "carrier")
+    given = (*COLUMNS, "height", "carrier", "pitch")
     read = ", ".join(f"CASE WHEN isnan({c}) THEN NULL ELSE {c} END AS {c}" for c in given)
 
     with duckdb.connect() as db:
@@ -445,11 +446,18 @@ PLACES |= {"apparent_heading"}
 EXPRESSED = [name for name, one in PAIR_FUNCTIONS.items() if one.sql]
 
 
-def body(x: float, z: float = 0.75, height: float = 1.5, node: int = 0, carrier: float = math.nan):
+def body(
+    x: float,
+    z: float = 0.75,
+    height: float = 1.5,
+    node: int = 0,
+    carrier: float = math.nan,
+    pitch: float = math.nan,
+):
     """A car, or a thing on the road if it has no height, that drives along the x axis."""
     row = np.array([[x, 0.3, z, 0.1, 4, 2, 9 - x / 4, 0.2, -1, 0]])
     low, high = (np.array([[side]]) for side in (z - height / 2, z + height / 2))
-    return np.hstack([row, low, high, [[node, carrier]]])
+    return np.hstack([row, low, high, [[node, carrier, pitch]]])
 
 
 def test_kinds_of_bodies_are_those_of_the_vocabulary() -> None:
@@ -465,6 +473,30 @@ def test_a_car_on_a_bridge_above_is_no_pair(name: str) -> None:
         level = PairNumbers(body(0), body(x, z=2.2, node=1))
         plain = PairNumbers(body(0)[:, :10], body(x, z=2.2)[:, :10])
         assert np.array_equal(level[name], plain[name], equal_nan=True)
+
+
+@pytest.mark.parametrize("name", EXPRESSED)
+@pytest.mark.parametrize(
+    ("x", "z", "pitches", "joined"),
+    [
+        pytest.param(40, 0.75 + 2.4, (math.nan, math.nan), True, id="6 % and no pitch"),
+        pytest.param(
+            40, 0.75 + 2.6, (math.nan, math.nan), False, id="more than a storey, no pitch"
+        ),
+        pytest.param(14, 0.75 + 1.6, (math.nan, 0), False, id="more than 10 %, no pitch"),
+        pytest.param(40, 0.75 + 3.9, (0, -0.1), True, id="as steep as b's pitch"),
+        pytest.param(40, 0.75 + 3.9, (0.1, math.nan), True, id="as steep as a's pitch"),
+        pytest.param(40, 0.75 + 4.1, (0.1, 0), False, id="steeper than the pitch"),
+        pytest.param(20, 0.75 + 5.5, (0.6, 0), False, id="a pitch that no road has"),
+    ],
+)
+def test_a_slope_joins_what_a_road_may_climb(
+    name: str, x: float, z: float, pitches: tuple[float, float], joined: bool
+) -> None:
+    a, b = body(0, pitch=pitches[0]), body(x, z=z, node=1, pitch=pitches[1])
+    plain = PairNumbers(a[:, :10], b[:, :10])[name]
+
+    assert np.isnan(PairNumbers(a, b)[name][0]) == (not joined or np.isnan(plain[0]))
 
 
 @pytest.mark.parametrize("name", EXPRESSED)

@@ -471,7 +471,7 @@ def touching(a: Thing, b: Thing) -> bool:
     known = not any(math.isnan(v) for t in (a, b) for v in (t.heading, t.length, t.width))
     if not known or footprint(a).distance(footprint(b)) > 1e-4:
         return False
-    return bodies(a, b)
+    return bodies(a, b) and not heights_apart(a, b)
 
 
 def bodies(a: Thing, b: Thing) -> bool:
@@ -494,6 +494,12 @@ def flat(t: Thing) -> bool:
 
 
 def storeys_apart(a: Thing, b: Thing) -> bool:
+    """Whether two are apart in height by more than a road of 10 % climbs, or than a storey, between them."""
+    away = math.hypot(b.x - a.x, b.y - a.y)
+    return heights_apart(a, b) and abs(bottom(a) - bottom(b)) > min(0.1 * away, 2.5)
+
+
+def heights_apart(a: Thing, b: Thing) -> bool:
     """Whether two are apart in height, as far as it is known; signals are on no storey."""
     if {a.kind, b.kind} & set(SIGNALS):
         return False

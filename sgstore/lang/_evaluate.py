@@ -250,13 +250,15 @@ class FrameView:
 
     @cached_property
     def _boxes(self) -> Floats:
-        """(E, 14) what numbers of pairs are made of; what stands for ever has acceleration 0."""
+        """(E, 15) what numbers of pairs are made of; what stands for ever has acceleration 0."""
         rows: list[list[float]] = []
         heights: list[tuple[float, bool, bool]] = []
         for node in self.rows:
             about = self.nodes[node]
             known: Attributes = {"ax": 0.0, "ay": 0.0} if about.get("is_static") else {}
             known = {**known, **about, "node_id": node}
+            if about.get("is_static"):
+                known["pitch"] = math.nan  # a store keeps none
             rows.append([known.get(name, math.nan) for name in ENTITY])
             kind = about["kind"]
             heights.append((about.get("height", math.nan), kind in HUNG, kind in UPRIGHT))
@@ -265,8 +267,8 @@ class FrameView:
         sides = low_and_high(boxes[:, COLUMNS.index("z")], height, hung > 0, upright > 0)
         for name, side in zip(("low", "high"), sides, strict=True):
             boxes[:, ENTITY.index(name)] = side
-        heading = COLUMNS.index("heading")
-        boxes[:, heading] = np.radians(boxes[:, heading])
+        angles = [ENTITY.index(name) for name in ("heading", "pitch")]
+        boxes[:, angles] = np.radians(boxes[:, angles])
         return boxes
 
 

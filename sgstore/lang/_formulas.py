@@ -188,6 +188,8 @@ def raw_text(name: str, at: Aliases, *, upright: bool = False) -> str:
     parts: list[str] = []
     if name == "carrier":
         return f"{at.state}.{quoted(name)}" if at.state else "CAST(NULL AS INTEGER)"
+    if name == "pitch":
+        return f"CAST({at.state}.{quoted(name)} AS DOUBLE)" if at.state else "CAST(NULL AS DOUBLE)"
     if name == "node_id":
         ids = [f"{alias}.{quoted(name)}" for alias in (at.state, at.entity, at.map) if alias]
         return ids[0] if len(ids) == 1 else f"coalesce({', '.join(ids)})"

@@ -11,6 +11,7 @@ from ._levels import TOUCH as TOUCH
 from ._levels import UNEVEN as UNEVEN
 from ._levels import UPRIGHT as UPRIGHT
 from ._levels import all_level as all_level
+from ._levels import climb as climb
 from ._levels import low_and_high as low_and_high
 from ._levels import low_and_high_sql as low_and_high_sql
 from ._table import MARKS as MARKS
@@ -50,6 +51,7 @@ __all__ = [
     "UPRIGHT",
     "WAYS",
     "all_level",
+    "climb",
     "as_written",
     "columns_needed",
     "gap",

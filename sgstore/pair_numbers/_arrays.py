@@ -28,11 +28,11 @@ class PairNumbers(dict[str, "Floats"]):
 
     Parameters
     ----------
-    a, b : (K, 14) float64
+    a, b : (K, 15) float64
         ``x, y, z, heading, length, width, vx, vy, ax, ay`` of the two entities of pair k; m, m, m, rad, m, m,
-        m/s, m/s, m/s², m/s²; and heights of the lower and the upper side (:func:`low_and_high`), node id, and
-        that of the carrier. NaN where one is missing. The last ones may be left out: without heights
-        (K, 10) all pairs are on one level, without accelerations (K, 8) they are unknown.
+        m/s, m/s, m/s², m/s²; and heights of the lower and the upper side (:func:`low_and_high`), node id,
+        that of the carrier, and pitch (rad). NaN where one is missing. The last ones may be left out:
+        without heights (K, 10) all pairs are on one level, without accelerations (K, 8) they are unknown.
     """
 
     def __init__(self, a: Floats, b: Floats) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from sgstore.pair_numbers._declared import PairFunction
-from sgstore.pair_numbers._levels import STOREY, TOUCH
+from sgstore.pair_numbers._levels import GRADE, STEEPEST, STOREY, TOUCH
 from sgstore.pair_numbers._ways import LANE_DIST
 
 if TYPE_CHECKING:
@@ -140,8 +140,11 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
 PARTS: Final[Mapping[str, str]] = {
     # Two on different storeys, and what pulls or carries the other, are no pair: NULL, else 0.
     "apart": "CASE WHEN a_high > a_low AND b_high > b_low"
-    f" THEN greatest(b_low - a_high, a_low - b_high) - {TOUCH:.0e}"
-    f" ELSE abs(b_low - a_low) - {STOREY}e0 END",
+    f" THEN least(greatest(b_low - a_high, a_low - b_high) - {TOUCH:.0e}, abs(b_low - a_low) - climb)"
+    f" ELSE abs(b_low - a_low) - greatest({STOREY}e0, climb) END",
+    "climb": f"greatest(least({GRADE}e0 * spread, {STOREY}e0), spread * least({STEEPEST}e0, tilt))",
+    "tilt": "greatest(abs(sin(coalesce(a_pitch, 0))), abs(sin(coalesce(b_pitch, 0))))",
+    "spread": "sqrt((b_x - a_x) * (b_x - a_x) + (b_y - a_y) * (b_y - a_y))",
     "level": "CASE WHEN apart > 0 OR a_carrier = b_node_id OR b_carrier = a_node_id OR a_carrier = b_carrier"
     " THEN NULL ELSE 0 END",
     # What is flat is no body: NULL, else 0.

@@ -2,6 +2,10 @@
 
 Signals hang over the road and belong to no storey: they have no such heights. What by its kind stands upright
 has no height of 0: there 0 means that it was not recorded, as in recordings that never give heights.
+
+Two bodies whose heights are apart may still be on one road, which climbs between them. They are on different
+storeys only if their lower sides differ by more than a road climbs over the distance of their centres: by a
+grade of :data:`GRADE`, up to a storey, or by the pitch of either, if it is recorded.
 """
 
 from __future__ import annotations
@@ -27,10 +31,10 @@ UPRIGHT: Final = (
 )
 """Kinds that have a height, recorded or not: the vehicles of the vocabulary, and more."""
 
-OPTIONAL: Final = ("low", "high", "node_id", "carrier")
+OPTIONAL: Final = ("low", "high", "node_id", "carrier", "pitch")
 """Columns of an entity without which a number of a pair has a value all the same.
 
-Heights of its lower and upper side (m), node id, and that of its carrier.
+Heights of its lower and upper side (m), node id, that of its carrier, and its pitch (rad).
 """
 
 TOUCH: Final = 1e-4
@@ -38,6 +42,13 @@ TOUCH: Final = 1e-4
 
 STOREY: Final = 2.5
 """Difference of the lower sides from which on storeys differ, where a height is not known; m."""
+
+
+GRADE: Final = 0.1
+"""Grade by which a road may climb where no pitch says how steep it is."""
+
+STEEPEST: Final = 0.25
+"""Greatest grade that a pitch is taken for."""
 
 
 UNEVEN: Final = {"flat": 1, "storeys": 2, "carried": 4, "near_flat": 8, "near_storeys": 16}
@@ -68,6 +79,24 @@ def all_level(low: Floats, high: Floats, frame: NDArray[np.int64] | None = None)
     if (extremes(solid, high) > TOUCH).any():
         return False
     return bool((solid == known).all() or (extremes(known, low) <= STOREY).all())
+
+
+def climb(distance: Floats, pitch_a: Floats, pitch_b: Floats) -> Floats:
+    """Height that a road may climb between two bodies; m.
+
+    Parameters
+    ----------
+    distance : (K,) float64
+        Of their centres in the plane; m.
+    pitch_a, pitch_b : (K,) float64
+        NaN: not known; rad.
+
+    Returns
+    -------
+    (K,) float64
+    """
+    pitch = np.fmax(np.nan_to_num(np.abs(np.sin(pitch_a))), np.nan_to_num(np.abs(np.sin(pitch_b))))
+    return np.fmax(np.fmin(GRADE * distance, STOREY), np.fmin(pitch, STEEPEST) * distance)
 
 
 def low_and_high(z: Floats, height: Floats, hung: Bools, upright: Bools) -> tuple[Floats, Floats]:

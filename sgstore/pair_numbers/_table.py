@@ -152,7 +152,8 @@ def _no_pairs() -> str:
     """The pairs that are none, with their marks. Those of storeys take long, where there are any."""
     sides = low_and_high_sql(lambda n: n if n == "kind" else f"{n}::DOUBLE")
     heights = ", ".join(f"{text} AS {name}" for name, text in sides.items())
-    side = f"(SELECT frame_id, node_id, carrier, {heights} FROM inside.state)"  # noqa: S608
+    places = "x::DOUBLE AS x, y::DOUBLE AS y, pitch::DOUBLE AS pitch"
+    side = f"(SELECT frame_id, node_id, carrier, {places}, {heights} FROM inside.state)"  # noqa: S608
     carried = "SELECT frame_id, node_id, carrier FROM inside.state WHERE carrier IS NOT NULL"
 
     def text(name: str) -> str:

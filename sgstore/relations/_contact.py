@@ -22,9 +22,10 @@ from sgstore.relations._scene import (
     IS_SIGNAL,
     Relation,
     edges_between,
-    meet_as_bodies,
+    heights_meet,
     meeting,
     relates_pairs,
+    solid_pairs,
 )
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ def _touching(bodies: Bodies, a: Rows, b: Rows) -> tuple[Rows, Rows]:
     """The pairs that touch, in height as far as it is known."""
     close = bodies.moves[a] | bodies.moves[b]
     a, b = a[close], b[close]
-    level = meet_as_bodies(bodies, a, b)
+    level = solid_pairs(bodies, a, b) & heights_meet(bodies, a, b)
     a, b = a[level], b[level]
     apart = _separation(bodies, a, b)
     touch = apart < -SURE

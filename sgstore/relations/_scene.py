@@ -16,7 +16,7 @@ from sgstore.columns import taken
 from sgstore.compiled import worth
 from sgstore.geometry import bearings
 from sgstore.graph import Edges
-from sgstore.pair_numbers import STOREY, TOUCH, UPRIGHT, all_level, gap, low_and_high
+from sgstore.pair_numbers import STOREY, TOUCH, UPRIGHT, all_level, climb, gap, low_and_high
 from sgstore.vocabulary import KIND_CODE, MOST_KINDS, RELATION_CODE, SIGNALS, VEHICLES
 
 if TYPE_CHECKING:
@@ -125,6 +125,7 @@ class Bodies:
     length: Floats
     width: Floats
     height: Floats
+    pitch: Floats
     carrier: Ints
 
     def __len__(self) -> int:
@@ -323,19 +324,37 @@ def spans(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
     return dx * dx + dy * dy + dz * dz
 
 
-def on_one_level(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Mask of the pairs of bodies that are not on different storeys; where it is not known, they are not."""
+def heights_meet(bodies: Bodies, a: Rows, b: Rows) -> Bools:
+    """Mask of the pairs of bodies that share a height; where it is not known, they do."""
     low, high = bodies.low_and_high
     reach = np.fmax(low[b] - high[a], low[a] - high[b])
     solid = high > low
-    level = np.where(solid[a] & solid[b], reach > TOUCH, np.abs(low[b] - low[a]) > STOREY)
-    return ~level
+    return ~np.where(solid[a] & solid[b], reach > TOUCH, np.abs(low[b] - low[a]) > STOREY)
+
+
+def on_one_level(bodies: Bodies, a: Rows, b: Rows) -> Bools:
+    """Mask of the pairs of bodies that are not on different storeys; where it is not known, they are not.
+
+    Those are on one storey that share a height, or that a road may join which climbs between them.
+    """
+    level = heights_meet(bodies, a, b)
+    rest = np.flatnonzero(~level)
+    a, b = a[rest], b[rest]
+    low, _ = bodies.low_and_high
+    away = np.hypot(bodies.x[b] - bodies.x[a], bodies.y[b] - bodies.y[a])
+    level[rest] = np.abs(low[b] - low[a]) <= climb(away, bodies.pitch[a], bodies.pitch[b])
+    return level
 
 
 def meet_as_bodies(bodies: Bodies, a: Rows, b: Rows) -> Bools:
     """Mask of the pairs of bodies on one level of which neither is flat, nor carries the other."""
+    return solid_pairs(bodies, a, b) & on_one_level(bodies, a, b)
+
+
+def solid_pairs(bodies: Bodies, a: Rows, b: Rows) -> Bools:
+    """Mask of the pairs of bodies of which neither is flat, nor carries the other."""
     flat = ~IS_UPRIGHT[bodies.kind] & (bodies.height == 0)
-    return ~(flat[a] | flat[b] | carried_by(bodies, a, b)) & on_one_level(bodies, a, b)
+    return ~(flat[a] | flat[b] | carried_by(bodies, a, b))
 
 
 def carried_by(bodies: Bodies, a: Rows, b: Rows) -> Bools:
