@@ -58,7 +58,7 @@ PARTS: Final[Mapping[str, str]] = {
     # Definition 2 of the source: b comes towards a, which drives towards b, or stands and faces it. All others
     # are of one direction (definition 1), with a standing leader, too.
     "meets_head_on": f"CASE WHEN toward_b > {_STANDS} AND (toward_a > {_STANDS}"
-    f" OR lon > 0 AND toward_a >= -{_STANDS}) THEN 1 ELSE 0 END",
+    f" OR lon > 0 AND toward_a + {_STANDS} >= 0) THEN 1 ELSE 0 END",
     "faster": "greatest(toward_a, toward_b, 0)",
     "flees": "CASE WHEN toward_a < 0 AND toward_b < 0 THEN greatest(toward_a, toward_b)"
     " ELSE least(toward_a, toward_b) END",
