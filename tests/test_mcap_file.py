@@ -144,12 +144,17 @@ def test_every_layout_is_read_as_the_official_reader_reads_it(
 
 
 def test_a_file_can_be_walked_again(tmp_path: Path) -> None:
-    with McapFile(drive(tmp_path / "a.mcap")) as recording:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.ground_truth(0.0, [car(1)])
+        recorder.writer.add_attachment(0, 0, "a", "text/plain", b"a")
+        recorder.writer.add_attachment(0, 0, "b", "text/plain", b"b")
+    with McapFile(tmp_path / "a.mcap") as recording:
         first = [len(run) for run in recording.walk(TraceReport())]
         second = [len(run) for run in recording.walk(TraceReport())]
 
         assert first == second
         assert len(recording.metadata) == 0
+        assert len(recording.attachments) == 2
 
 
 @pytest.mark.parametrize("how", LAYOUTS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -295,26 +296,106 @@ def test_a_topic_may_be_split_over_two_channels(name: str, tmp_path: Path) -> No
     assert not any(first_difference(found[0], other) for other in found)
 
 
-def test_an_index_takes_few_bytes_a_message() -> None:
-    count, each = 200_000, 2000
-    draw = np.random.default_rng(0)
-    channels = {i: Channel(i, str(i), "", {}, 0) for i in (1, 2)}
-    ranks = order.ChannelRanks(lambda _: 0, {}, channels)
+Draw = Callable[[np.random.Generator, int, int], np.ndarray[Any, Any]]
+LOG_TIMES: dict[str, Draw] = {
+    "random": lambda draw, _start, count: draw.integers(0, 1 << 40, count),
+    "nearly in order": lambda draw, start, count: start + draw.integers(0, 9000, count),
+    "backwards": lambda _draw, start, count: (1 << 40) - np.arange(start, start + count),
+    "equal": lambda _draw, _start, count: np.zeros(count, np.int64),
+    "half of them equal": lambda draw, _start, count: draw.integers(-9000, 9000, count).clip(0),
+}
+RANKS = order.ChannelRanks(
+    lambda number: -number % 3 + 1, {}, {i: Channel(i, str(i), "", {}, 0) for i in (1, 2)}
+)
 
-    def runs() -> Iterator[Messages]:
-        for start in range(0, count, each):
-            times = draw.integers(0, count, each) * 1000
-            zeros = np.zeros(each, np.int64)
-            columns = draw.integers(1, 3, each), zeros, times, times.astype(np.uint64), zeros
-            yield Messages(start, *columns, np.full(each, 20), lambda _at, _length: memoryview(b""))
 
+def many_messages(count: int, times: Draw, place: int | None = None) -> Iterator[Messages]:
+    """Messages of two channels, without data; of runs outside chunks if ``place`` is -1."""
+    draw, each = np.random.default_rng(0), 2000
+    for start in range(0, count, each):
+        log = times(draw, start, min(each, count - start)).astype(np.int64)
+        publish = (log + draw.integers(0, 3, len(log))).astype(np.uint64)
+        channel, zeros = draw.integers(1, 3, len(log)), np.zeros(len(log), np.int64)
+        offset = 31 * np.arange(start, start + len(log))
+        at = 31 * start if place is None else place
+        columns = channel, zeros, log, publish, offset, zeros + 20
+        yield Messages(at, *columns, lambda _at, _length: memoryview(b""))
+
+
+def index_of(runs: Iterator[Messages]) -> order.TimeOrder:
+    return order.TimeOrder(runs, RANKS, lambda _: True, lambda _a, _b: None, Findings())
+
+
+def peak_of(work: Callable[[], object]) -> int:
+    """Greatest memory that some work takes beside what there was before; bytes."""
     tracemalloc.start()
     try:
-        index = order.TimeOrder(runs(), ranks, lambda _: True, lambda _a, _b: None, Findings())
-        held, peak = tracemalloc.get_traced_memory()
+        work()
+        return tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
 
-    assert index.findings.losses == []
-    assert held < 24 * count
-    assert peak < 48 * count
+
+@pytest.mark.parametrize("place", [None, -1])
+@pytest.mark.parametrize("name", LOG_TIMES)
+def test_an_index_takes_at_most_24_bytes_a_message(name: str, place: int | None) -> None:
+    count = 1_500_000
+    index_of(many_messages(100_000, LOG_TIMES[name]))  # modules that load late are no part of it
+
+    assert peak_of(lambda: index_of(many_messages(count, LOG_TIMES[name], place))) <= 24 * count
+
+
+@pytest.mark.parametrize("name", LOG_TIMES)
+@pytest.mark.parametrize("count", [1, 3000, 200_000])
+def test_an_index_that_is_sorted_part_by_part_is_in_order(name: str, count: int) -> None:
+    runs = [*many_messages(count, LOG_TIMES[name])]
+    chunks = {run.chunk_offset: run for run in runs}
+    index = order.TimeOrder(runs, RANKS, lambda _: True, lambda at, _: chunks[at], Findings())
+    log, publish, channel, offset = (
+        np.concatenate([getattr(run, column) for run in runs])
+        for column in ("log_time_ns", "publish_time_ns", "channel", "offset")
+    )
+    keys = RANKS.of(channel), order.published(log, publish, channel), log
+
+    found = np.concatenate([run.offset for run in index.walk(Findings())])
+
+    assert found.tolist() == offset[np.lexsort(keys)].tolist()
+
+
+def test_publish_times_do_not_run_back_within_a_channel_and_a_log_time() -> None:
+    draw = np.random.default_rng(0)
+    log, channel = draw.integers(0, 9, 500), draw.integers(0, 3, 500)
+    publish = draw.integers(0, 99, 500).astype(np.uint64)
+    latest: dict[tuple[int, int], int] = {}
+    expected: list[int] = []
+    for key, time in zip(zip(log, channel, strict=True), publish.tolist(), strict=True):
+        latest[key] = max(time, latest.get(key, 0))
+        expected.append(latest[key])
+
+    assert order.published(log, publish, channel).tolist() == expected
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+def test_sorting_takes_at_most_64_mb_of_data(mixed: bool, tmp_path: Path) -> None:
+    draw = random.Random(0)
+    pictures = [draw.randbytes(1 << 18) for _ in range(4)]
+    times = [*range(600)]  # 150 MB
+    if mixed:
+        draw.shuffle(times)
+    with recordings.Recorder(tmp_path / "a.mcap", chunk_size=1 << 20) as recorder:
+        channel = recorder.channel("camera", "osi3.SensorView")
+        for time in times:
+            recorder.write(channel, time / 10, pictures[time % 4])
+
+    def read(rank: Callable[[int], int] | None) -> None:
+        with McapFile(tmp_path / "a.mcap") as recording:
+            if rank is not None:
+                recording.settle_order(rank)
+            count = sum(
+                len(run.data(row)) > 0
+                for run in recording.walk(Findings(), rank=rank)
+                for row in range(len(run))
+            )
+        assert count == 600
+
+    assert peak_of(lambda: read(lambda _: 1)) <= peak_of(lambda: read(None)) + (64 << 20)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import struct
 from array import array
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, ClassVar, Final, Protocol, Self
 
 import lz4.frame
 import numpy as np
@@ -244,6 +244,15 @@ class Messages:
         ``read(position, length)``: bytes at a position counted as ``offset`` is.
     """
 
+    COLUMNS: ClassVar[tuple[str, ...]] = (
+        "channel",
+        "sequence",
+        "log_time_ns",
+        "publish_time_ns",
+        "offset",
+        "length",
+    )
+
     chunk_offset: int
     channel: Ints
     sequence: Ints
@@ -270,22 +279,13 @@ class Messages:
         """The data of one message."""
         return self.read(int(self.offset[row]) + MESSAGE_HEAD.itemsize, int(self.length[row]))
 
-    def span(self, start: int, stop: int) -> Messages:
+    def span(self, start: int, stop: int) -> Self:
         """The messages from one row up to another."""
         return self.take(slice(start, stop))
 
-    def take(self, rows: NDArray[np.bool_] | slice) -> Messages:
+    def take(self, rows: NDArray[np.bool_] | slice) -> Self:
         """Some of the messages."""
-        return Messages(
-            self.chunk_offset,
-            self.channel[rows],
-            self.sequence[rows],
-            self.log_time_ns[rows],
-            self.publish_time_ns[rows],
-            self.offset[rows],
-            self.length[rows],
-            self.read,
-        )
+        return replace(self, **{name: getattr(self, name)[rows] for name in self.COLUMNS})
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,23 +1,31 @@
 """Messages in order of time, whatever their order in the file.
 
-Messages are ordered by log time. Within a channel equal log times keep their place. Between channels equal log
-times are ordered by publish time, then by the rank of the channel, then by its topic; never by place.
+Messages are ordered by log time. Within a channel, messages of equal log time keep their place. Between
+channels, equal log times are ordered by publish time, then by the rank of the channel, then by its topic. The
+place in the file never decides between channels.
 
-A file whose messages are in this order already is read as it is (:class:`OrderCheck`). Of any other file an
-index is sorted (:class:`TimeOrder`), and messages are handed out in batches: each chunk is read once for a
-batch, and only the data of the channels that are asked for are copied.
+A file whose messages are in this order is read as it is (:class:`OrderCheck`). For any other file an index is
+sorted (:class:`TimeOrder`), and messages are read in batches. A batch reads each of its chunks once, and copies
+the data of the channels that a reader needs.
 
 Notes
 -----
-Publish times may run back within a channel. A message then counts as published with the message before it, so
-that the order of all messages is one order.
+Publish times may run back within a channel. Such a message counts as published with the message before it.
+Without this rule there would be no single order of all messages.
+
+The index takes 21 bytes a message while it is built and sorted, and 5 bytes afterwards. It is kept in blocks,
+each sorted by log time. The blocks are merged part by part: a part has the messages of all blocks up to some
+time, and is removed from the blocks when it is sorted. If one time has more messages than a part may have, they
+are divided by publish time, then by channel.
 """
 
 from __future__ import annotations
 
+from array import array
+from bisect import bisect_right
 from collections import OrderedDict
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal
 
 import numpy as np
 
@@ -25,7 +33,7 @@ from sgstore.errors import TraceError
 from sgstore.mcap._chunks import IDS, MESSAGE_HEAD, Messages
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from mcap.records import Channel, Schema
     from numpy.typing import NDArray
@@ -33,40 +41,52 @@ if TYPE_CHECKING:
     from sgstore.mcap._findings import Findings
 
     Ints = NDArray[np.int64]
+    Numbers = NDArray[np.uint32]
     Times = NDArray[np.uint64]
+    Edge = tuple[Any, Literal["left", "right"]] | None
 
 BATCH_MESSAGES: Final = 16_384
 """Messages of a batch, at most."""
 BATCH_BYTES: Final = 8 << 20
 """Data that are copied for a batch, at most; bytes. A single message may have more."""
 CACHED: Final = 24 << 20
-"""Data of runs of the file that are kept from one batch to the next; bytes."""
-_PARTS: Final = 32
-_SAMPLE: Final = 4096
+"""Memory of chunks that are kept from one batch to the next; bytes."""
+COLUMN_BYTES: Final = 8 * 6
+"""Memory of the columns of a message, beside its data; bytes."""
 OFTEN: Final = 2
-"""A run of the file that is read more often in one reading is reported."""
+"""A chunk that is read more often in one reading is reported."""
+
+_ENTRY: Final = np.dtype([("log", "i8"), ("publish", "u8"), ("channel", "u2"), ("row", "u2")])
+_BLOCK: Final = 1 << 15  # a block has fewer than two times as many messages: a row has 16 bits
+_PARTS: Final = 64
+_SAMPLE: Final = 4096
+_KEYS: Final = ("log", "publish", "channel")
+_SIZES: Final = np.floor(2 ** (np.arange(256) / 8)).astype(np.int64)
+"""Code of a size → bytes: sizes are kept in one byte each, rounded up by at most 9 %."""
 
 
 class OutOfOrder(Exception):  # noqa: N818  (a signal, not an error)
-    """A walk in order of time met messages that are not; the next walk sorts them."""
+    """A walk in order of time met messages out of order. The next walk sorts them."""
 
 
 @dataclass(frozen=True, slots=True)
 class SortedMessages(Messages):
-    """Messages of several chunks, in order of time; ``chunk_offset`` is that of none of them.
+    """Messages of several chunks, in order of time.
 
     Attributes
     ----------
     places : int64
-        Byte offset of the chunk of each, -1 outside chunks.
-    held : list
-        The data of each that were copied, else ``None``.
+        Byte offset of the chunk of each message, -1 outside chunks. ``chunk_offset`` has no meaning here.
+    held : object
+        The data of each message as bytes; ``None`` if they were not copied.
     fetch : callable
         ``fetch(place, offset, length)``: the data of a message that were not copied.
     """
 
+    COLUMNS: ClassVar[tuple[str, ...]] = (*Messages.COLUMNS, "places", "held")
+
     places: Ints
-    held: list[bytes | None]
+    held: NDArray[np.object_]
     fetch: Callable[[int, int, int], memoryview]
 
     @property
@@ -80,27 +100,10 @@ class SortedMessages(Messages):
 
     def data(self, row: int) -> memoryview:
         """The data of one message."""
-        held = self.held[row]
+        held: bytes | None = self.held[row]
         if held is not None:
             return memoryview(held)
         return self.fetch(int(self.places[row]), int(self.offset[row]), int(self.length[row]))
-
-    def take(self, rows: NDArray[np.bool_] | slice) -> SortedMessages:
-        """Some of the messages."""
-        picked = np.arange(len(self))[rows].tolist()
-        return SortedMessages(
-            self.chunk_offset,
-            self.channel[rows],
-            self.sequence[rows],
-            self.log_time_ns[rows],
-            self.publish_time_ns[rows],
-            self.offset[rows],
-            self.length[rows],
-            self.read,
-            self.places[rows],
-            [self.held[row] for row in picked],
-            self.fetch,
-        )
 
 
 @dataclass(slots=True)
@@ -110,8 +113,8 @@ class ChannelRanks:
     Attributes
     ----------
     rank : callable
-        Rank of a channel by its id: the least comes first. Below 0: what is read does not depend on its place
-        among other channels at one time, so that such a file counts as in order.
+        Channel id → rank; the least comes first. A rank below 0 means that a reader does not depend on the
+        place of the channel among others of one time. Such a file counts as in order.
     schemas, channels : mapping
         Records by their id; both may grow.
     """
@@ -124,46 +127,50 @@ class ChannelRanks:
     _loose: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(IDS, np.bool_))
 
     def of(self, channel: NDArray[Any]) -> Ints:
-        """Number of each channel in that order."""
+        """Position of each channel in the order of channels."""
         self._learn()
         return self._numbers[channel]
 
     def is_loose(self, channel: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return for each channel whether its place at one time does not matter."""
+        """True for each channel whose place among others of one time does not matter."""
         self._learn()
         return self._loose[channel]
 
     def _learn(self) -> None:
         if self._known != len(self.channels):
             self._known = len(self.channels)
-            for number, one in enumerate(sorted(self.channels, key=self._key)):
-                self._numbers[one] = number
-                self._loose[one] = self.rank(one) < 0
+            for number, channel in enumerate(sorted(self.channels, key=self._key)):
+                self._numbers[channel] = number
+                self._loose[channel] = self.rank(channel) < 0
 
     def _key(self, number: int) -> tuple[Any, ...]:
         record = self.channels[number]
         schema = self.schemas.get(record.schema_id)
         name = schema.name if schema else ""
-        about = sorted(record.metadata.items())
-        return self.rank(number), record.topic, name, record.message_encoding, about, number
+        metadata = sorted(record.metadata.items())
+        return self.rank(number), record.topic, name, record.message_encoding, metadata, number
 
 
 def published(log_time: Ints, publish_time: Times, channel: NDArray[Any]) -> Times:
-    """Publish times that do not run back among the messages of one channel and one log time."""
-    order = np.lexsort((channel, log_time))  # stable: what is equal keeps its place
+    """Publish times, raised so that they do not run back within a channel and log time."""
+    order = np.lexsort((channel, log_time))  # stable: equal messages keep their place
     log, number, times = log_time[order], channel[order], publish_time[order]
     same = (log[1:] == log[:-1]) & (number[1:] == number[:-1])
     if not (same & (times[1:] < times[:-1])).any():
         return publish_time
-    starts = np.flatnonzero(np.concatenate([[True], ~same]))
-    raised = [np.maximum.accumulate(part) for part in np.split(times, starts[1:])]
-    found = publish_time.copy()
-    found[order] = np.concatenate(raised)
-    return found
+    group = np.concatenate([[0], np.cumsum(~same)])
+    step, longest = 1, np.bincount(group).max()
+    while step < longest:  # after it, each time is the greatest of 2 * step in its group
+        earlier = np.where(group[step:] == group[:-step], times[:-step], 0)
+        times[step:] = np.maximum(times[step:], earlier)
+        step *= 2
+    result = np.empty_like(publish_time)
+    result[order] = times
+    return result
 
 
 class OrderCheck:
-    """Tells whether messages come in order of time.
+    """Checks run by run whether messages are in order of time.
 
     Parameters
     ----------
@@ -178,7 +185,7 @@ class OrderCheck:
         self._channel = np.zeros(0, np.int64)
 
     def follows(self, run: Messages) -> bool:
-        """Return whether the messages of a run come in order, and behind all before them."""
+        """Return whether the messages of a run are in order, and behind all earlier ones."""
         log = np.concatenate([self._log, run.log_time_ns])
         steps = np.diff(log)
         if (steps < 0).any():
@@ -196,7 +203,7 @@ class OrderCheck:
         return True
 
     def _is_in_order(self, log: Ints, publish: Times, channel: Ints) -> bool:
-        """Return whether messages of one log time, one behind the other, are in order."""
+        """Return whether neighbours of equal log time are in order."""
         bound = ~self._ranks.is_loose(channel)
         log, publish, number = log[bound], publish[bound], self._ranks.of(channel[bound])
         before = publish[1:] < publish[:-1]
@@ -204,17 +211,33 @@ class OrderCheck:
         return not ((log[1:] == log[:-1]) & before).any()
 
 
+# The sorted index ---------------------------------------------------------------------------------
+
+
 @dataclass(slots=True)
-class _FileRun:
-    """Messages that stand together in the file.
+class _IndexBlock:
+    """Entries of messages that stand together in the file; ``first``: number of the first one in the file."""
 
-    ``place``: byte offset of the chunk, -1 outside chunks; ``offsets``: of the records, outside chunks only.
-    """
+    first: int
+    entries: NDArray[np.void]
 
-    place: int
-    count: int
-    size: int
-    offsets: Ints | None
+    def sort(self, key: str) -> None:
+        """Sort the entries by a key; equal ones keep their place."""
+        self.entries = self.entries[np.argsort(self.entries[key], kind="stable")]
+
+    def split(self, key: str, edge: Edge) -> _IndexBlock:
+        """Remove the entries before an edge; ``None``: all. The entries are sorted by the key."""
+        at = len(self.entries) if edge is None else np.searchsorted(self.entries[key], *edge)
+        part = _IndexBlock(
+            self.first, self.entries[:at].copy()
+        )  # no view: the block must become smaller
+        if at:
+            self.entries = self.entries[at:].copy()
+        return part
+
+    def numbers(self) -> Numbers:
+        """The number of each message in the file."""
+        return (self.first + self.entries["row"].astype(np.int64)).astype(np.uint32)
 
 
 class TimeOrder:
@@ -226,61 +249,81 @@ class TimeOrder:
         All messages, in file order.
     ranks : ChannelRanks
     keeps : callable
-        Whether the data of the messages of a channel will be asked for.
+        Whether the data of the messages of a channel will be needed.
     again : callable
-        ``again(place, offsets)``: reads the messages of a run once more.
+        ``again(place, count)``: reads a run of ``count`` messages once more. ``place``: byte offset of its
+        chunk, or of its first record outside chunks.
 
     Attributes
     ----------
     findings : Findings
-        What reading the file brought to light.
+        Losses and warnings of reading the file.
     """
 
     def __init__(
         self,
-        runs: Iterator[Messages],
+        runs: Iterable[Messages],
         ranks: ChannelRanks,
         keeps: Callable[[int], bool],
-        again: Callable[[int, Ints | None], Messages],
+        again: Callable[[int, int], Messages],
         findings: Findings,
     ) -> None:
         self.findings = findings
         self._again = again
-        self._runs: list[_FileRun] = []
         self._kept = np.zeros(IDS, np.bool_)
         self._cache: OrderedDict[int, Messages] = OrderedDict()
         self._last = np.zeros(IDS, np.int64)
         self._back = 0
-        log, publish, channel, size = bytearray(), bytearray(), bytearray(), bytearray()
-        for run in runs:  # 22 bytes a message
-            log += run.log_time_ns.tobytes()
-            publish += run.publish_time_ns.tobytes()
-            channel += run.channel.astype(np.uint16).tobytes()
-            size += self._take(run, keeps).tobytes()
-        self._sizes = np.frombuffer(size, np.uint32)
-        times = np.frombuffer(log, np.int64), np.frombuffer(publish, np.uint64)
-        self._order = _sorted(*times, np.frombuffer(channel, np.uint16), ranks)
-        self._starts = np.cumsum([0, *(run.count for run in self._runs)])
-        self._number = {run.place: number for number, run in enumerate(self._runs)}
+        # Of each run: where it begins in the file and among all messages, its data, and whether it is a chunk.
+        self._places, self._starts = array("q"), array("q", [0])
+        self._bytes, self._is_chunk = array("q"), array("b")
+        codes = bytearray()
+        blocks = [*self._blocks(runs, keeps, codes)]
+        self._codes = np.frombuffer(codes, np.uint8)
+        for block in blocks:
+            block.entries["channel"] = ranks.of(block.entries["channel"])
+        most = max(len(codes) // _PARTS, _SAMPLE)
+        parts = [*_in_order(blocks, _KEYS, most)] if blocks else []
+        self._order = np.concatenate([np.zeros(0, np.uint32), *parts])
 
-    def _take(self, run: Messages, keeps: Callable[[int], bool]) -> NDArray[np.uint32]:
-        """Take note of a run; how many bytes of each message will be copied."""
+    def _blocks(
+        self, runs: Iterable[Messages], keeps: Callable[[int], bool], codes: bytearray
+    ) -> Iterator[_IndexBlock]:
+        """Blocks of the index, sorted by log time; appends the code of each message's size to ``codes``."""
+        waiting, first = bytearray(), 0
+        for run in runs:
+            self._note(run, keeps)
+            sizes = np.where(self._kept[run.channel], run.length, 0)
+            codes += np.minimum(np.ceil(8 * np.log2(sizes + 1)), 255).astype(np.uint8).tobytes()
+            for start in range(0, len(run), _BLOCK):
+                waiting += _entries_of(run.span(start, start + _BLOCK))
+                if len(waiting) >= _BLOCK * _ENTRY.itemsize:
+                    yield (block := _block_of(waiting, first))
+                    waiting, first = bytearray(), first + len(block.entries)
+        if waiting:
+            yield _block_of(waiting, first)
+
+    def _note(self, run: Messages, keeps: Callable[[int], bool]) -> None:
+        """Note the place of a run, the channels in it, and how far log times run back."""
         for number in np.unique(run.channel).tolist():
             self._kept[number] = keeps(number)
             times = run.log_time_ns[run.channel == number]
             back = int(-np.diff(times, prepend=self._last[number]).min())
             self._back = max(self._back, back)
             self._last[number] = times[-1]
-        outside = run.chunk_offset < 0
-        offsets = run.offset.copy() if outside else None
-        size = int(run.length.sum())
-        self._runs.append(_FileRun(run.chunk_offset, len(run), size, offsets))
-        return np.where(self._kept[run.channel], run.length, 0).astype(np.uint32)
+        is_chunk = run.chunk_offset >= 0
+        self._places.append(run.chunk_offset if is_chunk else int(run.offset[0]))
+        self._starts.append(self._starts[-1] + len(run))
+        self._bytes.append(int(run.length.sum()))
+        self._is_chunk.append(is_chunk)
 
     def walk(
         self, report: Findings, wanted: Callable[[int], bool] | None = None
     ) -> Iterator[Messages]:
-        """The messages in order of time; what could not be read goes to ``report``."""
+        """The messages in order of time; losses and warnings go to ``report``.
+
+        ``wanted``: whether the chunk at an offset is wanted; others are passed over.
+        """
         report.warnings += self.findings.warnings
         for loss in self.findings.losses:
             report.lose(loss)
@@ -289,48 +332,50 @@ class TimeOrder:
                 f"log times run back in the file by up to {self._back / 1e9:g} s on one channel:"
                 " messages are read in order of log time"
             )
-        reads = np.zeros(len(self._runs), np.int64)
-        chosen = np.ones(len(self._runs), np.bool_)
+        reads = np.zeros(len(self._places), np.uint32)
+        chosen = np.ones(len(self._places), np.bool_)
         if wanted is not None:
-            chosen[:] = [run.place < 0 or wanted(run.place) for run in self._runs]
+            runs = zip(self._places, self._is_chunk, strict=True)
+            chosen[:] = [not is_chunk or wanted(place) for place, is_chunk in runs]
+        starts = np.frombuffer(self._starts, np.int64)
         start = 0
         while start < len(self._order):
             numbers = self._order[start : start + BATCH_MESSAGES].astype(np.int64)
-            sizes = np.cumsum(self._sizes[numbers], dtype=np.int64)
+            sizes = np.cumsum(_SIZES[self._codes[numbers]])
             numbers = numbers[: max(int(np.searchsorted(sizes, BATCH_BYTES)), 1)]
             start += len(numbers)
-            of = np.searchsorted(self._starts, numbers, side="right") - 1
+            of = np.searchsorted(starts, numbers, side="right") - 1
             numbers, of = numbers[chosen[of]], of[chosen[of]]
             if len(numbers):
-                yield self._batch(numbers, of, reads)
+                yield self._batch(numbers - starts[of], of, reads)
         often = np.flatnonzero(reads > OFTEN)
         if len(often):
-            size = sum(self._runs[run].size for run in often.tolist())
+            size = sum(self._bytes[run] for run in often.tolist())
             report.warnings.append(
                 f"messages are far from their order in time: {size} bytes in {len(often)} parts of the file"
                 f" were read more than {OFTEN} times (at most {reads.max()})"
             )
         self._cache.clear()
 
-    def _batch(self, numbers: Ints, of: Ints, reads: Ints) -> SortedMessages:
-        """Some messages by their number in the file; ``of``: the run of each."""
-        columns = np.zeros((6, len(numbers)), np.int64)
-        held: list[bytes | None] = [None] * len(numbers)
+    def _batch(self, rows: Ints, of: Ints, reads: Numbers) -> SortedMessages:
+        """Some messages by their row in a run; ``of``: the run of each."""
+        columns = np.zeros((7, len(rows)), np.int64)
+        held = np.full(len(rows), None, np.object_)
         for run in np.unique(of).tolist():
             messages = self._read(run, reads)
             mine = np.flatnonzero(of == run)
-            rows = numbers[mine] - self._starts[run]
-            columns[0, mine] = messages.channel[rows]
-            columns[1, mine] = messages.sequence[rows]
-            columns[2, mine] = messages.log_time_ns[rows]
-            columns[3, mine] = messages.publish_time_ns[rows].view(np.int64)
-            columns[4, mine] = messages.offset[rows]
-            columns[5, mine] = messages.length[rows]
-            needed = self._kept[messages.channel[rows]]
-            for at, row in zip(mine[needed].tolist(), rows[needed].tolist(), strict=True):
-                held[at] = bytes(messages.data(row))
-        places = np.array([run.place for run in self._runs], np.int64)[of]
-        channel, sequence, log_time, publish_time, offset, length = columns
+            row = rows[mine]
+            columns[0, mine] = messages.channel[row]
+            columns[1, mine] = messages.sequence[row]
+            columns[2, mine] = messages.log_time_ns[row]
+            columns[3, mine] = messages.publish_time_ns[row].view(np.int64)
+            columns[4, mine] = messages.offset[row]
+            columns[5, mine] = messages.length[row]
+            columns[6, mine] = messages.chunk_offset
+            needed = self._kept[messages.channel[row]]
+            for at, one in zip(mine[needed].tolist(), row[needed].tolist(), strict=True):
+                held[at] = bytes(messages.data(one))
+        channel, sequence, log_time, publish_time, offset, length, places = columns
         return SortedMessages(
             -1,
             channel,
@@ -345,56 +390,123 @@ class TimeOrder:
             self._fetch,
         )
 
-    def _read(self, number: int, reads: Ints | None = None) -> Messages:
+    def _read(self, number: int, reads: Numbers | None = None) -> Messages:
         """The messages of a run."""
-        found = self._cache.get(number)
-        if found is not None:
+        messages = self._cache.get(number)
+        if messages is not None:
             self._cache.move_to_end(number)
-            return found
+            return messages
         if reads is not None:
             reads[number] += 1
-        run = self._runs[number]
-        found = self._again(run.place, run.offsets)
-        if len(found) != run.count:
-            raise TraceError("the file was changed while it was read", offset=max(run.place, 0))
-        self._cache[number] = found
+        place, count = self._places[number], self._count(number)
+        messages = self._again(place, count)
+        if len(messages) != count:
+            raise TraceError("the file was changed while it was read", offset=place)
+        self._cache[number] = messages
         while len(self._cache) > 1 and self._cached() > CACHED:
             self._cache.popitem(last=False)
-        if run.size > CACHED:
+        if self._memory(number) > CACHED:
             self._cache.clear()
-        return found
+        return messages
+
+    def _count(self, number: int) -> int:
+        return self._starts[number + 1] - self._starts[number]
+
+    def _memory(self, number: int) -> int:
+        """Memory of the messages of a run; bytes."""
+        return self._bytes[number] + COLUMN_BYTES * self._count(number)
 
     def _cached(self) -> int:
-        return sum(self._runs[number].size for number in self._cache)
+        return sum(map(self._memory, self._cache))
 
     def _fetch(self, place: int, offset: int, length: int) -> memoryview:
         """The data of a message that were not copied."""
-        if place < 0:
-            return self._again(-1, np.array([offset], np.int64)).data(0)
-        return self._read(self._number[place]).read(offset + MESSAGE_HEAD.itemsize, length)
+        number = bisect_right(self._places, offset if place < 0 else place) - 1
+        return self._read(number).read(offset + MESSAGE_HEAD.itemsize, length)
 
 
 def _no_place(_position: int, _length: int) -> memoryview:
-    """Messages of several chunks have no bytes by their position alone."""
+    """Reject a position without a chunk: the messages are from several chunks."""
     raise NotImplementedError
 
 
-def _sorted(
-    log: Ints, publish: Times, channel: NDArray[Any], ranks: ChannelRanks
-) -> NDArray[np.uint32]:
-    """Numbers of messages in order of time, sorted part by part so that little memory is needed."""
-    order = np.empty(len(log), np.uint32)
-    sample = np.sort(log[:: max(len(log) // _SAMPLE, 1)])
-    edges: list[int | None] = [None]
-    if len(sample):
-        at = np.linspace(0, len(sample), _PARTS + 1).astype(np.int64)[1:-1]
-        edges = [*np.unique(sample[at]).tolist(), None]
-    start, rest = 0, np.ones(len(log), np.bool_)
-    for edge in edges:
-        rows = np.flatnonzero(rest if edge is None else rest & (log < edge))
-        rest[rows] = False
-        times, number = log[rows], channel[rows]
-        keys = ranks.of(number), published(times, publish[rows], number), times
-        order[start : start + len(rows)] = rows[np.lexsort(keys)]
-        start += len(rows)
-    return order
+def _entries_of(run: Messages) -> bytes:
+    """The entries of at most ``_BLOCK`` messages, without their rows."""
+    entries = np.zeros(len(run), _ENTRY)
+    entries["log"], entries["publish"] = run.log_time_ns, run.publish_time_ns
+    entries["channel"] = run.channel
+    return entries.tobytes()
+
+
+def _block_of(entries: bytearray, first: int) -> _IndexBlock:
+    block = _IndexBlock(first, np.frombuffer(entries, _ENTRY))
+    block.entries["row"] = np.arange(len(block.entries))
+    block.sort("log")
+    return block
+
+
+def _in_order(blocks: Sequence[_IndexBlock], keys: Sequence[str], most: int) -> Iterator[Numbers]:
+    """Numbers of messages in order of time, part by part; the blocks become empty.
+
+    Parameters
+    ----------
+    blocks : sequence of _IndexBlock
+        In file order, each sorted by the first of the keys.
+    keys : sequence of str
+        Those of ``_KEYS`` in which messages may differ.
+    most : int
+        Messages that may be sorted at once.
+    """
+    key, *others = keys
+    for edge in _edges(blocks, key, most):
+        part = [one for block in blocks if len((one := block.split(key, edge)).entries)]
+        if not part:
+            continue
+        if sum(len(block.entries) for block in part) <= most:
+            yield _sorted(part)
+        elif len(np.unique([block.entries[key][[0, -1]] for block in part])) > 1:
+            yield from _in_order(part, keys, most)
+        elif others:
+            if key == "log":
+                _raise_publish_times(part)
+            for block in part:
+                block.sort(others[0])
+            yield from _in_order(part, others, most)
+        else:  # of one channel and one time: they keep their place
+            yield from (block.numbers() for block in part)
+
+
+def _edges(blocks: Sequence[_IndexBlock], key: str, most: int) -> list[Edge]:
+    """Edges of parts that have at most about half as many messages as may be sorted at once.
+
+    A value of many messages is a part of its own. The last part begins at the greatest value.
+    """
+    count = sum(len(block.entries) for block in blocks)
+    step = max(count // _SAMPLE, 1)
+    picked = [block.entries[key][at] for block in blocks for at in (slice(None, None, step), [-1])]
+    sample = np.sort(np.concatenate(picked))
+    at = np.linspace(0, len(sample) - 1, 2 * count // most + 2).astype(np.int64)
+    edges: list[Edge] = []
+    for value, times in zip(*np.unique(sample[at], return_counts=True), strict=True):
+        edges.append((value, "left"))
+        if times > 1:
+            edges.append((value, "right"))
+    return [*edges, None]
+
+
+def _raise_publish_times(blocks: Sequence[_IndexBlock]) -> None:
+    """Apply :func:`published` to messages of one log time, block by block."""
+    latest = np.zeros(IDS, np.uint64)
+    for block in blocks:
+        channel = block.entries["channel"]
+        times = np.maximum(block.entries["publish"], latest[channel])
+        block.entries["publish"] = published(block.entries["log"], times, channel)
+        np.maximum.at(latest, channel, block.entries["publish"])
+
+
+def _sorted(blocks: Sequence[_IndexBlock]) -> Numbers:
+    """Numbers of the messages of some blocks, in order of time."""
+    entries = np.concatenate([block.entries for block in blocks])
+    log, channel = entries["log"], entries["channel"]
+    order = np.lexsort((channel, published(log, entries["publish"], channel), log))
+    return np.concatenate([block.numbers() for block in blocks])[order]

@@ -52,7 +52,6 @@ from sgstore.mcap._chunks import (
     name_of,
     parse_records,
     read_chunk_head,
-    read_records,
 )
 from sgstore.mcap._fetch import (
     METADATA,
@@ -69,7 +68,7 @@ from sgstore.mcap._order import ChannelRanks, OrderCheck, OutOfOrder, TimeOrder
 from sgstore.mcap._read_ahead import MAGIC, ReadAhead, Spool, chunks_in, read_summary
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Generator, Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -178,7 +177,7 @@ class McapFile:
         self.metadata: dict[RecordPlace, Metadata] = {}
         self.attachments: list[RecordPlace] = []
         self.counts: dict[int, int] | None
-        self.compression = "zstd"
+        self.compression, self._has_met_chunk = "zstd", False
         self._verified: set[int] = set()
         self._aheads: list[ReadAhead] = []
         self._known_channels = np.zeros(IDS, np.bool_)
@@ -299,35 +298,23 @@ class McapFile:
             if known == len(self.channels):
                 return found
 
-    def _again(self, place: int, offsets: Ints | None) -> Messages:
-        """Read once more the messages of the chunk at a place, or those outside chunks at some offsets."""
-        if offsets is not None:
-            messages = self._outside(offsets)
-        else:
-            messages = self._spool.get(self.path, place, lambda: self._anew(place).read)
-            messages = self._anew(place) if messages is None else messages
-        known = self._known_channels[messages.channel]
-        return messages if known.all() else messages.take(known)
-
-    def _anew(self, place: int) -> Messages:
-        """The messages of a chunk, from the file; of one whose end is missing, those that are whole."""
-        try:
-            head = read_chunk_head(self._file, place)
-            return parse_records(read_records(self._file, head, verify=False), place)[0]
-        except TraceError:
-            kept = self._of_cut(place)[1]
-            if kept is None:
-                raise
-            return kept
+    def _again(self, place: int, count: int) -> Messages:
+        """Read once more a run of messages, from the chunk or record at a place on."""
+        runs = self._in_file_order(Findings(), _all, None, place)
+        for run in runs:
+            runs.close()
+            return run.span(0, count)
+        raise TraceError("the file was changed while it was read", path=self.path, offset=place)
 
     def _in_file_order(
         self,
         report: Findings,
         wanted: Callable[[int], bool] | None,
         keep: Callable[[int], bool] | None,
-    ) -> Iterator[Messages]:
-        """All messages in file order."""
-        walk = _FileWalk(report, self._read_ahead(wanted), wanted, keep)
+        start: int = len(MAGIC),
+    ) -> Generator[Messages]:
+        """All messages in file order, from the record at ``start`` on."""
+        walk = _FileWalk(report, self._read_ahead(wanted), wanted, keep, start)
         self._aheads.append(walk.ahead)
         try:
             while not walk.closed:
@@ -377,7 +364,7 @@ class McapFile:
     def _read_ahead(self, wanted: Callable[[int], bool] | None) -> ReadAhead:
         """Start to read the chunks of a walk before their turn, if they are many and all wanted."""
         if wanted is not None or self.size <= SMALL:
-            return ReadAhead(self._file)
+            return ReadAhead(self._file, verified=self._verified)
         offsets = self._chunk_starts or chunks_in(self._file)
         offsets = (at for at in offsets if not self._spool.has(self.path, at))
         return ReadAhead(self._file, offsets, self._verified)
@@ -471,8 +458,8 @@ class McapFile:
         head = None
         try:
             head = read_chunk_head(self._file, place.offset)
-            if walk.chunks == 1:
-                self.compression = head.compression
+            if not self._has_met_chunk:
+                self.compression, self._has_met_chunk = head.compression, True
             walk.unverified += head.crc == 0
             messages, definitions = self._records(walk, head)
         except TraceError as error:
@@ -622,7 +609,8 @@ class McapFile:
 
     def _define_at(self, walk: _FileWalk, opcode: int, place: RecordPlace) -> None:
         if opcode == Opcode.ATTACHMENT:
-            if place not in self.attachments[-1:]:
+            known = self.attachments[-1].offset if self.attachments else -1
+            if place.offset > known:  # a later walk meets it again
                 self.attachments.append(place)
         elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA}:
             if place.length > MAX_DEFINITION:
@@ -781,8 +769,10 @@ class McapBag(McapFile):
         report: Findings,
         wanted: Callable[[int], bool] | None,
         keep: Callable[[int], bool] | None,
-    ) -> Iterator[Messages]:
+        start: int = 0,
+    ) -> Generator[Messages]:
         """All messages, file by file."""
+        del start  # several files are read from their beginning, always
         report.losses += self._faults
         for base, file in self._files.items():
             found = Findings()
@@ -798,16 +788,14 @@ class McapBag(McapFile):
                 file.close()
                 _take_up(found, report, file.path.name, base)
 
-    def _again(self, place: int, offsets: Ints | None) -> Messages:
-        """Read once more the messages of a chunk, or those outside chunks, of one file."""
-        at = place if offsets is None else int(offsets[0])
-        part = part_at(self._parts, at)
+    def _again(self, place: int, count: int) -> Messages:
+        """Read once more a run of messages of one file."""
+        part = part_at(self._parts, place)
         if part is None or part.base not in self._files:
-            raise TraceError("no file of the bag is there", path=self.path, offset=at)
+            raise TraceError("no file of the bag is there", path=self.path, offset=place)
         file, base = self._files[part.base], part.base
         self._use(file)
-        inside = None if offsets is None else offsets - base
-        messages = self._placed(file, file._again(place - base, inside), base)  # noqa: SLF001  (its own class)
+        messages = self._placed(file, file._again(place - base, count), base)  # noqa: SLF001  (its own class)
 
         def read(position: int, length: int) -> memoryview:
             self._use(file)
