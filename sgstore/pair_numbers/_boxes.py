@@ -42,6 +42,14 @@ def _turned(angle: str) -> str:
     return f"{angle} - 360 * ceil(({angle} - 180) / 360)"
 
 
+_SPREAD: Final = "sqrt((b_x - a_x) * (b_x - a_x) + (b_y - a_y) * (b_y - a_y))"
+_TILT: Final = "greatest(abs(sin(coalesce(a_pitch, 0))), abs(sin(coalesce(b_pitch, 0))))"
+# Written into the branch that needs it: most pairs share a height.
+_CLIMB: Final = (
+    f"greatest(least({GRADE}e0 * {_SPREAD}, {STOREY}e0), {_SPREAD} * least({STEEPEST}e0, {_TILT}))"
+)
+"""Height that a road may climb between two bodies."""
+
 NUMBERS: Final[Mapping[str, PairFunction]] = {
     "dist": PairFunction(
         "distance between the centres, in space",
@@ -140,11 +148,9 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
 PARTS: Final[Mapping[str, str]] = {
     # Two on different storeys, and what pulls or carries the other, are no pair: NULL, else 0.
     "apart": "CASE WHEN a_high > a_low AND b_high > b_low"
-    f" THEN least(greatest(b_low - a_high, a_low - b_high) - {TOUCH:.0e}, abs(b_low - a_low) - climb)"
-    f" ELSE abs(b_low - a_low) - greatest({STOREY}e0, climb) END",
-    "climb": f"greatest(least({GRADE}e0 * spread, {STOREY}e0), spread * least({STEEPEST}e0, tilt))",
-    "tilt": "greatest(abs(sin(coalesce(a_pitch, 0))), abs(sin(coalesce(b_pitch, 0))))",
-    "spread": "sqrt((b_x - a_x) * (b_x - a_x) + (b_y - a_y) * (b_y - a_y))",
+    f" AND greatest(b_low - a_high, a_low - b_high) <= {TOUCH:.0e} THEN 0"
+    f" WHEN a_high > a_low AND b_high > b_low OR abs(b_low - a_low) > {STOREY}e0"
+    f" THEN abs(b_low - a_low) - {_CLIMB} ELSE 0 * (b_low - a_low) END",
     "level": "CASE WHEN apart > 0 OR a_carrier = b_node_id OR b_carrier = a_node_id OR a_carrier = b_carrier"
     " THEN NULL ELSE 0 END",
     # What is flat is no body: NULL, else 0.
