@@ -313,8 +313,8 @@ def test_nothing_is_beyond_a_graph(tmp_path: Path) -> None:
     assert judged(tmp_path, f"USING SCOPE graph {text}", 50) == "true"
 
 
-@pytest.mark.parametrize(("limit", "expected"), [(50, "unknown"), (200, "false")])
-def test_two_beyond_the_graph_may_be_near(tmp_path: Path, limit: float, expected: str) -> None:
+@pytest.mark.parametrize(("limit", "expected"), [(50, "false"), (200, "false")])
+def test_two_beyond_the_graph_are_near(tmp_path: Path, limit: float, expected: str) -> None:
     rungs = "near|very_near|super_near|near_coll"
     text = f"CHECK c: ALWAYS NOT EXISTS {{(v:Vehicle)-[:{rungs}]->(w:Vehicle)}}"
     assert judged(tmp_path, text, limit) == expected

@@ -13,6 +13,7 @@ from sgstore.errors import QueryError, TextSpan
 from sgstore.lang import ir as b
 from sgstore.lang import ir as o
 from sgstore.lang import syntax as s
+from sgstore.lang._beyond import whole_block
 from sgstore.lang._bind_expressions import BINDERS, edge_attribute, node_attribute, parameter
 from sgstore.lang._bind_match_values import over_match
 from sgstore.lang._bind_stages import StageBinder, name_path
@@ -94,6 +95,7 @@ def bind_query(
     session.ask(catalog)
     match = _only_match(statements, session)
     settings = chosen(match.settings, session, catalog)
+    session.look_beyond(catalog, world=settings.scope == "world")
     if settings.end is not None:
         session.refuse("USING END belongs to CHECK", match.settings[0].span)
     if settings.gaps == "unknown":
@@ -365,13 +367,16 @@ def bind_block(block: s.Block, names: SymbolTable) -> None:
         names.scope.where += b.conjuncts(names.condition(block.where))
 
 
-def _block(e: s.BlockExpression, names: SymbolTable) -> b.BlockValue:
+def _block(e: s.BlockExpression, names: SymbolTable) -> b.Bound:
     session, inner = names.session, names.block()
     bind_block(e.block, inner)
     value = inner.number(e.value) if e.value is not None else None
     kind = Type.boolean if e.word == "EXISTS" else Type.number
     session.blocks += 1
-    return b.BlockValue(e.word, inner.scope.finished(), value, kind, session.blocks)
+    block = b.BlockValue(e.word, inner.scope.finished(), value, kind, session.blocks)
+    found = whole_block(block, session.blocks + 1)
+    session.blocks += sum(isinstance(part, b.BlockValue) for part in b.walk(found)) - 1
+    return found
 
 
 _BINDERS: Final[Binders] = {
@@ -481,6 +486,7 @@ def _edge(edge: s.EdgePattern, left: str, right: str, names: SymbolTable) -> str
             edge.name is not None,
             edge.span,
             known=names.scope.parent is not None,
+            beyond=session.beyond if names.scope.parent is not None else (),
         )
     )
     return key
@@ -837,6 +843,7 @@ def bind_checks(
 
 def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog) -> o.BoundCheck:
     settings = chosen(written.settings, session, catalog)
+    session.look_beyond(catalog, world=settings.scope != "graph")
     if settings.policy is not None:
         session.refuse("USING MATCHES belongs to sequences", written.settings[0].span)
     scope = StepScope(session)

@@ -97,6 +97,8 @@ class DisplayUnit(StrEnum):
     """How many frames of the store are of the class of the frame, in an abstraction; the column is its name."""
     seen = "seen"
     """Whether the class of the frame, in an abstraction, is that of a frame of a dataset."""
+    inside = "inside"
+    """Whether a node is in the graph of the frame; of what moves, its state says so."""
     role = "role"
     """What a lane is to the ego, frame by frame: in the view ``roles``."""
     own = "own"
@@ -239,7 +241,8 @@ IN_GRAPH: Final = Attribute(
     Type.boolean,
     {Home.state: "in_graph"},
     "whether it is in the graph of the frame, in scope ``world``",
-    own_kinds=_ENTITIES,
+    DisplayUnit.inside,
+    _ENTITIES,
 )
 """Of queries made here alone: who writes one has the scope."""
 
@@ -615,6 +618,12 @@ class RelationScope:
     kinds : tuple of pairs of str
     between : str
         What distances are measured between: :attr:`sgstore.config.Proximity.between`.
+    rungs : tuple of (str, float)
+        Relations of distance, from the nearest on, and their upper bounds; m.
+    near_kinds : tuple of pairs of str
+        Those that they are among; empty: all.
+    radius : float
+        A circle around the ego that is in its graph; m.
     """
 
     within: float = 25.0
@@ -623,6 +632,9 @@ class RelationScope:
     ego_within: float = 0.0
     kinds: tuple[tuple[str, ...], ...] = ()
     between: str = "centres"
+    rungs: tuple[tuple[str, float], ...] = ()
+    near_kinds: tuple[tuple[str, ...], ...] = ()
+    radius: float = 0.0
 
     @classmethod
     def of(cls, settings: Mapping[str, Any]) -> Self | None:
@@ -630,10 +642,20 @@ class RelationScope:
         pairs = settings.get("pairs")
         if pairs is None:
             return None
-        kinds = tuple(tuple(labels) for labels in pairs["kinds"])
-        between = settings["proximity"]["between"]
+        near, around = settings["proximity"], settings["range"]
         names = ("within", "ego", "static", "ego_within")
-        return cls(**{name: pairs[name] for name in names}, kinds=kinds, between=between)
+        return cls(
+            **{name: pairs[name] for name in names},
+            kinds=_pairs_of(pairs["kinds"]),
+            between=near["between"],
+            rungs=tuple(zip(near["names"], near["upper"], strict=False)),
+            near_kinds=_pairs_of(near["kinds"]),
+            radius=around["radius"] if around["shape"] == "radius" else 0.0,
+        )
+
+
+def _pairs_of(labels: Iterable[Iterable[str]]) -> tuple[tuple[str, ...], ...]:
+    return tuple(map(tuple, labels))
 
 
 @dataclass(frozen=True, slots=True)

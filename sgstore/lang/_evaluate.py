@@ -18,7 +18,7 @@ import numpy as np
 
 from sgstore.criticality import RECORDED
 from sgstore.lang import ir as b
-from sgstore.lang._catalog import IN_GRAPH, NODE_ATTRIBUTES, DisplayUnit, Type
+from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit, Type
 from sgstore.lang._operators import OPERATORS, Column
 from sgstore.pair_numbers import (
     COLUMNS,
@@ -321,7 +321,7 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
                 return lambda at: _in_junction(at, at.nodes[node])
             if attribute is NODE_ATTRIBUTES["type"]:
                 return lambda at: _type_of(at.view.nodes[at.nodes[node]])
-            if attribute is IN_GRAPH:
+            if attribute.unit is DisplayUnit.inside:
                 return lambda at: at.view.draws(at.nodes[node])
             name = attribute.name
             if attribute is NODE_ATTRIBUTES["lifetime"]:
@@ -579,16 +579,12 @@ def _of_crowd(part: b.Bound, key: str) -> Columns[Asked] | None:
 
 def _is_derived(attribute: Attribute) -> bool:
     """Tell whether an attribute is not told with the node as a float, or as true or false."""
-    return (
-        attribute is IN_GRAPH
-        or attribute.unit
-        in {
-            DisplayUnit.binding,
-            DisplayUnit.role,
-            DisplayUnit.own,
-        }
-        or attribute in {NODE_ATTRIBUTES["injunction"], NODE_ATTRIBUTES["lifetime"]}
-    )
+    return attribute.unit in {
+        DisplayUnit.inside,
+        DisplayUnit.binding,
+        DisplayUnit.role,
+        DisplayUnit.own,
+    } or attribute in {NODE_ATTRIBUTES["injunction"], NODE_ATTRIBUTES["lifetime"]}
 
 
 def _of_others(value: b.NodeAttribute | b.PairNumber) -> Columns[Asked]:

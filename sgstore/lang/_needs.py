@@ -35,7 +35,7 @@ from sgstore.lang.ir import (
     ego_kinds,
     is_one_of,
 )
-from sgstore.pair_numbers import COURSES, WAYS, columns_needed
+from sgstore.pair_numbers import COURSES, TOUCH, WAYS, columns_needed
 from sgstore.vocabulary import (
     SIGNALS,
     VEHICLE_LIGHTS,
@@ -46,7 +46,7 @@ from sgstore.vocabulary import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
     from sgstore.lang._catalog import TraceFacts
     from sgstore.lang.ir import BoundCheck
@@ -71,16 +71,27 @@ def in_range(a: str, b: str, traces: Iterable[TraceFacts]) -> Bound:
     Bound
         False of what is no entity; unknown in traces whose settings are not known.
     """
+    return in_traces(scopes_of(traces), lambda reach: related(a, b, reach))
+
+
+def scopes_of(traces: Iterable[TraceFacts]) -> b.Scopes:
+    """Return which pairs are related in some traces: each way once, with the ids of its traces."""
     of: dict[RelationScope | None, list[int]] = {}
     for trace in traces:
         of.setdefault(trace.reach, []).append(trace.trace_id)
-    if len(of) < 2:
-        return _related(a, b, next(iter(of), RelationScope()))
+    return tuple((reach, tuple(ids)) for reach, ids in of.items()) or ((RelationScope(), ()),)
+
+
+def in_traces(scopes: b.Scopes, condition: Callable[[RelationScope | None], Bound]) -> Bound:
+    """Return a condition that is another one in traces with other settings."""
+    if len(scopes) < 2:
+        return condition(scopes[0][0])
     number = TraceAttribute(TRACE_ATTRIBUTES["id"], Type.number)
-    return _or(_and(is_one_of(number, ids), _related(a, b, reach)) for reach, ids in of.items())
+    return _or(_and(is_one_of(number, ids), condition(reach)) for reach, ids in scopes)
 
 
-def _related(a: str, b: str, reach: RelationScope | None) -> Bound:
+def related(a: str, b: str, reach: RelationScope | None) -> Bound:
+    """Return the condition that the relations of two nodes were computed with some settings."""
     if reach is None:
         return Value(None, Type.boolean)
     ego = _or(LabelTest(node, ego_kinds()) for node in (a, b))
@@ -95,13 +106,53 @@ def _related(a: str, b: str, reach: RelationScope | None) -> Bound:
         ways.append(_and(*further, *move, near))
         if reach.static:
             ways.append(_and(*further, _still(a), _still(b), near))
+    entities = [LabelTest(node, any_kinds().only(entity_kinds())) for node in (a, b)]
+    return _and(*entities, *_listed(a, b, reach.kinds), _or(ways))
+
+
+def _listed(a: str, b: str, kinds: Iterable[tuple[str, ...]]) -> list[Bound]:
+    """Return the condition that two nodes have labels that are listed; none where none are."""
     listed = [
         _and(LabelTest(a, _labelled(one)), LabelTest(b, _labelled(other)))
-        for pair in reach.kinds
+        for pair in kinds
         for one, other in (pair, pair[::-1])
     ]
-    entities = [LabelTest(node, any_kinds().only(entity_kinds())) for node in (a, b)]
-    return _and(*entities, *([_or(listed)] if listed else []), _or(ways))
+    return [_or(listed)] if listed else []
+
+
+def bounded(a: str, b: str, names: Iterable[str], reach: RelationScope) -> Bound:
+    """Return the condition that two entities have one of some relations that end at some distance.
+
+    Parameters
+    ----------
+    a, b : str
+        Keys of the nodes.
+    names : iterable of str
+        Rungs of the settings, and ``overlaps``.
+    reach : RelationScope
+        The settings.
+    """
+    wanted, ways, low = frozenset(names), list[Bound](), list[Bound]()
+    for name, high in reach.rungs:
+        near = _up_to(a, b, high, reach)
+        if name in wanted:
+            ways.append(_and(near, *low))
+        low = [_not(near)]
+    near = [_and(related(a, b, reach), *_listed(a, b, reach.near_kinds), _or(ways))] if ways else []
+    return _or([*near, _touch(a, b, reach)] if "overlaps" in wanted else near)
+
+
+def _touch(a: str, b: str, reach: RelationScope) -> Bound:
+    """Return the condition that two bodies touch, of which one moves."""
+    solid = [_not(LabelTest(node, _SIGNAL)) for node in (a, b)]
+    moves = _or(_not(_still(node)) for node in (a, b))
+    ego = [] if reach.within > 0 else [_or(LabelTest(node, ego_kinds()) for node in (a, b))]
+    if not (reach.within > 0 or reach.ego):
+        return Value(value=False, type=Type.boolean)
+    listed = _listed(a, b, reach.kinds)
+    return _and(
+        *solid, moves, *ego, *listed, _no_more(_pair("gap", a, b), Value(TOUCH, Type.number))
+    )
 
 
 def _labelled(label: str) -> Kinds:

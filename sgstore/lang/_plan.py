@@ -188,7 +188,7 @@ def _file(condition: Bound, parts: Phases) -> None:
         parts.direct.append(condition)
     elif any(
         isinstance(leaf, NodeAttribute | EdgeAttribute)
-        and leaf.attribute.unit in {DisplayUnit.role, DisplayUnit.own}
+        and leaf.attribute.unit in {DisplayUnit.role, DisplayUnit.own, DisplayUnit.inside}
         for leaf in found
     ):
         parts.rest.append(condition)

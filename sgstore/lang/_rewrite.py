@@ -12,7 +12,6 @@ from itertools import combinations, pairwise, product
 from typing import TYPE_CHECKING, Any, Final, TypeGuard
 
 from sgstore.lang._catalog import (
-    IN_GRAPH,
     NODE_ATTRIBUTES,
     Attribute,
     Catalog,
@@ -206,7 +205,7 @@ def nothing_beyond(scope: Scope, catalog: Catalog) -> Scope:
     """In scope ``graph``, and where nothing is known beyond the graphs, all are in the graph."""
 
     def known(value: Bound) -> Bound:
-        if isinstance(value, NodeAttribute) and value.attribute is IN_GRAPH:
+        if isinstance(value, NodeAttribute) and value.attribute.unit is DisplayUnit.inside:
             return Value(value=True, type=Type.boolean)
         return with_operands(value, known)
 
@@ -407,7 +406,8 @@ def stands_alone(condition: Bound, catalog: Catalog) -> TypeGuard[BlockValue]:
 
 def _of_table(leaf: NodeAttribute) -> bool:
     """Tell whether an attribute stands in the table of its node."""
-    return leaf.attribute.unit not in {DisplayUnit.role, DisplayUnit.own, DisplayUnit.owner}
+    bare = {DisplayUnit.role, DisplayUnit.own, DisplayUnit.owner, DisplayUnit.inside}
+    return leaf.attribute.unit not in bare
 
 
 def _ends(scope: Scope) -> set[str]:
@@ -545,7 +545,7 @@ def is_lasting(leaf: Leaf, scope: Scope, catalog: Catalog) -> bool:
             if attribute.unit in {DisplayUnit.binding, DisplayUnit.owner} or is_constant(leaf):
                 return True
             profile = Profile.of(scope.kinds(node), catalog)
-            if attribute.unit in {DisplayUnit.role, DisplayUnit.own}:
+            if attribute.unit in {DisplayUnit.role, DisplayUnit.own, DisplayUnit.inside}:
                 return False
             return not profile.moving and not profile.fixed
         case _:

@@ -53,6 +53,7 @@ from sgstore.lang._sql_masks import (
     in_mask,
     in_which,
     merged,
+    stands_text,
     told_kinds,
     with_blocks,
 )
@@ -786,6 +787,13 @@ def _of_node(sql: SqlBuilder, join: Join, scope: Scope, node: str, attribute: At
         return role_text(join.frame, join.nodes[node])
     if attribute.unit is DisplayUnit.own:
         return own_text(attribute, join.frame, join.nodes[node])
+    if attribute.unit is DisplayUnit.inside:
+        state = join.at.get(node, Aliases()).state
+        told = [] if state is None else [f'{state}."in_graph"']
+        profile = Profile.of(scope.kinds(node), sql.catalog)
+        if profile.fixed or profile.mapped:
+            told.append(stands_text(join.frame, join.nodes[node]))
+        return if_bound(sql, join.nodes[node], f"coalesce({', '.join(told)})")
     value = attribute_text(attribute, join.at[node])
     return if_bound(sql, join.nodes[node], value) if attribute.name == "is_ego" else value
 

@@ -417,6 +417,13 @@ def in_mask(alias: str, frame: str) -> str:
     return f'({alias}."mask" & ({bit_of(frame)})) <> 0'
 
 
+def stands_text(frame: str, node: str) -> str:
+    """Return the SQL that what stands is in the graph of a frame, not beyond it."""
+    on = [f'":g"."bucket" = {frame} >> 6', f'":g"."node_id" = {node}', in_mask('":g"', frame)]
+    rows = Select(["1"], ['"graph_node" AS ":g"'], on)
+    return f"EXISTS ({rows.text()})"
+
+
 def number_of_frames(text: str) -> str:
     """Return the number of frames of a first-phase relation that binds nothing, as ``frames``."""
     total = 'coalesce(sum(bit_count("mask")), 0) AS "frames"'

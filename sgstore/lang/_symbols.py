@@ -20,6 +20,7 @@ from sgstore.lang import ir as b
 from sgstore.lang import syntax as s
 from sgstore.lang._catalog import PAIR_NAMES, Attribute, DisplayUnit, Home, Type
 from sgstore.lang._hints import condition_hint, hint_at, variable_hint
+from sgstore.lang._needs import scopes_of
 from sgstore.lang.ir import Bound, Edge, Kinds, Node, Scope, ego_kinds
 from sgstore.lang.library import predicates
 from sgstore.records import dataclass
@@ -99,6 +100,8 @@ class Session:
         The key of the ego, once the query has named it ``ego``, wherever that is.
     numbers, blocks : int
         Unnamed nodes and edges, and blocks, so far.
+    beyond : Scopes
+        Which relations traces have, of a statement that asks for them beyond the graphs; else empty.
     """
 
     text: str
@@ -122,12 +125,18 @@ class Session:
     the_ego: str | None = None
     numbers: int = 0
     blocks: int = 0
+    beyond: b.Scopes = ()
 
     def ask(self, catalog: Catalog) -> None:
         """Take over what a catalog says of the store that is asked."""
         self.classed, self.tables, self.traces = catalog.classed, catalog.tables, catalog.traces
         self.own, self.own_edges, self.part = catalog.own, catalog.own_edges, catalog.part
         self.online = catalog.online
+
+    def look_beyond(self, catalog: Catalog, *, world: bool) -> None:
+        """Take over which relations traces have, if a statement asks for them beyond the graphs."""
+        if world and (catalog.world or catalog.online):
+            self.beyond = scopes_of(self.traces)
 
     def key(self, name: str | None) -> str:
         """A key that is not taken: the name itself if it can be; ``#1``, ``#2``, … for what has none."""

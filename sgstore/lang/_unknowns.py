@@ -12,11 +12,18 @@ from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Final
 
 from sgstore.lang import ir as b
-from sgstore.lang._catalog import IN_GRAPH, NODE_ATTRIBUTES, DisplayUnit, Type
-from sgstore.lang._horizon import LINKS
-from sgstore.lang._needs import MEASURED, MOTION
+from sgstore.lang._beyond import beyond_graph, bounded_in, holds
+from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit, RelationScope, Type
+from sgstore.lang._needs import MEASURED, MOTION, in_traces, related
 from sgstore.pair_numbers import columns_needed
-from sgstore.vocabulary import BEYOND, MAP_ONLY, entity_kinds, normalize_name
+from sgstore.vocabulary import (
+    BEYOND,
+    DIRECTIONS,
+    MAP_ONLY,
+    SIDES,
+    entity_kinds,
+    normalize_name,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -30,6 +37,8 @@ _ANSWERS: Final = frozenset({"IS NULL", "IS NOT NULL", "coalesce", "case"})
 _FLIPPED: Final = {"<": ">=", "<=": ">", ">": "<=", ">=": "<", "=": "<>", "<>": "="}
 _COMPUTED: Final = frozenset({*BEYOND, *MAP_ONLY, "mayAffect"})
 """Relations that are known beyond the graphs as they are in them."""
+_OF_PAIRS: Final = frozenset({*DIRECTIONS, *SIDES})
+"""Relations of all pairs that settings relate."""
 _FALSE: Final = b.Value(value=False, type=Type.boolean)
 _LOOSE: Final = 1 << 20
 """Added to the number of a block that also has the matches of which too little is known."""
@@ -282,18 +291,20 @@ def _edges_of(condition: b.Bound) -> frozenset[str]:
 def _not_computed(edge: b.Edge, block: b.BlockValue) -> b.Bound | None:
     """The condition that an edge in braces was not computed, as an end of it is beyond the graph.
 
-    A relation that ends at some distance does not hold of entities that are farther apart.
+    A relation of pairs does not hold of two that settings do not relate, nor one of distance of two that are
+    farther apart.
     """
     names = edge.relations - _COMPUTED
     ends = [block.scope.kinds(key).every & entity_kinds() for key in (edge.src, edge.dst)]
-    if not edge.known or not names or not all(ends):
+    if not edge.beyond or not names or not all(ends):
         return None
-    far = any_of(
-        [_not(b.NodeAttribute(key, IN_GRAPH, Type.boolean)) for key in (edge.src, edge.dst)]
-    )
-    limits = [LINKS.get(name) for name in names]
-    if edge.high > 1 or None in limits:
-        return far
-    limit = b.Value(max(one for one in limits if one is not None), Type.number)
-    apart = b.PairNumber("dist", edge.src, edge.dst)
-    return _both(far, b.Operation("<=", (apart, limit), Type.boolean))
+    away = beyond_graph(edge)
+    if edge.high > 1 or names - _OF_PAIRS - bounded_in(edge.beyond):
+        return away
+    if not names & _OF_PAIRS:
+        return _both(away, holds(edge, names))
+    return _both(away, in_traces(edge.beyond, lambda reach: _related(edge, reach)))
+
+
+def _related(edge: b.Edge, reach: RelationScope | None) -> b.Bound:
+    return related(edge.src, edge.dst, reach or RelationScope())

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, Literal, TypeGuard
 
-from sgstore.lang._catalog import NODE_ATTRIBUTES, Attribute, DisplayUnit, Type
+from sgstore.lang._catalog import NODE_ATTRIBUTES, Attribute, DisplayUnit, RelationScope, Type
 from sgstore.lang._durations import (
     BoundHold,  # noqa: TC001  they are of this module
     Length,  # noqa: F401  # pyright: ignore[reportUnusedImport]
@@ -41,6 +41,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from sgstore.errors import TextSpan
+
+
+Scopes = tuple[tuple[RelationScope | None, tuple[int, ...]], ...]
+"""Which pairs of entities are related in traces, and the ids of the traces; ``None``: that is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +87,9 @@ class Edge:
     known : bool
         Whether it is asked of all that is known in the scope: it stands in braces. One of a pattern is an
         edge of the graph in every scope.
+    beyond : Scopes
+        Of one in braces, in scope ``world``: which relations the traces have. Empty where it is told of all
+        that is known, or nothing is beyond the graphs.
     """
 
     key: str
@@ -95,6 +102,7 @@ class Edge:
     named: bool
     span: TextSpan
     known: bool = False
+    beyond: Scopes = ()
 
 
 # Expressions --------------------------------------------------------------------------------------

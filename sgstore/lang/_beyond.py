@@ -1,0 +1,148 @@
+"""Relations that end at some distance, of entities beyond the graph: told by where these are.
+
+Of two entities of which one is beyond the graph no edges were computed. But rungs of ``[proximity]`` and
+``overlaps`` are defined by places and sizes, which are known. So in scope ``world`` braces that ask for such an
+edge are asked twice: for the edge, and, of pairs that are not both in the graph, for its definition. No match
+is in both answers, so numbers of matches add up.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import combinations
+from typing import TYPE_CHECKING, Final
+
+from sgstore.lang import ir as b
+from sgstore.lang._catalog import IN_GRAPH, RelationScope, Type
+from sgstore.lang._horizon import LINKS
+from sgstore.lang._needs import bounded, in_traces
+from sgstore.vocabulary import DIRECTIONS, PROXIMITY, entity_kinds
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+_MOST: Final = 3
+"""Edges in braces that are told so; there are as many questions as sets of them."""
+
+_SIDES: Final = 10.0
+"""Half lengths of two bodies, by which their centres are farther apart than their edges; m."""
+
+
+def beyond_graph(edge: b.Edge) -> b.Bound:
+    """Return the condition that the ends of an edge are two, and not both in the graph."""
+    keys = edge.src, edge.dst
+    two = b.Operation("<>", tuple(map(b.NodeValue, keys)), Type.boolean)
+    ends = (b.NodeAttribute(key, IN_GRAPH, Type.boolean) for key in keys)
+    away = _any([b.Operation("NOT", (end,), Type.boolean) for end in ends])
+    return b.Operation("AND", (two, away), Type.boolean)
+
+
+def whole_block(block: b.BlockValue, number: int) -> b.Bound:
+    """Return what a block is of all that is known, and with it of pairs beyond the graph.
+
+    Parameters
+    ----------
+    block : BlockValue
+        Asked of the edges that were computed.
+    number : int
+        From which on blocks have no number yet.
+    """
+    edges = [edge for edge in block.scope.edges if _is_told(edge, block)]
+    if not edges or len(edges) > _MOST or block.word not in _JOINED:
+        return block
+    told = {edge.key for edge in edges}
+    computed = [replace(e, beyond=()) if e.key in told else e for e in block.scope.edges]
+    block = replace(block, scope=replace(block.scope, edges=tuple(computed)))
+    blocks = [block]
+    for many in range(1, len(edges) + 1):
+        for some in combinations(edges, many):
+            blocks.append(_defined(block, some, number))
+            number += 1
+    return _JOINED[block.word](blocks)
+
+
+def _is_told(edge: b.Edge, block: b.BlockValue) -> bool:
+    """Tell whether the definition of an edge says all of it that was not computed."""
+    if edge.high > 1 or edge.named or not edge.beyond:
+        return False
+    kinds = [block.scope.kinds(key) for key in (edge.src, edge.dst)]
+    if not all(one.every & entity_kinds() for one in kinds):
+        return False
+    scopes = [reach for reach, _ in edge.beyond]
+    known = [reach for reach in scopes if reach is not None]
+    if len(known) < len(scopes):
+        return False
+    if edge.relations - bounded_in(edge.beyond):
+        return False
+    # Who is as near to the ego is in the graph.
+    of_ego = any(not one.other for one in kinds)
+    return not (of_ego and all(_reach(edge, reach) <= reach.radius for reach in known))
+
+
+def bounded_in(scopes: b.Scopes) -> frozenset[str]:
+    """Return the relations that end at some distance; a trace without such a rung has none."""
+    rungs = (name for reach, _ in scopes if reach is not None for name, _ in reach.rungs)
+    return frozenset({"overlaps", *PROXIMITY, *rungs}) - frozenset(DIRECTIONS)
+
+
+def _reach(edge: b.Edge, reach: RelationScope) -> float:
+    limits = (high for name, high in reach.rungs if name in edge.relations)
+    return max(limits, default=0.0) + _SIDES
+
+
+def _defined(block: b.BlockValue, edges: tuple[b.Edge, ...], number: int) -> b.BlockValue:
+    """The block of pairs beyond the graph that have some edges by their definition."""
+    told = {edge.key for edge in edges}
+    where = [*block.scope.where]
+    for edge in edges:
+        where += [beyond_graph(edge), holds(edge, edge.relations)]
+    rest = tuple(edge for edge in block.scope.edges if edge.key not in told)
+    return replace(block, scope=replace(block.scope, edges=rest, where=tuple(where)), number=number)
+
+
+def holds(edge: b.Edge, names: Iterable[str]) -> b.Bound:
+    """Return the condition that an edge has one of some relations by their definition.
+
+    Where settings are not known: that it may have one.
+    """
+    among = frozenset(names)
+
+    def of_scope(reach: RelationScope | None) -> b.Bound:
+        if reach is not None:
+            return bounded(edge.src, edge.dst, among, reach)
+        limit = b.Value(
+            max((LINKS.get(name, math.inf) for name in among), default=0.0), Type.number
+        )
+        apart = b.PairNumber("dist", edge.src, edge.dst)
+        return b.Operation("<=", (apart, limit), Type.boolean)
+
+    return in_traces(edge.beyond, of_scope)
+
+
+def _any(conditions: list[b.Bound]) -> b.Bound:
+    return b.Operation("OR", tuple(conditions), Type.boolean)
+
+
+def _sum(blocks: list[b.BlockValue]) -> b.Bound:
+    found: b.Bound = blocks[0]
+    for one in blocks[1:]:
+        found = b.Operation("+", (found, one), Type.number)
+    return found
+
+
+def _extreme(word: str, blocks: list[b.BlockValue]) -> b.Bound:
+    found: b.Bound = blocks[0]
+    for one in blocks[1:]:
+        both = b.Operation(word, (found, one), Type.number)
+        found = b.Operation("coalesce", (both, found, one), Type.number)
+    return found
+
+
+_JOINED: Final = {
+    "EXISTS": lambda blocks: _any([*blocks]),
+    "COUNT": _sum,
+    "MIN": lambda blocks: _extreme("min", blocks),
+    "MAX": lambda blocks: _extreme("max", blocks),
+}
+"""What a block is, made of those that have its matches."""
