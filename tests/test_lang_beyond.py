@@ -123,7 +123,10 @@ def test_a_search_in_memory_finds_the_same_beyond_graphs(near: Store, trace: str
         text = f"USING SCOPE world MATCH {named(asked, trace)} AND trace.name = '{trace}'"
         found[asked] = sum(row[0] in frames for row in rows(near, text))
         query = compile_query(text, near.catalog()).bound
-        views = (near._view(near.file.frame(frame), query) for frame in frames)
+        views = (
+            near._view(near.file.frame(frame), query)  # pyright: ignore[reportPrivateUsage]
+            for frame in frames
+        )
         seen[asked] = sum(
             1 for view in views for _ in ScopeSearch(query.scope, injective=True).run(Binding(view))
         )

@@ -20,7 +20,7 @@ from sgstore.lang._needs import bounded, in_traces
 from sgstore.vocabulary import DIRECTIONS, PROXIMITY, entity_kinds
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable, Mapping
 
 _MOST: Final = 3
 """Edges in braces that are told so; there are as many questions as sets of them."""
@@ -139,7 +139,7 @@ def _extreme(word: str, blocks: list[b.BlockValue]) -> b.Bound:
     return found
 
 
-_JOINED: Final = {
+_JOINED: Final[Mapping[str, Callable[[list[b.BlockValue]], b.Bound]]] = {
     "EXISTS": lambda blocks: _any([*blocks]),
     "COUNT": _sum,
     "MIN": lambda blocks: _extreme("min", blocks),

@@ -85,7 +85,7 @@ def scopes_of(traces: Iterable[TraceFacts]) -> b.Scopes:
 def in_traces(scopes: b.Scopes, condition: Callable[[RelationScope | None], Bound]) -> Bound:
     """Return a condition that is another one in traces with other settings."""
     if len(scopes) < 2:
-        return condition(scopes[0][0])
+        return condition(next(reach for reach, _ in scopes))
     number = TraceAttribute(TRACE_ATTRIBUTES["id"], Type.number)
     return _or(_and(is_one_of(number, ids), condition(reach)) for reach, ids in scopes)
 
