@@ -639,6 +639,54 @@ def test_ingest_and_info_say_what_settings_cut(tmp_path: Path, sgstore: Any) -> 
     ]
 
 
+def test_select_and_criticality_say_what_settings_cut(store: str, sgstore: Any) -> None:
+    graph = "scope graph: 25,349 of 36,189 states lie beyond the graphs (50 m)"
+    world = "scope world: 3,153 of 36,189 states lie beyond the world (200 m)"
+    for words, cut in (
+        (("select", store, "--budget", "3frames"), graph),
+        (("criticality", store), world),
+        (("coverage", "spec", store, "MATCH (e:Ego) RETURN e.kind"), graph),
+    ):
+        code, _, err = sgstore(*words)
+        assert code == 0, err
+        assert [line for line in err.splitlines() if "lie beyond" in line] == [f"sgstore: {cut}"]
+        code, _, err = sgstore(*words, "--json")
+        (told,) = [json.loads(line)["scope"] for line in err.splitlines() if line[:1] == "{"]
+        assert (told["scope"], told["states"]) == (cut.split()[1][:-1], 36189)
+
+
+def test_a_collection_says_what_settings_cut_as_a_store_does(
+    store: str, tmp_path: Path, sgstore: Any
+) -> None:
+    place, rule = tmp_path / "lake", tmp_path / "rule.sgql"
+    rule.write_text("CHECK slow: ALWAYS ego.speed < 90")
+    assert sgstore("collection", "pack", store, place)[0] == 0
+    union = f"{CROSSING} RETURN frame.id UNION {CROSSING} RETURN frame.id"
+    for verb, *rest in (
+        ("find", CROSSING),
+        ("find", f"USING SCOPE world {CROSSING}"),
+        ("find", union),
+        ("check", rule),
+        ("select", "--budget", "3frames"),
+        ("coverage", "classes"),
+    ):
+        first, *more = rest
+        words = [verb, first, "{}"] if verb == "coverage" else [verb, "{}", first, *more]
+        told = [
+            [
+                line
+                for line in sgstore(*(str(word).replace("{}", str(of)) for word in words), *form)[
+                    2
+                ].splitlines()
+                if "lie beyond" in line or "beyond_radius" in line
+            ]
+            for of in (store, place)
+            for form in ((), ("--json",))
+        ]
+        assert [len(one) for one in told] == [1, 1, 1, 1], words
+        assert told[:2] == told[2:]
+
+
 def test_prioritize_and_coverage_say_what_settings_cut(store: str, sgstore: Any) -> None:
     graph = "scope graph: 25,349 of 36,189 states lie beyond the graphs (50 m)"
     world = "scope world: 3,153 of 36,189 states lie beyond the world (200 m)"

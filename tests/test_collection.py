@@ -27,7 +27,7 @@ from sgstore.lang import _catalog, compile_query, ir, syntax
 from sgstore.lang import _parts as parts
 from sgstore.lang._aggregates import AGGREGATES
 from sgstore.query import Store
-from sgstore.store import CATALOGUE, StoreFile, _bundles
+from sgstore.store import CATALOGUE, StoreFile, _bundles, write_parquet
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -347,7 +347,7 @@ def many_bundles(count: int) -> catalogue.Snapshot:
         name = f"{number:064x}"
         facts["bundle"].append((name, 1, 1, 1, catalogue.SCHEMA_VERSION, "", "", 0, 1))
         about = (number + 1, f"t{number}", f"d{number}", "e", "", "", "c", answers, 10, 0, 1)
-        facts["trace"].append((name, *about, 100_000_000, "u", (number + 1) << 12, 1, ""))
+        facts["trace"].append((name, *about, 100_000_000, "u", (number + 1) << 12, 1, "", ""))
         facts["kind"] += [(name, "moving", kind) for kind in kinds]
         for relation in ("near", "visible"):
             for kind in kinds:
@@ -694,3 +694,13 @@ def test_what_is_wrong_with_a_question_is_no_fault_of_a_bundle(
     with pytest.raises(QueryNameError) as found:
         Collection(place, partial=True).find("MATCH (a:Car)").rows()
     assert (str(found.value), found.value.as_dict()) == (str(refused), refused.as_dict())
+
+
+def test_a_catalogue_of_before_knows_no_scopes(tmp_path: Path) -> None:
+    columns = {"bundle": "VARCHAR", "trace_id": "BIGINT"}
+    path = tmp_path / "trace.parquet"
+    write_parquet([*columns], [("b", 7)], path, [*columns.values()])
+
+    assert _bundles.parquet_rows(path, [*columns, "scope"]) == [("b", 7, None)]
+    snapshot = catalogue.Snapshot()
+    assert snapshot.scope(world=True) == {}

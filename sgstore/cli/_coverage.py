@@ -373,6 +373,7 @@ def spec_(
     if by and cells:
         raise typer.BadParameter("give one of --by and --cells")
     chosen, *reference = ask.frames(a, *([by] if by else []))
+    say_scope(chosen.scope(world=False), ask.chosen)
     tables = specification(chosen, query, cells, *reference)
     ask.report(tables[2 if missing else 1 if covered else 0], limit)
 
@@ -468,6 +469,7 @@ def _slot_table(
     from sgstore.coverage import read_specifications, slot_coverage
 
     (chosen,) = ask.frames(text)
+    say_scope(chosen.scope(world=False), ask.chosen)
     tables = slot_coverage(chosen, read_specifications(slots), k)
     return tables[1 if covered else 2 if missing else 0]
 
@@ -654,7 +656,9 @@ def select(
         raise typer.BadParameter(f"--output {output}: the name of a lock ends in {ENDING}")
     shares = parse_split(split) if split else {}
     opened = whole.opened_at(store, bounds)
-    found = choose(chosen_frames(opened, str(store), query, parameters), spec)
+    chosen = chosen_frames(opened, str(store), query, parameters)
+    say_scope(chosen.scope(world=False), out.chosen)
+    found = choose(chosen, spec)
     parts = split_up(found, shares) if shares else {}
     for text in found.said:
         say(text)

@@ -53,10 +53,12 @@ def criticality(
     A row is the ego of a trace and one of those that it could meet: the view
     encounters in SQL. In patterns they are functions, as in pet(e, v) < 1.5.
     """
-    from sgstore.coverage import ReportTable
+    from sgstore.coverage import ChosenFrames, ReportTable
     from sgstore.criticality import RECORDED, recorded
 
-    found = recorded(bounds.opened(store), tuple(measures or RECORDED))
+    opened = bounds.opened(store)
+    found = recorded(opened, tuple(measures or RECORDED))
+    say_scope(ChosenFrames(str(store), opened).scope(world=True), out.chosen)
     rows = found.values
     if most is not None:
         first = found.columns.index("kind") + 1

@@ -180,6 +180,7 @@ def _found_in(
         number = matches.count()
         typer.echo(number)
     else:
+        say_scope(matches.scope, ask.chosen)
         number = ask.write(*_as_shown(matches, matches, ask.chosen))
     say_left_out(matches)
     if count:

@@ -25,6 +25,7 @@ from sgstore.store import (
     answers_of,
     parquet_rows,
     relations_of_set,
+    scope_of,
     subset_catalogs,
     write_parquet,
 )
@@ -140,6 +141,12 @@ class Snapshot:
         names = [*CATALOGUE["trace"]]
         found = (dict(zip(names, row, strict=True)) for row in self.facts["trace"])
         return tuple(sorted(found, key=lambda row: natural(row["name"])))
+
+    def scope(self, *, world: bool, traces: Iterable[int] | None = None) -> dict[str, Any]:
+        """What settings left out of some traces, or of all; see :func:`sgstore.store.scope_of`."""
+        chosen = None if traces is None else frozenset(traces)
+        told = (row["scope"] for row in self.traces if chosen is None or row["trace_id"] in chosen)
+        return scope_of(({"scope": json.loads(one)} for one in told if one), world=world)
 
     @cached_property
     def homes(self) -> dict[int, str]:

@@ -572,6 +572,12 @@ class PartedMatches(Tabular):
         """Notes on likely mistakes: none are looked for in a collection."""
         return ()
 
+    @property
+    def scope(self) -> dict[str, Any]:
+        """What settings left out of the traces that are asked; see :func:`sgstore.store.scope_of`."""
+        chosen = (trace.trace_id for trace in self._ready.chosen)
+        return self.snapshot.scope(world=self._ready.bound.world, traces=chosen)
+
     def _rows(self, *, whole: bool) -> Iterator[Any]:
         del whole  # a bundle is asked as a whole
         return iter(self)
@@ -726,6 +732,14 @@ class PartedUnion(UnionMatches):
         """Tell whether it speaks of the classes of the frames of all bundles."""
         return any(part.of_all for part in self._parts)
 
+    @property
+    def scope(self) -> dict[str, Any]:
+        """What settings left out of the traces that any part is asked of."""
+        parts = [part._ready for part in self._parts]  # noqa: SLF001
+        chosen = {trace.trace_id for one in parts for trace in one.chosen}
+        snapshot = self._parts[0].snapshot
+        return snapshot.scope(world=any(one.bound.world for one in parts), traces=chosen)
+
     def _rows(self, *, whole: bool) -> Iterator[Any]:
         if self.graphs:
             yield from super()._rows(whole=whole)
@@ -811,6 +825,12 @@ class PartedChecks:
     def notes(self) -> tuple[str, ...]:
         """Notes on likely mistakes: none are looked for in a collection."""
         return ()
+
+    @property
+    def scope(self) -> dict[str, Any]:
+        """What settings left out of the traces; see :func:`sgstore.store.scope_of`."""
+        world = any(one.check.world for one in self._checks)
+        return self._whole.snapshot.scope(world=world)
 
     def explain(self) -> str:
         """Explain the checks: formulas over atoms, and each atom."""

@@ -191,13 +191,13 @@ class ChosenFrames:
         return tuple(self.reasons)
 
     def scope(self, *, world: bool) -> dict[str, Any]:
-        """States that settings cut, as :func:`sgstore.store.scope_of` has them; none of a collection."""
-        if not isinstance(self.store, Store):
-            return {}
-        traces = self.store.info()
+        """States that settings cut, as :func:`sgstore.store.scope_of` has them."""
+        chosen = None
         if self.frame_id is not None:
             chosen = set(np.unique(trace_of(self.frame_id)).tolist())
-            traces = [one for one in traces if one.trace_id in chosen]
+        if not isinstance(self.store, Store):
+            return self.store.snapshot.scope(world=world, traces=chosen)
+        traces = [one for one in self.store.info() if chosen is None or one.trace_id in chosen]
         return scope_of((one.report for one in traces), world=world)
 
     @property

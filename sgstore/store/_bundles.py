@@ -247,6 +247,7 @@ CATALOGUE: Final[dict[str, dict[str, str]]] = {
         "uri": "VARCHAR",
         "first_bucket": "BIGINT",
         "buckets": "BIGINT",
+        "scope": "VARCHAR",
         "segment": "VARCHAR",
     },
     "config": {"config": "VARCHAR", "settings": "VARCHAR"},
@@ -287,8 +288,12 @@ CATALOGUE: Final[dict[str, dict[str, str]]] = {
 
 ``word``: the names that the compiler must know beside its own: of an enumeration (``kind``, ``relation``,
 ``light_state``), of attributes of a client's own (``own``, ``own_edges``, with their types), and of
-abstractions in which the classes of frames are known (``classed``).
+abstractions in which the classes of frames are known (``classed``). ``trace.scope``: what settings left out of
+it, as its report has it, in JSON; empty or NULL: not known.
 """
+
+LATER: Final = frozenset({"scope"})
+"""Columns that catalogues of before do not have."""
 
 Facts = dict[str, list[tuple[Any, ...]]]
 """Rows of a catalogue by table."""
@@ -296,7 +301,8 @@ Facts = dict[str, list[tuple[Any, ...]]]
 _TRACES: Final = """
 SELECT t.trace_id, t.name, r.digest, coalesce(t.ego, ''), coalesce(m.name, ''), coalesce(m.digest, ''),
 c.digest,
-       to_json(t.answers)::VARCHAR, t.frames, t.start_ns, t.end_ns, t.period_ns, r.uri, b.first, b.buckets
+       to_json(t.answers)::VARCHAR, t.frames, t.start_ns, t.end_ns, t.period_ns, r.uri, b.first, b.buckets,
+       coalesce(json_extract(t.report, '$.scope')::VARCHAR, '')
 FROM trace t JOIN recording r ON r.recording_id = t.recording_id JOIN config c ON c.config_id = t.config_id
      LEFT JOIN map m ON m.map_id = t.map_id
      JOIN (SELECT trace_id, min(bucket) AS first, max(bucket) - min(bucket) + 1 AS buckets FROM bucket GROUP BY
@@ -406,17 +412,22 @@ def maps_of_traces(path: Path, traces: Iterable[int]) -> dict[str, str]:
 
 
 def parquet_rows(path: Path, columns: Iterable[str]) -> list[tuple[Any, ...]]:
-    """Rows of a Parquet file of ours, columns of some names.
+    """Rows of a Parquet file of ours, columns of some names; NULL for those of :data:`LATER` that it lacks.
 
     Raises
     ------
     StoreError
         It cannot be read, or has no such columns.
     """
-    listed = ", ".join(map(quoted, columns))
+    names = [*columns]
+    listed = ", ".join(map(quoted, names))
+    later = ", ".join(f"NULL::VARCHAR AS {quoted(name)}" for name in names if name in LATER)
     try:
         with duckdb.connect(":memory:") as connection:
-            sql = f"SELECT {listed} FROM read_parquet(?)"
+            rows = "FROM read_parquet(?)"
+            if later:
+                rows = f"FROM (SELECT {later} WHERE FALSE UNION ALL BY NAME {rows})"
+            sql = f"SELECT {listed} {rows}"
             found: Rows = run(connection, sql, [str(path)])
             return found.values
     except duckdb.Error as error:
