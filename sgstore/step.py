@@ -44,10 +44,12 @@ from sgstore.world import (
     Entities,
     FaultTally,
     FrameBlock,
+    Life,
+    Lives,
     MessageRefs,
     Origin,
+    Sight,
     States,
-    is_leap,
     is_plausible,
     nearest_frames,
     number,
@@ -456,33 +458,6 @@ class EntityConstants(NamedTuple):
         }
 
 
-class _Life(NamedTuple):
-    """An entity that moves: its constants, and when and where it was last; ``run``: of the clock."""
-
-    constants: EntityConstants
-    run: int
-    time_ns: int
-    place: tuple[float, ...]
-
-    def is_of(self, entity: Entity, run: int, time_ns: int) -> bool:
-        """False if an entity with this id is another one: another kind, or where this one cannot have moved."""
-        if self.constants.kind != KINDS[entity.kind]:
-            return False
-        apart = (now - then for now, then in zip(entity.numbers[:3], self.place, strict=True))
-        away = math.hypot(*(0.0 if math.isnan(part) else part for part in apart))
-        return (
-            run != self.run
-            or entity.whole[_LIGHT] >= 0
-            or not is_leap(away, (time_ns - self.time_ns) / 1e9)
-        )
-
-    def now(self, entity: Entity, run: int, time_ns: int) -> _Life:
-        """The same, where an entity is now."""
-        if any(map(math.isnan, entity.numbers[:2])):
-            return self
-        return _Life(self.constants, run, time_ns, entity.numbers[:3])
-
-
 class Records:
     """Makes records of graphs.
 
@@ -730,13 +705,14 @@ class Stepper:
         self._origin: Origin | None = None
         self.last: tuple[list[GraphBlock], Codes] | None = None
         self._next = 0
-        self._moving: OrderedDict[str, _Life] = OrderedDict()  # those of the last frame at the end
+        # Entities that move, by their id; those of the last frame at the end.
+        self._moving: OrderedDict[str, Lives[EntityConstants]] = OrderedDict()
         self.faults = FaultTally()
         self._time_ns: int | None = None
         self._run = 0  # of the clock: it ends where the clock jumps back
         self._standing: dict[str, tuple[Entity, EntityConstants]] = {}
-        # The generator's own node ids, which begin anew with it, and what they are outside.
-        self._inner: dict[str, int] = {}
+        # Node id → the generator's own one, which begins anew with it; and the other way round.
+        self._inner: dict[int, int] = {}
         self._introduced = 0
         self._outer: Ints = np.zeros(64, np.int64)
 
@@ -758,15 +734,18 @@ class Stepper:
             self._records.stand(self._standing[entity.ident][1], block.scenery, row)
         here = {entity.ident for entity in moving}
         named = (ego or frame.ego or self._ego for ego in egos)
-        nodes = [self._inner[ego] if ego in here else -1 for ego in named]
+        nodes = [
+            self._inner[self._moving[ego].last.entity.node] if ego in here else -1 for ego in named
+        ]
         self.last = None  # let go of the graphs before this one: of a crowd they are large
         graphs = self._generator.blocks(block, [np.array([node]) for node in nodes])
         self._seq += 1
         self.last = graphs, self._generator.kinds
         while len(self._moving) > len(moving) + REMEMBERED:
-            ident, _ = self._moving.popitem(last=False)
-            self._inner.pop(ident, None)
-        constants = [self._moving[entity.ident].constants for entity in moving]
+            _, lives = self._moving.popitem(last=False)
+            for life in (lives.last, *lives.left):
+                self._inner.pop(life.entity.node, None)
+        constants = [self._moving[entity.ident].last.entity for entity in moving]
         known = {one.node: one for one in constants}
         happened = self._happened(frame)
         with GcPaused():
@@ -784,7 +763,7 @@ class Stepper:
     def _node_of(self, ident: str) -> int | None:
         if ident in self._standing:
             return self._standing[ident][1].node
-        return self._moving[ident].constants.node if ident in self._moving else None
+        return self._moving[ident].last.entity.node if ident in self._moving else None
 
     def _met(self, frame: Frame) -> tuple[list[Entity], list[Entity]]:
         """Entities of a frame that move, and those that stand and were not known.
@@ -805,9 +784,13 @@ class Stepper:
         # Node ids as of a recording: first those of new ids, then those of ids that have returned.
         for entity in frame.entities:
             if entity.ident not in self._moving and entity.ident not in self._standing:
-                self._enter(entity, new)
-        for ident, entity in moving.items():
-            self._follow(ident, entity, frame.time_ns)
+                known = self._enter(entity)
+                if entity.ident in new:
+                    self._standing[entity.ident] = entity, known
+                else:
+                    self._moving[entity.ident] = Lives(Life(known, entity.kind))
+        for entity in moving.values():
+            self._follow(entity, frame.time_ns)
         return list(moving.values()), list(new.values())
 
     def _is_static(self, ident: str) -> bool | None:
@@ -815,34 +798,30 @@ class Stepper:
             return True
         return False if ident in self._moving else None
 
-    def _enter(self, entity: Entity, new: dict[str, Entity], lifetime: int = 1) -> None:
+    def _enter(self, entity: Entity, lifetime: int = 1) -> EntityConstants:
         texts = entity.special, entity.subkind, entity.type_name
         known = EntityConstants(self._next, entity.ident, KINDS[entity.kind], *texts, lifetime)
         self._next += 1
-        if entity.ident in new:
-            self._standing[entity.ident] = entity, known
-        else:
-            self._moving[entity.ident] = _Life(known, -1, 0, (_NAN,) * 3)
+        return known
 
-    def _follow(self, ident: str, entity: Entity, time_ns: int) -> None:
-        """Take note of where an entity is; it is another one if its id has returned."""
-        life = self._moving[ident]
-        if not life.is_of(entity, self._run, time_ns):
-            self._inner.pop(ident, None)
-            self._enter(entity, {}, life.constants.lifetime + 1)
-        self._moving[ident] = self._moving[ident].now(entity, self._run, time_ns)
-        self._moving.move_to_end(ident)
+    def _follow(self, entity: Entity, time_ns: int) -> None:
+        """Note where an entity is; it is another one if its id has returned."""
+        lives = self._moving[entity.ident]
+        place = (_NAN,) * 3 if entity.whole[_LIGHT] >= 0 else entity.numbers[:3]
+        here = Sight(place, time_ns, self._run)
+        lives.follow(entity.kind, here, partial(self._enter, entity, lives.count + 1))
+        self._moving.move_to_end(entity.ident)
 
     def _block(self, frame: Frame, moving: list[Entity], standing: list[Entity]) -> FrameBlock:
         """A frame as a block, in the generator's own node ids."""
         first = self._introduced
-        new = [*standing, *(e for e in moving if e.ident not in self._inner)]
+        new = [*standing, *(e for e in moving if self._node(e) not in self._inner)]
         self._introduced += len(new)
         while self._introduced > len(self._outer):
             self._outer = np.concatenate([self._outer, self._outer])
         for inner, entity in enumerate(new, start=first):
-            self._inner[entity.ident] = inner
-            self._outer[inner] = self._node(entity)
+            self._outer[inner] = node = self._node(entity)
+            self._inner[node] = inner
         time, none = np.array([frame.time_ns]), np.zeros(0, np.int64)
         return FrameBlock(
             seq=np.array([self._seq]),
@@ -864,14 +843,14 @@ class Stepper:
     def _node(self, entity: Entity) -> int:
         if entity.static:
             return self._standing[entity.ident][1].node
-        return self._moving[entity.ident].constants.node
+        return self._moving[entity.ident].last.entity.node
 
     def _states(self, of: list[Entity]) -> States:
         numbers = np.array([e.numbers for e in of], np.float64).reshape(-1, len(NUMBERS))
         whole = np.array([e.whole for e in of], np.int64).reshape(-1, len(WHOLE))
         lights, light_state, derived = whole.T
         return States.of(
-            node=np.array([self._inner[e.ident] for e in of], np.int64),
+            node=np.array([self._inner[self._node(e)] for e in of], np.int64),
             lights=lights,
             light_state=light_state.astype(np.int8),
             derived=derived,

@@ -10,8 +10,9 @@ belong to the road map (:mod:`sgstore.roads`).
 
 from __future__ import annotations
 
+import math
 from dataclasses import field, fields, replace
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeVar
 
 from sgstore.arrays import np
 from sgstore.columns import taken
@@ -20,7 +21,7 @@ from sgstore.mcap import Findings, Loss
 from sgstore.records import dataclass
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
     from typing import Any
 
@@ -221,6 +222,125 @@ def is_leap(away: float, seconds: float) -> bool:
 def leaps(away: Floats, seconds: Floats) -> Bools:
     """:func:`is_leap` of arrays."""
     return (seconds > 0) & (away > FASTEST * seconds + LEAP)
+
+
+TWINS_NS: Final = 1_000_000_000
+"""How long an entity may be away while another one has its id, and go on; ns."""
+
+TWINS: Final = 4
+"""Entities beside the last one that may have one id by turns."""
+
+AnyEntity = TypeVar("AnyEntity")
+
+
+class Sight(NamedTuple):
+    """Where and when an entity was seen.
+
+    Attributes
+    ----------
+    place : tuple of float
+        x, y and z; m. NaN: not known.
+    time_ns : int
+        Simulation time; ns.
+    run : int
+        Run of the clock; a jump back begins the next one.
+    """
+
+    place: tuple[float, ...]
+    time_ns: int
+    run: int
+
+    @property
+    def is_placed(self) -> bool:
+        """True if the position in the plane is known."""
+        return not (math.isnan(self.place[0]) or math.isnan(self.place[1]))
+
+
+class Life(NamedTuple, Generic[AnyEntity]):
+    """One of the entities that an id has had; ``seen``: where it was last, ``None`` without a known place."""
+
+    entity: AnyEntity
+    kind: int
+    seen: Sight | None = None
+
+    def goes_on(self, kind: int | None, here: Sight) -> bool:
+        """True if the entity may be the one with its id in a frame.
+
+        It must have the same kind (``None``: the kind is not certain), at a place that it can have reached.
+        After a jump of the clock, it can have reached any place.
+        """
+        seen = self.seen
+        if kind is not None and kind != self.kind:
+            return False
+        if seen is None or seen.run != here.run or not here.is_placed:
+            return True
+        (x, y, z), (x_then, y_then, z_then) = here.place, seen.place
+        up = z - z_then
+        away = math.hypot(x - x_then, y - y_then, 0.0 if math.isnan(up) else up)
+        return not is_leap(away, (here.time_ns - seen.time_ns) / 1e9)
+
+    def is_recent(self, here: Sight) -> bool:
+        """True if the entity was away for a short time, or if the clock has jumped back meanwhile."""
+        seen = self.seen
+        if seen is None or seen.run != here.run:
+            return True
+        return 0 <= here.time_ns - seen.time_ns <= TWINS_NS
+
+
+class Lives(Generic[AnyEntity]):
+    """The entities that one id has had.
+
+    An id that comes back as another kind, or at a place that its entity cannot have reached, has another entity
+    from then on. If several entities have one id by turns, each of them goes on.
+
+    Parameters
+    ----------
+    last : Life
+        The entity that has the id.
+
+    Attributes
+    ----------
+    last : Life
+    left : sequence of Life
+        Entities that have lost the id to another one and may go on; the latest at the end.
+    count : int
+        How many entities there were.
+    """
+
+    __slots__ = ("count", "last", "left")
+
+    def __init__(self, last: Life[AnyEntity]) -> None:
+        self.last = last
+        self.left: Sequence[Life[AnyEntity]] = ()
+        self.count = 1
+
+    def follow(
+        self, kind: int, here: Sight, enter: Callable[[], AnyEntity], *, sure_kind: bool = True
+    ) -> AnyEntity:
+        """Return the entity that has the id now.
+
+        Parameters
+        ----------
+        kind : int
+            Its kind.
+        here : Sight
+            Where it is.
+        enter : callable
+            Makes the entity if it is another one than all before.
+        sure_kind : bool
+            False: the kind is a guess, and another kind alone makes no other entity.
+        """
+        last, judged = self.last, kind if sure_kind else None
+        if not last.goes_on(judged, here):
+            twins = (one for one in self.left if one.is_recent(here) and one.goes_on(judged, here))
+            after = next(twins, None)
+            if after is None:
+                after = Life(enter(), kind)
+                self.count += 1
+            self.left = [one for one in (*self.left, last) if one is not after][-TWINS:]
+            last = after
+        self.last = last._replace(seen=here) if here.is_placed else last
+        return last.entity
 
 
 UNTOLD: Final = -2

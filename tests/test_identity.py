@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import random
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -255,14 +256,20 @@ def test_a_fast_car_and_a_jump_of_the_clock_make_no_new_entity(
     assert len(tracks(blocks, 7)) == 1
 
 
-def test_two_entities_that_have_one_id_by_turns_both_go_on(tmp_path: Path) -> None:
-    scenes = [(i / 10, [Body(7, 1000.0 * (i % 2))]) for i in range(12)]
+@pytest.mark.parametrize(("apart", "kind"), [(45.0, "car"), (45.0, "person"), (1.0, "person")])
+def test_two_entities_that_have_one_id_by_turns_both_go_on(
+    tmp_path: Path, apart: float, kind: str
+) -> None:
+    bodies = Body(7, 0.0), Body(7, apart, kind)
+    scenes = [(i / 10, [bodies[i % 2]]) for i in range(12)]
     blocks, _ = read(write_osi(tmp_path / "twins", scenes))
+    online = steps(*scenes)
 
-    assert {life: frames for life, (_, frames) in tracks(blocks, 7).items()} == {
-        1: [0, 2, 4, 6, 8, 10],
-        2: [1, 3, 5, 7, 9, 11],
+    assert tracks(blocks, 7) == {
+        1: ("car", [0, 2, 4, 6, 8, 10]),
+        2: (kind, [1, 3, 5, 7, 9, 11]),
     }
+    assert [frame["7"] for frame in online] == [(1, "car", 1), (2, kind, 2)] * 6
 
 
 def test_a_vehicle_and_a_person_of_sumo_with_one_id_stay_apart(tmp_path: Path) -> None:
@@ -466,6 +473,80 @@ def test_a_replay_has_the_entities_of_the_recording(tmp_path: Path, write: Write
         for node in sorted(block.states.node[start:stop].tolist())
     ]
     assert max(stored) == 4
+
+
+def turning_scenes(draw: random.Random, *, steps: Sequence[float]) -> list[Scene]:
+    """Scenes in which ids are used by turns, by entities of several kinds at several places."""
+    size: dict[str, Size] = {"car": (4.5, 1.9, 1.5), "person": (0.5, 0.5, 1.8)}
+    users = {
+        ident: [
+            (draw.choice((0.0, 3.0, 400.0, 900.0)) + 20 * ident, draw.choice(("car", "person")))
+            for _ in range(draw.randint(1, 3))
+        ]
+        for ident in range(1, 5)
+    }
+    turns = {ident: draw.choice((1, 1, 3, 9)) for ident in users}
+    scenes: list[Scene] = []
+    time = 60.0
+    for number in range(40):
+        bodies: list[Body] = []
+        for ident, some in users.items():
+            x, kind = some[number // turns[ident] % len(some)]
+            if draw.random() < 0.9:
+                bodies.append(Body(ident, x + 0.5 * time, kind, size[kind]))
+        scenes.append((time, [Body(9, -5.0), *bodies]))
+        time = round(time + draw.choice(steps), 1)
+    return scenes
+
+
+@pytest.mark.parametrize(
+    ("write", "steps"),
+    [
+        (write_osi, (0.1, 0.1, 0.3, 1.5)),
+        (write_osi_file, (0.1, 0.1, 0.1, 1.5, -1.0)),
+        (write_carla, (0.1, 0.1, 0.3, 1.5)),
+        (write_foxglove, (0.1, 0.1, 0.3, 1.5)),
+    ],
+)
+def test_the_same_frames_have_the_same_entities_online_and_stored(
+    tmp_path: Path, write: Writer, steps: Sequence[float]
+) -> None:
+    lifetimes = 0
+    for seed in range(4):
+        draw = random.Random(seed)
+        scenes = turning_scenes(draw, steps=steps)
+        blocks, _ = read(write(tmp_path / str(seed), scenes), draw.choice((1, 7, 60)))
+        rows = [row for block in blocks for row in zip(*named(block), strict=True)]
+        stored: list[list[tuple[str, int, str]]] = []
+        nodes: list[list[int]] = []
+        for block in blocks:
+            for start, stop in zip(block.offsets, block.offsets[1:], strict=False):
+                node = sorted(block.states.node[start:stop].tolist())
+                nodes.append(node)
+                stored.append(sorted(rows[one] for one in node))
+        lifetimes = max(lifetimes, *(life for _, life, _ in rows))
+
+        replay, online = Replay(), SceneGraphGenerator(None, Config())
+        again = [online.step(frame) for block in blocks for frame in replay.frames(block)]
+        assert [sorted(graph.nodes) for graph in again] == nodes
+        plain = SceneGraphGenerator(None, Config())
+        for graph, (time, bodies), expected in zip(again, scenes, stored, strict=True):
+            frame = Frame(round(time * 1e9))
+            for body in bodies:
+                frame.add(body.ident, body.kind, body.x, 0.0)
+            for one in (graph, plain.step(frame)):
+                assert expected == sorted(
+                    (about["ident"], about["lifetime"], about["kind"])
+                    for about in one.nodes.values()
+                )
+
+    assert lifetimes >= 3
+
+
+def named(block: FrameBlock) -> tuple[Sequence[str], Sequence[int], list[str]]:
+    """Ids, lifetimes and kinds of the entities that are new in a block."""
+    new = block.entities
+    return new.ident, new.lifetime or [1] * len(new), [KINDS[kind] for kind in new.kind.tolist()]
 
 
 # Batches ----------------------------------------------------------------------------------------------

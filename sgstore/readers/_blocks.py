@@ -10,10 +10,10 @@ a block begins or ends.
 
 from __future__ import annotations
 
-import math
 from bisect import bisect_right
 from collections import deque
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 from typing import TYPE_CHECKING, ClassVar, Final, Generic, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
@@ -29,10 +29,12 @@ from sgstore.world import (
     Entities,
     FaultTally,
     FrameBlock,
+    Life,
+    Lives,
     MessageRefs,
+    Sight,
     States,
     derivable_ns,
-    is_leap,
     leaps,
     without_implausible,
 )
@@ -97,7 +99,7 @@ class FrameRows:
     seconds : float
         Time since the frame before; s. NaN: it is not known, or too long to derive anything across it.
     returned : int
-        Entities that have come back as others up to this frame; see :class:`~sgstore.readers._lives.Lives`.
+        Entities up to this frame whose id another one had before; see :class:`LifetimeTracker`.
     """
 
     time_ns: int
@@ -183,7 +185,9 @@ class EntityTable:
     _idents: set[str] = field(default_factory=set[str])
     _returned: list[tuple[int, EntityRow]] = field(default_factory=list[tuple[int, "EntityRow"]])
     _returned_taken: int = 0
-    _since: dict[str, list[int]] = field(default_factory=dict[str, list[int]])
+    _turns: dict[str, list[tuple[int, int]]] = field(
+        default_factory=dict[str, list[tuple[int, int]]]
+    )
 
     def enter(
         self,
@@ -236,7 +240,7 @@ class EntityTable:
         """The entity with a number."""
         return self._rows[number]
 
-    def enter_again(self, row: EntityRow, before: int, seq: int) -> int:
+    def enter_again(self, row: EntityRow, before: int) -> int:
         """Enter another entity with an id that is known, and return its node id.
 
         Parameters
@@ -244,21 +248,18 @@ class EntityTable:
         row : EntityRow
         before : int
             How many ids are known when it is met.
-        seq : int
-            Number of the first frame that has it.
         """
         self._returned.append((before, row))
-        self._since.setdefault(row.ident, []).append(seq)
         return before + len(self._returned) - 1
+
+    def turn(self, number: int, lifetime: int, seq: int) -> None:
+        """Note which of its entities an id has from a frame on."""
+        self._turns.setdefault(self._rows[number].ident, []).append((seq, lifetime))
 
     @property
     def returned(self) -> int:
         """How many entities have an id that another one had before."""
         return len(self._returned)
-
-    def lives(self, ident: str) -> int:
-        """How many entities have had an id."""
-        return 1 + len(self._since.get(ident, ()))
 
     def nodes_of(self, numbers: Ints) -> Ints:
         """Node ids of the first entities with some numbers; below 0: as they are."""
@@ -277,7 +278,7 @@ class EntityTable:
     def take_events(self) -> tuple[Event, ...]:
         """The events that were not taken yet."""
         events, self._events = self._events, []
-        if self._since:
+        if self._turns:
             events = [
                 replace(
                     event,
@@ -290,7 +291,9 @@ class EntityTable:
 
     def _lifetime(self, ident: str, seq: int) -> int:
         """Which of the entities with an id a frame has."""
-        return 1 + bisect_right(self._since.get(ident, ()), seq)
+        turns = self._turns.get(ident, ())
+        at = bisect_right(turns, seq, key=itemgetter(0))
+        return turns[at - 1][1] if at else 1
 
     def settle(self) -> None:
         """Report what is odd, once everything was taken."""
@@ -411,7 +414,7 @@ class MessageDecoder(Generic[Raw]):
         Takes up entities while messages are decoded.
     channels : frozenset of int
     sure_kinds : bool
-        Whether the recording knows what entities are, as a simulator does; see :class:`Lives`.
+        Whether kinds are certain, as those of a simulator; see :class:`LifetimeTracker`.
     """
 
     sure_kinds: ClassVar[bool] = True
@@ -494,7 +497,7 @@ def assemble(
     wanted[[*decoder.channels]] = True
     raw: list[Raw] = []
     sizes: list[int] = []  # how many ids are known with each of them
-    lives = Lives(decoder.roster, first_steps, sure_kinds=decoder.sure_kinds)
+    lives = LifetimeTracker(decoder.roster, first_steps, sure_kinds=decoder.sure_kinds)
     done: list[FrameRows] = []  # the frame before the block, and those of it that are complete
     open_refs: list[MessageRefs] = []
     block_refs: list[MessageRefs] = []
@@ -650,27 +653,11 @@ FIRST_STEPS: Final = 64
 """Steps of the clock whose median is the period of a recording, at any time of it."""
 
 
-TWINS_NS: Final = 1_000_000_000
-"""How long an entity may be away and go on where it was while another one has its id; ns."""
-TWINS: Final = 3
-"""Entities beside the last one that may have one id at once."""
+class LifetimeTracker:
+    """Frames in order, each with the time since the one before and the node ids of its entities.
 
-_Seen: TypeAlias = "tuple[tuple[float, ...], int]"
-"""Where and when an entity was seen last: its position, and ns."""
-
-
-def _away(one: _Seen, other: _Seen) -> float:
-    """Distance of two places; a coordinate that one of them lacks does not count."""
-    apart = (a - b for a, b in zip(one[0], other[0], strict=True))
-    return math.hypot(*(part for part in apart if not math.isnan(part)))
-
-
-class Lives:
-    """Frames in order, with the time since the one before, and with the entities that their rows belong to.
-
-    An id that comes back as another kind, or at a place where no body can be, is another entity from then on. A
-    jump of the clock ends no entity: where a body can be after it is not known. If two entities have one id at
-    once, as where two recordings were mixed, both go on.
+    Node ids depend on lifetimes: :class:`~sgstore.world.Lives` has the rule. Most ids have one entity in all
+    frames. They are compared as arrays, and only the rows that may be another entity one by one.
 
     Parameters
     ----------
@@ -679,7 +666,7 @@ class Lives:
     first_steps : iterable of int
         Times between the first frames of the recording; ns.
     sure_kinds : bool
-        False: what a frame calls an entity is a guess, and another guess alone makes no other entity.
+        False: the kind of an entity in a frame is a guess.
     """
 
     MOST: ClassVar[int] = 20
@@ -696,12 +683,9 @@ class Lives:
         self._gaps: list[int] = []
         self._seen = np.zeros((0, 2), np.int64)  # of each id: time, and run of the clock; -1: never
         self._places = np.zeros((0, 3))
-        self._nodes: dict[int, int] = {}  # of the ids that have returned
-        self._kinds: dict[int, int] = {}
-        self._left: dict[
-            int, list[tuple[int, int, _Seen]]
-        ] = {}  # entities that were left, the last ones
-        self._told: list[str] = []
+        # Node id and lifetime of the entities of each id that was called another kind, or has leapt.
+        self._lives: dict[int, Lives[tuple[int, int]]] = {}
+        self._warnings: list[str] = []
 
     def follow(self, frames: list[FrameRows], sizes: list[int]) -> list[FrameRows]:
         """The next frames; ``sizes``: how many ids are known with each."""
@@ -710,21 +694,21 @@ class Lives:
             seconds = self._seconds(frame.time_ns)
             frame.seconds, frame.returned = seconds, self._roster.returned
             runs.append(self._run)
-        far = self._leaps(frames, runs)
-        if not (self._nodes or any(far) or any(frame.kinds for frame in frames)):
+        earlier = self._earlier(frames, runs)
+        if not (self._lives or any(earlier)):
             self._seq += len(frames)
             return frames
         return [
-            self._entered(frame, last_seen, size)
-            for frame, last_seen, size in zip(frames, far, sizes, strict=True)
+            self._entered(frame, run, sights, size)
+            for frame, run, sights, size in zip(frames, runs, earlier, sizes, strict=True)
         ]
 
     def settle(self) -> None:
         """Report which ids have returned, and the gaps of the clock."""
         warnings = self._roster.report.warnings
-        warnings += self._told[: self.MOST]
-        if len(self._told) > self.MOST:
-            warnings.append(f"{len(self._told)} ids in all come back as other entities")
+        warnings += self._warnings[: self.MOST]
+        if len(self._warnings) > self.MOST:
+            warnings.append(f"{len(self._warnings)} ids in all come back as other entities")
         if self._gaps:
             longest = max(self._gaps) / 1e9
             warnings.append(
@@ -748,33 +732,46 @@ class Lives:
             self._gaps.append(step)
         return step / 1e9 if joined else NAN
 
-    def _leaps(self, frames: list[FrameRows], runs: list[int]) -> list[dict[int, _Seen]]:
-        """Of each frame the rows that lie where the entity of their last row cannot be, and where that was."""
+    def _earlier(self, frames: list[FrameRows], runs: list[int]) -> list[dict[int, Sight | None]]:
+        """For each frame: row → where its id was seen before, for rows that may be another entity.
+
+        These are rows at a leap, and rows of ids that some of these frames call another kind.
+        """
         counts = [len(frame) for frame in frames]
-        found: list[dict[int, _Seen]] = [{} for _ in frames]
+        found: list[dict[int, Sight | None]] = [{} for _ in frames]
         node = np.concatenate([frame.node for frame in frames] or [np.zeros(0, np.int64)])
         if not len(node):
             return found
         self._grow()
-        place = np.concatenate([frame.values[:, _X : _X + 3] for frame in frames])
+        rows = np.argsort(node, kind="stable")
+        ids = node[rows]
+        place = np.concatenate([frame.values[:, _X : _X + 3] for frame in frames])[rows]
+        lamp = np.concatenate([frame.light_state for frame in frames])[rows] >= 0
         times = np.array([frame.time_ns for frame in frames], np.int64)
-        now = np.repeat(np.stack([times, np.array(runs)], axis=1), counts, axis=0)
-        moves = np.concatenate([frame.light_state for frame in frames]) < 0
-        rows = np.flatnonzero(np.isfinite(place[:, :2]).all(axis=1) & moves)
-        rows = rows[np.argsort(node[rows], kind="stable")]
-        ids, place, now = node[rows], place[rows], now[rows]
-        begins = np.diff(ids, prepend=-1) != 0
-        before, was = np.roll(place, 1, axis=0), np.roll(now, 1, axis=0)
-        before[begins], was[begins] = self._places[ids[begins]], self._seen[ids[begins]]
-        ends = np.append(begins[1:], True)[: len(ids)]
-        self._places[ids[ends]], self._seen[ids[ends]] = place[ends], now[ends]
+        now = np.repeat(np.stack([times, np.array(runs)], axis=1), counts, axis=0)[rows]
+        placed = np.isfinite(place[:, :2]).all(axis=1) & ~lamp
+        # The latest row of the same id at a known place, up to this one and before it.
+        at, begins = np.arange(len(ids)), np.diff(ids, prepend=-1) != 0
+        first = np.maximum.accumulate(np.where(begins, at, 0))
+        latest = np.maximum.accumulate(np.where(placed, at, -1))
+        last = np.append(-1, latest[:-1])
+        carried = (last < first)[:, None]
+        before = np.where(carried, self._places[ids], place[last])
+        was = np.where(carried, self._seen[ids], now[last])
+        ends = np.flatnonzero(np.append(begins[1:], True) & (latest >= first))
+        self._places[ids[ends]], self._seen[ids[ends]] = place[latest[ends]], now[latest[ends]]
         away = place - before
         far = leaps(np.sqrt(np.nansum(away * away, axis=1)), (now[:, 0] - was[:, 0]) / 1e9)
+        far &= placed & (now[:, 1] == was[:, 1])
+        called = {number for frame in frames for number in frame.kinds} if self._sure_kinds else ()
+        if called:
+            far |= np.isin(ids, [*called])
         ends = np.cumsum(counts)
-        for at in np.flatnonzero(far & (now[:, 1] == was[:, 1])).tolist():
-            frame = int(np.searchsorted(ends, rows[at], side="right"))
-            row = int(rows[at] - ends[frame] + counts[frame])
-            found[frame][row] = tuple(before[at].tolist()), int(was[at, 0])
+        for one in np.flatnonzero(far).tolist():
+            frame = int(np.searchsorted(ends, rows[one], side="right"))
+            row = int(rows[one] - ends[frame] + counts[frame])
+            time, run = was[one].tolist()
+            found[frame][row] = Sight(tuple(before[one].tolist()), time, run) if run >= 0 else None
         return found
 
     def _grow(self) -> None:
@@ -783,52 +780,49 @@ class Lives:
             self._seen = np.concatenate([self._seen, np.full((more, 2), -1, np.int64)])
             self._places = np.concatenate([self._places, np.zeros((more, 3))])
 
-    def _entered(self, frame: FrameRows, far: dict[int, _Seen], size: int) -> FrameRows:
+    def _entered(
+        self, frame: FrameRows, run: int, earlier: dict[int, Sight | None], size: int
+    ) -> FrameRows:
         """A frame with the node ids of its entities; those that have returned are entered."""
-        for row in sorted(far):
-            number = int(frame.node[row])
-            here = tuple(frame.values[row, _X : _X + 3].tolist()), frame.time_ns
-            if not self._goes_on(number, far[row], here, frame.kinds.get(number)):
-                self._return(number, frame.kinds.get(number), size, "is where it cannot have moved")
-        known = {*frame.kinds, *self._kinds} if self._sure_kinds else set[int]()
-        for number in sorted(known & {*frame.node.tolist()}):
-            called = frame.kinds.get(number)
-            first = self._roster.entered(number).kind
-            kind = KIND_CODE[called[0].kind] if called else first
-            if kind != self._kinds.get(number, first):
-                self._return(number, called, size, f"is a {KINDS[kind]} now")
-        self._seq += 1
         numbers, nodes = frame.node.tolist(), self._roster.nodes_of(frame.node).tolist()
-        found = [self._nodes.get(number, node) for number, node in zip(numbers, nodes, strict=True)]
-        of = dict(zip(numbers, found, strict=True))
+        for row, number in enumerate(numbers):
+            if row not in earlier and number not in self._lives:
+                continue
+            kind = self._roster.entered(number).kind
+            if number not in self._lives:
+                self._lives[number] = Lives(Life((nodes[row], 1), kind, earlier[row]))
+            called = frame.kinds.get(number)
+            kind = KIND_CODE[called[0].kind] if called else kind
+            lamp = frame.light_state[row] >= 0
+            place = (NAN,) * 3 if lamp else tuple(frame.values[row, _X : _X + 3].tolist())
+            nodes[row] = self._follow(number, kind, Sight(place, frame.time_ns, run), called, size)
+        self._seq += 1
+        of = dict(zip(numbers, nodes, strict=True))
         return replace(
             frame,
-            node=np.array(found, np.int64),
+            node=np.array(nodes, np.int64),
             ego=of.get(frame.ego, -1),
             driven={of[number]: told for number, told in frame.driven.items() if number in of},
             returned=self._roster.returned,
         )
 
-    def _goes_on(self, number: int, last: _Seen, here: _Seen, called: Called | None) -> bool:
-        """Return whether an entity that had the id a moment ago goes on: two have one id at once."""
-        entered = self._roster.entered(number).kind
-        kind = KIND_CODE[called[0].kind] if called else entered
-        first = int(self._roster.nodes_of(np.array([number]))[0])
-        left = self._nodes.get(number, first), self._kinds.get(number, entered), last
-        others = self._left.setdefault(number, [])
-        for other in others:
-            node, was, seen = other
-            step = here[1] - seen[1]
-            if was == kind and 0 <= step <= TWINS_NS and not is_leap(_away(here, seen), step / 1e9):
-                others.remove(other)
-                self._nodes[number], self._kinds[number] = node, was
-                others.append(left)
-                return True
-        others[:] = [*others[-TWINS:], left]
-        return False
+    def _follow(self, number: int, kind: int, here: Sight, called: Called | None, size: int) -> int:
+        """The node id of an id in a frame."""
+        lives = self._lives[number]
+        before = lives.last
 
-    def _return(self, number: int, called: Called | None, size: int, why: str) -> None:
-        """Enter the entity that an id means from this frame on."""
+        def enter() -> tuple[int, int]:
+            same = before.kind == kind or not self._sure_kinds
+            why = "is where it cannot have moved" if same else f"is a {KINDS[kind]} now"
+            return self._enter(number, called, size, why)
+
+        node, lifetime = lives.follow(kind, here, enter, sure_kind=self._sure_kinds)
+        if lifetime != before.entity[1]:
+            self._roster.turn(number, lifetime, self._seq)
+        return node
+
+    def _enter(self, number: int, called: Called | None, size: int, why: str) -> tuple[int, int]:
+        """Enter another entity of an id, and return its node id and its lifetime."""
         row = self._roster.entered(number)
         if called is not None:
             meaning, type_name = called
@@ -838,13 +832,12 @@ class Lives:
                 subkind=meaning.subkind,
                 type_name=type_name,
             )
-        row = row._replace(lifetime=self._roster.lives(row.ident) + 1)
-        self._nodes[number] = self._roster.enter_again(row, size, self._seq)
-        self._kinds[number] = row.kind
+        row = row._replace(lifetime=self._lives[number].count + 1)
         name = f"{row.ident}#{row.lifetime}"
-        self._told.append(
+        self._warnings.append(
             f"entity {row.ident!r} {why} (frame {self._seq}): it is a new entity, {name}"
         )
+        return self._roster.enter_again(row, size), row.lifetime
 
 
 def _on_earth(frames: list[FrameRows], roster: EntityTable) -> list[FrameRows]:
