@@ -138,9 +138,9 @@ def test_order_in_the_file_changes_no_row_of_the_sample(tmp_path: Path) -> None:
         assert not first_difference(rows, view_rows(other, tmp_path / f"{number}.sgstore"))
 
 
-@pytest.mark.parametrize("name", [name for name in MANY if name != "osi split"])
+@pytest.mark.parametrize("name", MANY)
 def test_messages_of_a_bag_may_lie_in_any_of_its_files(name: str, tmp_path: Path) -> None:
-    path = MANY[name](tmp_path / f"{name}.mcap")  # a bag takes channels of one topic for one
+    path = MANY[name](tmp_path / f"{name}.mcap")
     whole = Recorded.of(path)
     rows = block_rows(path)
 

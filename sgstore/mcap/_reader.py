@@ -696,9 +696,10 @@ class McapBag(McapFile):
     path, size, mtime_ns
         The folder; the size of all files together, and the latest time of change among them.
     others
-        As :class:`McapFile` has them, of all files together. A channel is the same
-        in two files if its topic, its encodings and its definition are; ids are those of the first file that
-        has it, or new ones where another channel bears these.
+        As :class:`McapFile` has them, of all files together. A channel is the same in two files if its topic,
+        its encodings and its definition are. Several such channels of a file have the same order in all
+        files, or the same ids. Ids are those of the first file that has the channel, or new ones if another
+        channel has these.
 
     Raises
     ------
@@ -721,7 +722,8 @@ class McapBag(McapFile):
         self._files: dict[int, McapFile] = {}
         self._open_files: list[McapFile] = []
         self._faults: list[Loss] = []
-        self._ids: dict[tuple[Any, ...], int] = {}
+        self._schema_ids: dict[tuple[Any, ...], int] = {}
+        self._channel_ids: dict[tuple[Any, ...], list[int]] = {}
         self._own: dict[tuple[Path, int], int] = {}
         self._told: dict[Path, tuple[int, int, int]] = {}
         for part in self._parts:
@@ -831,11 +833,13 @@ class McapBag(McapFile):
         if self._told.get(file.path) == told:
             return
         self._told[file.path] = told
-        for number, channel in file.channels.items():
-            if (file.path, number) not in self._own:
-                self._own[file.path, number] = self._take(
-                    channel, file.schemas.get(channel.schema_id)
-                )
+        alike: dict[tuple[Any, ...], list[int]] = {}
+        for number, channel in sorted(file.channels.items()):
+            alike.setdefault(_key_of(channel, file), []).append(number)
+        for key, numbers in alike.items():
+            for number in numbers:
+                if (file.path, number) not in self._own:
+                    self._own[file.path, number] = self._take(number, file, key, numbers)
         base = next(base for base, one in self._files.items() if one is file)
         for place, record in file.metadata.items():
             self.metadata.setdefault(RecordPlace(place.offset + base, place.length), record)
@@ -843,19 +847,25 @@ class McapBag(McapFile):
         moved = (RecordPlace(place.offset + base, place.length) for place in file.attachments)
         self.attachments += [place for place in moved if place not in known]
 
-    def _take(self, channel: Channel, schema: Schema | None) -> int:
-        """The id of a channel in the bag."""
-        meant = (schema.name, schema.encoding, schema.data) if schema else ()
-        key = (channel.topic, channel.message_encoding, *meant)
-        if key not in self._ids:
-            number = self._free(channel.id, self.channels)
-            schema_id = 0
-            if schema is not None:
-                schema_id = self._ids.setdefault(meant, self._free(schema.id, self.schemas))
-                self.schemas.setdefault(schema_id, replace(schema, id=schema_id))
-            self.channels[number] = replace(channel, id=number, schema_id=schema_id)
-            self._ids[key] = number
-        return self._ids[key]
+    def _take(self, number: int, file: McapFile, key: tuple[Any, ...], alike: list[int]) -> int:
+        """The id of a channel of a file in the bag. ``alike``: the channels of the file with its key."""
+        known = self._channel_ids.setdefault(key, [])
+        if {*alike} <= {*known}:
+            return number
+        taken = {self._own.get((file.path, other)) for other in alike}
+        free = [one for one in known if one not in taken]
+        if free:
+            return free[0]
+        channel = file.channels[number]
+        number, schema_id = self._free(channel.id, self.channels), 0
+        schema = file.schemas.get(channel.schema_id)
+        if schema is not None:
+            new = self._free(schema.id, self.schemas)
+            schema_id = self._schema_ids.setdefault(key[2:], new)
+            self.schemas.setdefault(schema_id, replace(schema, id=schema_id))
+        self.channels[number] = replace(channel, id=number, schema_id=schema_id)
+        known.append(number)
+        return number
 
     def _free(self, number: int, taken: dict[int, Any]) -> int:
         """The id, or the next one that is free."""
@@ -883,6 +893,13 @@ class McapBag(McapFile):
 
 def _all(_channel: int) -> bool:
     return True
+
+
+def _key_of(channel: Channel, file: McapFile) -> tuple[Any, ...]:
+    """Properties in which channels of two files are the same channel of a bag."""
+    schema = file.schemas.get(channel.schema_id)
+    definition = (schema.name, schema.encoding, schema.data) if schema else ()
+    return channel.topic, channel.message_encoding, *definition
 
 
 def _moved(wanted: Callable[[int], bool], base: int) -> Callable[[int], bool]:
