@@ -548,6 +548,8 @@ class SceneGraph:
         Gives the same with all that is known beyond it; see :meth:`known`.
     out_of_world : int
         Online: how many entities of the frame are out of ``[range] world``, so that nothing is known of them.
+    excluded : frozenset of str
+        Online: kinds of the entities of the frame that settings exclude.
     """
 
     frame_id: int
@@ -565,6 +567,7 @@ class SceneGraph:
     )
     around: Callable[[], SceneGraph] | None = field(default=None, compare=False, repr=False)
     out_of_world: int = field(default=0, compare=False, repr=False)
+    excluded: frozenset[str] = field(default=frozenset(), compare=False, repr=False)
 
     def known(self) -> SceneGraph:
         """All that is known of the world around: this graph, and what lies beyond it, out to ``[range] world``.
@@ -573,7 +576,8 @@ class SceneGraph:
         """
         if self.around is None:
             return self
-        return replace(self.around(), events=self.events, out_of_world=self.out_of_world)
+        cut = {"out_of_world": self.out_of_world, "excluded": self.excluded}
+        return replace(self.around(), events=self.events, **cut)
 
     def __repr__(self) -> str:
         size = f"{len(self.nodes)} nodes, {len(self.edges)} edges"

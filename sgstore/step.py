@@ -499,7 +499,8 @@ class Records:
             Node id of the records → entity, of all that move in the frame.
         """
         found = self._graph(graph, (graph,), graph.edges, outer, known)
-        found = replace(found, out_of_world=graph.left_out.beyond_world)
+        excluded = frozenset(KINDS[code] for code, _ in graph.left_out.excluded)
+        found = replace(found, out_of_world=graph.left_out.beyond_world, excluded=excluded)
         if (world := graph.world) is None:
             return found
 

@@ -167,3 +167,98 @@ def test_a_check_of_nearness_is_that_of_graphs_as_wide(
     for check, one in ours.items():
         assert one.verdict == theirs[check].verdict == told[check].verdict, check
         assert one.first_violation == theirs[check].first_violation, check
+
+
+# Kinds that settings exclude ------------------------------------------------------------------------
+
+PEOPLE: Final = Scene(
+    WAYS,
+    ego(along(RIGHT), 10),
+    actor("v", along(LEFT), 12, start=20),
+    actor("p", (30, -3.0), kind="person"),
+    seconds=1,
+)
+
+
+@pytest.mark.parametrize(
+    ("check", "expected"),
+    [
+        ("FORALL (p:Person) ALWAYS p.speed < 1", "unknown"),
+        ("FORALL (p:Entity) ALWAYS p.speed < 20", "unknown"),
+        ("FORALL (p:Entity) ALWAYS p.speed < 11", "false"),
+        ("FORSOME (p:Entity) EVENTUALLY p.speed > 11", "true"),
+        ("FORSOME (p:Person) ALWAYS p.speed < 1", "unknown"),
+        ("ALWAYS NOT EXISTS {(p:Person) WHERE dist(ego, p) < 5}", "unknown"),
+        ("ALWAYS COUNT {(p:Vehicle)} < 5", "true"),
+        ("ALWAYS COUNT {(p:Entity)} < 5", "unknown"),
+        ("ALWAYS COUNT {(p:Entity)} < 1", "false"),
+        ("FORALL (v:Vehicle) ALWAYS v.speed < 20", "true"),
+        ("ALWAYS ego.speed < 11", "true"),
+    ],
+)
+@pytest.mark.parametrize(
+    "settings", [{"kinds": ("Vehicle", "Lane", "Road")}, {"exclude_ids": ("p",)}]
+)
+def test_a_check_of_what_settings_exclude_is_unknown(
+    tmp_path: Path, check: str, expected: str, settings: dict[str, tuple[str, ...]]
+) -> None:
+    config = Config(**settings)
+    store = store_of(tmp_path / "s.sgstore", {"road": [PEOPLE]}, {"road": config})
+    text = f"CHECK c: {check}"
+    monitor = Monitor(text, PEOPLE.road, config)
+    for frame in replayed([PEOPLE.block()]):
+        monitor.step(frame)
+    (found,), (watched,) = store.check(text), monitor.finish()
+    assert (found.verdict, found.reason) == (watched.verdict, watched.reason)
+    assert found.verdict == expected
+    assert ("which the settings of the trace exclude" in found.reason) is (expected == "unknown")
+    (inside,) = store.check(f"USING SCOPE graph {text}")
+    assert inside.verdict != "unknown"
+
+
+# How far a check looks ------------------------------------------------------------------------------
+
+PASSING: Final = Scene(
+    WAYS,
+    ego(along(RIGHT), 10),
+    actor("v", along(LEFT), 30, start=48),
+    actor("t", along(RIGHT), 14, "truck", start=70),
+    actor("w", along(LEFT), 18, start=120),
+    cone("cone", (102, -3.5)),
+    seconds=4,
+)
+LOOKING: Final = """
+USING RANGE 80 CHECK slow: FORALL (v:Vehicle) ALWAYS v.speed < 16;
+USING RANGE 80 CHECK slower: FORALL (v:Vehicle) ALWAYS v.speed < 12;
+USING RANGE 80 CHECK fast: FORSOME (v:Vehicle) EVENTUALLY v.speed > 16;
+USING RANGE 80 CHECK leaves: FORALL (v:Vehicle) ALWAYS[0s, 2s] (v.speed > 25 IMPLIES dist(ego, v) < 78);
+USING RANGE 80 CHECK few: ALWAYS COUNT {(v:Vehicle)} < 3;
+USING RANGE 80 CHECK cones: ALWAYS EXISTS {(c:Prop)};
+USING RANGE 80 CHECK none: EVENTUALLY EXISTS {(c:Prop)};
+USING RANGE 80 CHECK two: ALWAYS NOT EXISTS {(v:Truck), (w:Car) WHERE dist(v, w) < 12};
+USING RANGE 80 CHECK ahead: FORALL (v:Truck, w:Car) ALWAYS (v.speed > w.speed OR NOT next_lane(v, w));
+USING RANGE 80 CHECK change: FORALL (v:Vehicle) ALWAYS abs(delta(v.speed, 1s)) < 1;
+USING RANGE 80 CHECK least: ALWAYS MIN {(v:Vehicle) | v.speed} < 15;
+USING RANGE 80 CHECK names: FORALL (v:Vehicle WHERE v.speed > 16) ALWAYS v.length > 10
+"""
+
+
+def test_a_check_looks_no_farther_than_it_says(tmp_path: Path) -> None:
+    settings = {"cut": (50, 80), "world": (50, 200), "wide": (200, 0), "all": (50, float("inf"))}
+    told: dict[str, dict[str, tuple[Any, ...]]] = {}
+    for name, (radius, world) in settings.items():
+        config = ranged(Config(), radius, world)
+        store = store_of(tmp_path / f"{name}.sgstore", {"road": [PASSING]}, {"road": config})
+        told[name] = {
+            one.check: (one.verdict, one.first_violation, len(one.witnesses))
+            for one in store.check(LOOKING)
+        }
+        monitor = Monitor(LOOKING, PASSING.road, config, trace="road")
+        for frame in replayed([PASSING.block()]):
+            monitor.step(frame)
+        for one in monitor.finish():
+            assert one.verdict == told[name][one.check][0], (name, one.check)
+            assert one.first_violation == told[name][one.check][1], (name, one.check)
+    assert told["cut"] == told["world"] == told["wide"] == told["all"]
+    verdicts = {verdict for verdict, _, _ in told["cut"].values()}
+    assert {"true", "false"} <= verdicts

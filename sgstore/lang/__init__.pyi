@@ -6,6 +6,8 @@ from ._bind import CheckInCatalog as CheckInCatalog
 from ._bind import bind_checks as bind_checks
 from ._bind import bind_query as bind_query
 from ._bind_temporal import FUTURE as FUTURE
+from ._beyond import is_limited as is_limited
+from ._beyond import within as within
 from ._catalog import EDGE_ATTRIBUTES as EDGE_ATTRIBUTES
 from ._catalog import ENV_ATTRIBUTES as ENV_ATTRIBUTES
 from ._catalog import FRAME_ATTRIBUTES as FRAME_ATTRIBUTES
@@ -19,6 +21,7 @@ from ._catalog import TraceFacts as TraceFacts
 from ._catalog import Triple as Triple
 from ._catalog import attributes_of as attributes_of
 from ._catalog import Type as Type
+from ._catalog import excluded_kinds as excluded_kinds
 from ._catalog import own_type as own_type
 from ._notes import Compared as Compared
 from ._notes import compared_in_check as compared_in_check
@@ -53,6 +56,7 @@ from ._sql_ways import told_lanes as told_lanes
 from ._functions import FUNCTIONS as FUNCTIONS
 from ._horizon import Horizon as Horizon
 from ._horizon import horizon as horizon
+from ._horizon import spoken_kinds as spoken_kinds
 from ._needs import MOTION as MOTION
 from ._needs import Need as Need
 from ._needs import of_check as of_check
@@ -191,10 +195,12 @@ __all__ = [
     "each_match",
     "entities",
     "events_in",
+    "excluded_kinds",
     "expression",
     "extents",
     "for_people",
     "ir",
+    "is_limited",
     "joined",
     "keywords",
     "joined_rows",
@@ -216,6 +222,7 @@ __all__ = [
     "patterns",
     "relation",
     "rewritten",
+    "spoken_kinds",
     "syntax",
     "traces_of",
     "traces_with",
@@ -225,6 +232,7 @@ __all__ = [
     "why_not",
     "words",
     "with_places",
+    "within",
 ]
 from ._symbols import CLASSES_GIVEN as CLASSES_GIVEN
 from ._symbols import regex as regex

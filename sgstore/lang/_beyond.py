@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 from typing import TYPE_CHECKING, Final
 
 from sgstore.lang import ir as b
-from sgstore.lang._catalog import IN_GRAPH, RelationScope, Type
+from sgstore.lang._catalog import IN_GRAPH, NODE_ATTRIBUTES, RelationScope, Type
 from sgstore.lang._horizon import LINKS
 from sgstore.lang._needs import bounded, in_traces
 from sgstore.vocabulary import DIRECTIONS, PROXIMITY, entity_kinds
@@ -99,6 +100,72 @@ def _defined(block: b.BlockValue, edges: tuple[b.Edge, ...], number: int) -> b.B
         where += [beyond_graph(edge), holds(edge, edge.relations)]
     rest = tuple(edge for edge in block.scope.edges if edge.key not in told)
     return replace(block, scope=replace(block.scope, edges=rest, where=tuple(where)), number=number)
+
+
+def looks_less(check: b.BoundCheck, ego: b.Node) -> b.BoundCheck:
+    """Return a check of which nobody farther away than it says is part.
+
+    Parameters
+    ----------
+    check : BoundCheck
+        With a limit.
+    ego : Node
+        Added to its nodes if it does not speak of the ego.
+    """
+    assert check.limit is not None  # noqa: S101 - it has one
+    own = [key for key, node in check.scope.nodes.items() if not node.kinds.other]
+    nodes = check.scope.nodes if own else {**check.scope.nodes, ego.key: ego}
+    limited = partial(_limited, ego=nodes[own[0] if own else ego.key], limit=check.limit)
+    quantifiers = tuple(
+        replace(one, where=one.where and limited(one.where)) for one in check.quantifiers
+    )
+    return replace(
+        check,
+        scope=replace(check.scope, nodes=nodes),
+        quantifiers=quantifiers,
+        formula=limited(check.formula),
+        reset=check.reset and limited(check.reset),
+    )
+
+
+def _limited(value: b.Bound, ego: b.Node, limit: float) -> b.Bound:
+    """A value, in whose braces nobody is farther from the ego."""
+    again = partial(_limited, ego=ego, limit=limit)
+    if not isinstance(value, b.BlockValue):
+        return b.with_operands(value, again)
+    scope = value.scope
+    own = [key for key, node in scope.nodes.items() if is_limited(node)]
+    where = [*map(again, scope.where), *(within(key, ego.key, limit) for key in own)]
+    outer = {**scope.outer, ego.key: ego.kinds} if own and ego.key not in scope.nodes else scope.outer
+    scope = replace(scope, outer=outer, where=tuple(where))
+    return replace(value, scope=scope, value=value.value and again(value.value))
+
+
+def is_limited(node: b.Node) -> bool:
+    """Tell whether a node may be an entity that is not the ego."""
+    return bool(node.kinds.other & entity_kinds())
+
+
+def within(key: str, ego: str, limit: float) -> b.Bound:
+    """Return the condition that the footprint of a node is no farther from the ego's centre than a limit.
+
+    What has no place, or is part of the map, counts as near.
+    """
+
+    def number(name: str) -> b.Bound:
+        half = b.NodeAttribute(key, NODE_ATTRIBUTES[name], Type.number)
+        known = b.Operation("coalesce", (half, b.Value(0.0, Type.number)), Type.number)
+        return b.Operation("/", (known, b.Value(2.0, Type.number)), Type.number)
+
+    def beside(function: str, size: str) -> b.Bound:
+        away = b.Operation("abs", (b.PairNumber(function, key, ego),), Type.number)
+        past = b.Operation("-", (away, number(size)), Type.number)
+        out = b.Operation("max", (past, b.Value(0.0, Type.number)), Type.number)
+        return b.Operation("*", (out, out), Type.number)
+
+    square = b.Operation("+", (beside("lon", "length"), beside("lat", "width")), Type.number)
+    near = b.Operation("<=", (square, b.Value(limit * limit, Type.number)), Type.boolean)
+    return b.Operation("coalesce", (near, b.Value(value=True, type=Type.boolean)), Type.boolean)
 
 
 def holds(edge: b.Edge, names: Iterable[str]) -> b.Bound:

@@ -13,7 +13,7 @@ from sgstore.errors import QueryError, TextSpan
 from sgstore.lang import ir as b
 from sgstore.lang import ir as o
 from sgstore.lang import syntax as s
-from sgstore.lang._beyond import whole_block
+from sgstore.lang._beyond import looks_less, whole_block
 from sgstore.lang._bind_expressions import BINDERS, edge_attribute, node_attribute, parameter
 from sgstore.lang._bind_match_values import over_match
 from sgstore.lang._bind_stages import StageBinder, name_path
@@ -47,6 +47,7 @@ from sgstore.vocabulary import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
+    from sgstore.lang._catalog import TraceFacts
     from sgstore.lang.syntax import QuantifierClause, Statement
 
 
@@ -861,7 +862,7 @@ def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog)
         )
     returns = _returned(written, names)
     refuse_strange(session, catalog)
-    return o.BoundCheck(
+    found = o.BoundCheck(
         name,
         replace(scope.finished(), distinct=scope.distinct()),
         quantifiers,
@@ -878,6 +879,15 @@ def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog)
         world=settings.scope != "graph",
         range=settings.range,
     )
+    if settings.range is None or _knows_no_more(session.traces, settings.range):
+        return found
+    ego = b.Node(session.key(None), b.ego_kinds(), "unnamed", written.span)
+    return looks_less(replace(found, limit=settings.range), ego)
+
+
+def _knows_no_more(traces: Iterable[TraceFacts], limit: float) -> bool:
+    """Tell whether nothing is known of entities farther from the ego."""
+    return all(one.reach is not None and one.reach.farthest <= limit for one in traces)
 
 
 def _returned(written: WrittenCheck, names: SymbolTable) -> tuple[b.ReturnColumn, ...]:

@@ -31,6 +31,7 @@ from sgstore.vocabulary import (
     VEHICLE_LIGHTS,
     VEHICLES,
     entity_kinds,
+    kinds_labelled,
     normalize_name,
 )
 
@@ -624,6 +625,8 @@ class RelationScope:
         Those that they are among; empty: all.
     radius : float
         A circle around the ego that is in its graph; m.
+    farthest : float
+        How far from the ego an entity is at most of which something is known; m.
     """
 
     within: float = 25.0
@@ -635,6 +638,7 @@ class RelationScope:
     rungs: tuple[tuple[str, float], ...] = ()
     near_kinds: tuple[tuple[str, ...], ...] = ()
     radius: float = 0.0
+    farthest: float = math.inf
 
     @classmethod
     def of(cls, settings: Mapping[str, Any]) -> Self | None:
@@ -651,11 +655,30 @@ class RelationScope:
             rungs=tuple(zip(near["names"], near["upper"], strict=False)),
             near_kinds=_pairs_of(near["kinds"]),
             radius=around["radius"] if around["shape"] == "radius" else 0.0,
+            farthest=max(
+                around["radius"] if around["shape"] == "radius" else math.inf,
+                around.get("world", 0.0),
+            ),
         )
 
 
 def _pairs_of(labels: Iterable[Iterable[str]]) -> tuple[tuple[str, ...], ...]:
     return tuple(map(tuple, labels))
+
+
+def excluded_kinds(labels: Iterable[str], counted: Iterable[str]) -> frozenset[str]:
+    """Return the kinds of which settings leave out some nodes, or all.
+
+    Parameters
+    ----------
+    labels : iterable of str
+        Of what is kept: :attr:`sgstore.config.Config.kinds`; none: everything.
+    counted : iterable of str
+        Kinds of what was left out.
+    """
+    kept = [frozenset(kinds_labelled(label) or ()) for label in labels]
+    every = frozenset(OWN_KINDS) | entity_kinds()
+    return (every.difference(*kept) if kept else frozenset()) | frozenset(counted)
 
 
 @dataclass(frozen=True, slots=True)
@@ -680,6 +703,8 @@ class TraceFacts:
         How far around the ego all is known that was recorded; m. Infinite where nothing was left out.
     uneven : int
         What there is that is no pair of bodies: bits of :data:`sgstore.pair_numbers.UNEVEN`.
+    excluded : frozenset of str
+        Kinds of which settings leave out some nodes, or all.
     """
 
     trace_id: int
@@ -691,6 +716,7 @@ class TraceFacts:
     extent: tuple[int, int] = (0, 0)
     known: float = math.inf
     uneven: int = sum(UNEVEN.values())
+    excluded: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)

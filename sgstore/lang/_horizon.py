@@ -113,17 +113,52 @@ def horizon(check: BoundCheck, speed: float = FASTEST) -> Horizon:
             found = _farther(found, where.reach, true=every, false=not every)
             asked.known[key] = where.reach
     for formula in formulas:
-        for reach, true, false in asked.blocks(formula):
-            found = _farther(found, reach, true=true, false=false)
+        for one in asked.blocks(formula):
+            found = _farther(found, one.reach, true=one.true, false=one.false)
     if check.range is not None:
         found = Horizon(min(found.true, check.range), min(found.false, check.range))
     return found
+
+
+def spoken_kinds(check: BoundCheck) -> tuple[frozenset[str], frozenset[str]]:
+    """Kinds of nodes that a check may wrongly be true for want of, and those that it may wrongly be false for.
+
+    Parameters
+    ----------
+    check : BoundCheck
+    """
+    true, false = set[str](), set[str]()
+    for quantifier in check.quantifiers:
+        among = true if quantifier.word == "FORALL" else false
+        for key in quantifier.nodes:
+            among |= check.scope.nodes[key].kinds.other
+    formulas = [check.formula, *(q.where for q in check.quantifiers if q.where is not None)]
+    for formula in formulas:
+        for one in _Looking({}, FASTEST).blocks(formula):
+            true |= one.kinds if one.true else set()
+            false |= one.kinds if one.false else set()
+    return frozenset(true), frozenset(false)
 
 
 def _farther(found: Horizon, reach: float, *, true: bool, false: bool) -> Horizon:
     if true:
         found = replace(found, true=max(found.true, reach))
     return replace(found, false=max(found.false, reach)) if false else found
+
+
+@dataclass(frozen=True, slots=True)
+class _Missed:
+    """A node in braces: its kinds, its reach, and whether a check may be true, or false, for want of it."""
+
+    kinds: frozenset[str]
+    reach: float
+    true: bool
+    false: bool
+
+    @property
+    def either(self) -> _Missed:
+        """The same where it is not known which."""
+        return replace(self, true=True, false=True)
 
 
 @dataclass(slots=True)
@@ -137,8 +172,8 @@ class _Looking:
 
     def blocks(  # noqa: C901, PLR0912 - a case each
         self, formula: Bound, *, up: bool = True
-    ) -> Iterable[tuple[float, bool, bool]]:
-        """Return how far one in braces can be, and whether the formula may be true, or false, for want of it.
+    ) -> Iterable[_Missed]:
+        """Return the nodes in braces.
 
         ``up``: whether the formula makes the whole true where it is.
         """
@@ -162,18 +197,20 @@ class _Looking:
             case _:
                 for part in b.walk(formula):
                     if isinstance(part, b.BlockValue):
-                        for reach, _, _ in self.of_block(part, up=up):
-                            yield reach, True, True
+                        for one in self.of_block(part, up=up):
+                            yield one.either
                     elif isinstance(part, b.SignalCall) and part is not formula:
-                        for reach, _, _ in self.blocks(part.operand, up=up):
-                            yield reach, True, True
+                        for one in self.blocks(part.operand, up=up):
+                            yield one.either
 
-    def of_block(self, block: b.BlockValue, *, up: bool) -> Iterable[tuple[float, bool, bool]]:
+    def of_block(self, block: b.BlockValue, *, up: bool) -> Iterable[_Missed]:
         """Return the same of a block; who is missed makes ``EXISTS`` false and ``COUNT`` less."""
         scope = block.scope
         for key, node in scope.nodes.items():
-            if node.kinds.every & entity_kinds() and node.kinds.other:
-                yield self.in_scope(scope, key).reach, not up, up
+            if node.kinds.other:
+                moves = node.kinds.every & entity_kinds()
+                reach = self.in_scope(scope, key).reach if moves else 0.0
+                yield _Missed(node.kinds.other, reach, not up, up)
         inner = _Looking(
             self.known | {key: self.in_scope(scope, key).reach for key in scope.nodes}, self.speed
         )

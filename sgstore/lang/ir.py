@@ -877,6 +877,8 @@ class BoundCheck:
         As in :class:`Query`.
     range : float or None
         How far from the ego it looks, as it says; m. ``None``: as its formula says.
+    limit : float or None
+        The same, if traces may know more: who is farther is as if absent.
     """
 
     name: str
@@ -894,3 +896,4 @@ class BoundCheck:
     returns: tuple[ReturnColumn, ...] = ()
     world: bool = True
     range: float | None = None
+    limit: float | None = None

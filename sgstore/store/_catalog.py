@@ -12,7 +12,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.abstractions import SUBSETS
-from sgstore.lang import Catalog, RelationScope, TraceFacts, Type, own_type
+from sgstore.lang import Catalog, RelationScope, TraceFacts, Type, excluded_kinds, own_type
 from sgstore.quoting import literal
 from sgstore.store._schema import others_of
 from sgstore.store._traces import stored_traces
@@ -63,6 +63,9 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
                 extents.get(t.trace_id, (0, 0)),
                 known_range(t.report.get("scope")),
                 uneven=t.uneven,
+                excluded=excluded_kinds(
+                    t.settings.get("kinds", ()), (t.report.get("scope") or {}).get("excluded", ())
+                ),
             )
             for t in stored_traces(connection)
         ),

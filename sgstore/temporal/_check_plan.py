@@ -20,12 +20,14 @@ from sgstore.lang import (
     Type,
     certain,
     has_pairs,
+    is_limited,
     negated,
     pushed,
     spelled_out,
     undecided,
     unknown,
     unnumbered_text,
+    within,
 )
 from sgstore.lang import ir as b
 from sgstore.records import dataclass
@@ -114,6 +116,8 @@ class CheckPlan(Plan):
         the atom that says where it is unknown.
     meanings : dict of str to Bound
         Conditions of the query, by the names of propositions that stand for a part of them.
+    limit : float or None
+        How far from the ego somebody is at most who is there; m.
     """
 
     words: tuple[tuple[str, frozenset[str]], ...] = ()
@@ -122,6 +126,17 @@ class CheckPlan(Plan):
         default_factory=dict[str, "tuple[Ask | None, str | None]"]
     )
     meanings: dict[str, b.Bound] = field(default_factory=dict[str, b.Bound])
+
+    limit: float | None = None
+
+    def _query(self, things: frozenset[str], where: tuple[b.Bound, ...]) -> b.Query:
+        nodes = self.whole.scope.nodes
+        some = sorted(key for key in things & nodes.keys() if is_limited(nodes[key]))
+        if self.limit is None or not some:
+            return Plan._query(self, things, where)  # noqa: SLF001 - of the base class
+        ego = next(key for key, node in nodes.items() if not node.kinds.other)
+        near = tuple(within(key, ego, self.limit) for key in some)
+        return Plan._query(self, things | {ego}, (*where, *near))  # noqa: SLF001 - of the base class
 
     def formula(self, expression: b.Bound) -> f.Formula:
         """The formula of a condition that must be known to be true, as within ``run_length``."""
@@ -520,7 +535,7 @@ PlannedCheck = tuple[CheckPlan, f.Formula, "f.Formula | None", dict[int, f.Formu
 def empty_plan(check: BoundCheck) -> CheckPlan:
     """Return the plan of a check, without questions yet."""
     words = tuple((q.word if q.absent else "false", frozenset(q.nodes)) for q in check.quantifiers)
-    return CheckPlan(query_of_check(check), variables_of(check), words=words)
+    return CheckPlan(query_of_check(check), variables_of(check), words=words, limit=check.limit)
 
 
 def plan_of_check(check: BoundCheck, *, reset: bool = True) -> PlannedCheck:

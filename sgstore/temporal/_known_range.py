@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from sgstore.lang import Horizon, horizon
+from sgstore.lang import Horizon, excluded_kinds, horizon, spoken_kinds
 from sgstore.records import dataclass
 
 if TYPE_CHECKING:
@@ -37,6 +37,10 @@ class ShortRange:
         """The reason why a verdict is unknown that were true, or false, of what is known."""
         return self.true if holds else self.false
 
+    def or_else(self, other: ShortRange) -> ShortRange:
+        """The same where another trace could tell no more, or else what the other could not tell."""
+        return ShortRange(self.true or other.true, self.false or other.false)
+
 
 def short_ranges(file: StoreFile, catalog: Catalog, check: BoundCheck) -> Mapping[int, ShortRange]:
     """The traces that know less of the world around than a check needs, by id.
@@ -48,19 +52,20 @@ def short_ranges(file: StoreFile, catalog: Catalog, check: BoundCheck) -> Mappin
         That the check was bound to.
     check : BoundCheck
     """
-    limited = [trace for trace in catalog.traces if trace.known < math.inf]
-    if (
-        not check.world
-        or check.unknown_is_false
-        or not _any_short(horizon(check), [t.known for t in limited])
-    ):
+    if not check.world or check.unknown_is_false:
         return {}
-    fastest = dict(file.rows(_SPEEDS).values)
     found: dict[int, ShortRange] = {}
-    for trace in limited:
-        needed = horizon(check, fastest.get(trace.trace_id) or 0.0)
-        if _any_short(needed, [trace.known]):
-            found[trace.trace_id] = short_range(needed, trace.known)
+    limited = [trace for trace in catalog.traces if trace.known < math.inf]
+    if _any_short(horizon(check), [t.known for t in limited]):
+        fastest = dict(file.rows(_SPEEDS).values)
+        for trace in limited:
+            needed = horizon(check, fastest.get(trace.trace_id) or 0.0)
+            if _any_short(needed, [trace.known]):
+                found[trace.trace_id] = short_range(needed, trace.known)
+    for trace in catalog.traces:
+        if trace.excluded:
+            less = found.get(trace.trace_id, ShortRange())
+            found[trace.trace_id] = less.or_else(without_kinds(check, trace.excluded))
     return found
 
 
@@ -87,6 +92,26 @@ def short_range(needed: Horizon, known: float) -> ShortRange:
     return ShortRange(reason(needed.true), reason(needed.false))
 
 
+def without_kinds(check: BoundCheck, excluded: frozenset[str]) -> ShortRange:
+    """Return what a trace cannot tell whose settings exclude some kinds.
+
+    Parameters
+    ----------
+    check : BoundCheck
+    excluded : frozenset of str
+    """
+
+    def reason(spoken: frozenset[str]) -> str:
+        missed = sorted(spoken & excluded)
+        if not missed:
+            return ""
+        some = ", ".join(missed[:3]) + (f" and {len(missed) - 3} more kinds" if missed[3:] else "")
+        return f"it depends on {some}, which the settings of the trace exclude"
+
+    true, false = spoken_kinds(check)
+    return ShortRange(reason(true), reason(false))
+
+
 @dataclass(slots=True)
 class SeenRange:
     """What a monitor has seen of the world around an ego, out to a distance.
@@ -99,20 +124,31 @@ class SeenRange:
         Whether something was told that lies beyond it.
     fastest : float
         The greatest speed so far; m/s.
+    labels : tuple of str
+        Of what settings keep; empty: everything.
+    excluded : frozenset of str
+        Kinds of what was told and is not kept.
     """
 
     known: float
+    labels: tuple[str, ...] = ()
+    excluded: frozenset[str] = frozenset()
     cut: bool = False
     fastest: float = 0.0
 
     def see(self, view: FrameView) -> None:
         """Take note of a frame."""
         self.cut = self.cut or view.graph.out_of_world > 0
+        self.excluded |= view.graph.excluded
         speeds = (about.get("speed", 0.0) for about in view.nodes.values())
         self.fastest = max(self.fastest, *speeds, 0.0)
 
     def short(self, check: BoundCheck) -> ShortRange:
         """Why it cannot be told that a check is true, or false, of what was seen."""
-        if not self.cut or not check.world or check.unknown_is_false:
+        if not check.world or check.unknown_is_false:
             return ShortRange()
-        return short_range(horizon(check, self.fastest), self.known)
+        found = ShortRange()
+        if self.cut:
+            found = short_range(horizon(check, self.fastest), self.known)
+        excluded = excluded_kinds(self.labels, self.excluded)
+        return found.or_else(without_kinds(check, excluded)) if excluded else found

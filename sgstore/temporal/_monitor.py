@@ -267,7 +267,7 @@ class Monitor:
         self._seen: list[SeenRange] = []
         around = config.range
         radius = around.radius if around.shape == "radius" else 0.0
-        self._known = max(radius, around.world)
+        self._known, self._labels = max(radius, around.world), config.kinds
         self._pulse = StreamClock(None if period_s is None else round(period_s * 1e9))
         self._last: FrameTime | None = None
         self._watches: list[tuple[int, CheckMonitor, _PendingEvents]] = []
@@ -302,7 +302,7 @@ class Monitor:
         if scope not in self._scopes:
             self._scopes.append(scope)
             self._questions.append(QueryCache())
-            self._seen.append(SeenRange(self._known))
+            self._seen.append(SeenRange(self._known, self._labels))
         number = self._scopes.index(scope)
         return number, self._questions[number]
 
