@@ -595,7 +595,12 @@ class Told:
             values = [self.true(statement.formula, 0, binding) for binding in bindings]
             margins = [self.margin(statement.formula, 0, binding) for binding in bindings]
         if "FORSOME" in asked:
-            return any(values), max(margins, default=-math.inf)
+            best = max(margins, default=-math.inf)
+            if best == -math.inf:  # who is absent is no infinite fault
+                with self.counting(absent=True, unknown=unknown, due=due):
+                    others = [self.margin(statement.formula, 0, binding) for binding in bindings]
+                best = min(max(others, default=best), 0.0)
+            return any(values), best
         return all(values), min(margins, default=math.inf)
 
     # Sequences

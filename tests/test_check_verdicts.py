@@ -144,6 +144,26 @@ def test_absence_is_never_an_infinite_fault() -> None:
     assert lately.robustness.value == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize(
+    ("formula", "value"),
+    [
+        ("ALWAYS gap(ego, v) > 5", 0.0),
+        ("ALWAYS gap(ego, v) > 9", -1.0),
+        ("ALWAYS NOT gap(ego, v) <= 9", -1.0),
+        ("ALWAYS (gap(ego, v) > 5 AND dist(ego, v) > 13)", -1.0),
+        ("EVENTUALLY gap(ego, v) > 9", -1.0),
+        ("EVENTUALLY gap(ego, v) > 5", 3.0),
+    ],
+)
+def test_who_is_asked_for_and_absent_is_no_infinite_fault(formula: str, value: float) -> None:
+    text = f"CHECK c: FORSOME (v:Car) {formula} ROBUSTNESS"
+
+    found = judged(text, following(10, gone_in_between)).robustness
+
+    assert found is not None
+    assert found.value == pytest.approx(value)
+
+
 # Unknown ----------------------------------------------------------------------------------------------
 
 

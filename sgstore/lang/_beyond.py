@@ -136,7 +136,9 @@ def _limited(value: b.Bound, ego: b.Node, limit: float) -> b.Bound:
     scope = value.scope
     own = [key for key, node in scope.nodes.items() if is_limited(node)]
     where = [*map(again, scope.where), *(within(key, ego.key, limit) for key in own)]
-    outer = {**scope.outer, ego.key: ego.kinds} if own and ego.key not in scope.nodes else scope.outer
+    outer = (
+        {**scope.outer, ego.key: ego.kinds} if own and ego.key not in scope.nodes else scope.outer
+    )
     scope = replace(scope, outer=outer, where=tuple(where))
     return replace(value, scope=scope, value=value.value and again(value.value))
 

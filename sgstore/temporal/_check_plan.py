@@ -91,6 +91,9 @@ class Reading:
 WHOLE: Final = Reading(FAVOURABLE)
 """The reading of a check."""
 
+WITHOUT_ABSENCE: Final = Reading(FAVOURABLE, absent=True)
+"""The reading in which conditions on absent entities count in favour of a check."""
+
 CERTAIN: Final = Reading("", absent=False)
 """The reading of what must be known to be true."""
 
@@ -551,7 +554,12 @@ def plan_of_check(check: BoundCheck, *, reset: bool = True) -> PlannedCheck:
     return plan, formula, resets, guards
 
 
-def plan_of_margins(check: BoundCheck) -> tuple[CheckPlan, f.Formula]:
+def plan_of_margins(check: BoundCheck, reading: Reading = WHOLE) -> tuple[CheckPlan, f.Formula]:
     """Return what a check is met by: the plan, and the formula over margins."""
     plan = empty_plan(check)
-    return plan, plan.margin(check.formula, WHOLE)
+    return plan, plan.margin(check.formula, reading)
+
+
+def misses_absent(check: BoundCheck) -> bool:
+    """Tell whether a check is false where an entity is absent."""
+    return any(one.word == "FORSOME" and one.absent for one in check.quantifiers)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from heapq import merge
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
@@ -30,8 +30,10 @@ from sgstore.temporal._check_plan import (
     SIGNS,
     UNFAVOURABLE,
     WHOLE,
+    WITHOUT_ABSENCE,
     base_name,
     empty_plan,
+    misses_absent,
     plan_of_check,
 )
 from sgstore.temporal._formula import Formula, Proposition, formula_text, propositions, tolerant
@@ -49,6 +51,7 @@ from sgstore.temporal._robustness import (
     MARGIN_CELLS,
     MarginTable,
     Robustness,
+    apart_from_absence,
     condition_text,
     margin_columns,
 )
@@ -645,6 +648,9 @@ class StoreCheck:
             if part.at is not None:
                 self._values.test(part.at)
         self._quantity = self._plan.margin(check.formula, WHOLE) if check.robustness else None
+        self._apart = None
+        if check.robustness and misses_absent(check):
+            self._apart = self._plan.margin(check.formula, WITHOUT_ABSENCE)
         self._lasting = kept_throughout(check)
         ranked = self._lasting or check.formula
         self._ranked = self._plan.margin(ranked, WHOLE) if margins else None
@@ -783,6 +789,9 @@ class StoreCheck:
         if self._quantity is None:
             return found
         robustness = self._robustness(self._quantity, trace, levels)
+        if self._apart is not None:
+            without = partial(self._robustness, self._apart, trace, levels)
+            robustness = apart_from_absence(robustness, without)
         return replace(found, robustness=robustness)
 
     def _judged(self, trace: TraceReader, levels: Sequence[Level]) -> Judged:

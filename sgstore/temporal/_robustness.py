@@ -11,7 +11,7 @@ whose propositions are margins.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import TYPE_CHECKING, Final
 
@@ -81,6 +81,24 @@ class Robustness:
     nodes: Mapping[str, int] = field(default_factory=dict[str, int])
     names: Mapping[str, str] = field(default_factory=dict[str, str])
     upper: float | None = None
+
+
+def apart_from_absence(found: Robustness, without: Callable[[], Robustness]) -> Robustness:
+    """Return a margin that is not infinitely bad for want of an entity that is absent.
+
+    Parameters
+    ----------
+    found : Robustness
+    without : callable
+        Gives the margin if conditions on absent entities counted in favour of the check. One that is true so is
+        false by nothing that could be measured.
+    """
+    if found.value > -np.inf:
+        return found
+    other = without()
+    if other.value == -np.inf:
+        return found
+    return other if other.value < 0 else replace(found, value=0.0)
 
 
 # Margins of propositions --------------------------------------------------------------------------

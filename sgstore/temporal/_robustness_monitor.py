@@ -24,7 +24,10 @@ from sgstore.temporal._check_plan import (
     FAVOURABLE,
     SIGNS,
     UNFAVOURABLE,
+    WITHOUT_ABSENCE,
+    Reading,
     base_name,
+    misses_absent,
     plan_of_margins,
 )
 from sgstore.temporal._checks import folded_margins, innermost
@@ -44,7 +47,12 @@ from sgstore.temporal._formula import (
     Until,
     propositions,
 )
-from sgstore.temporal._robustness import Robustness, condition_text, margin_columns
+from sgstore.temporal._robustness import (
+    Robustness,
+    apart_from_absence,
+    condition_text,
+    margin_columns,
+)
 from sgstore.temporal._signals import NS
 from sgstore.temporal._valuation import BindingTable, Valuation
 
@@ -531,6 +539,8 @@ class RobustnessMonitor:
         What is asked of each frame; those of the margins become part of them.
     pulse : StreamClock
         Told of each frame before this is.
+    reading : Reading, optional
+        What counts where an entity is absent; by default as the quantifiers say.
 
     Raises
     ------
@@ -542,8 +552,18 @@ class RobustnessMonitor:
     Of each binding that was ever told apart a margin is kept, for no two are alike for long.
     """
 
-    def __init__(self, check: BoundCheck, questions: QueryCache, pulse: StreamClock) -> None:
-        self._plan, self._formula = plan_of_margins(check)
+    def __init__(
+        self,
+        check: BoundCheck,
+        questions: QueryCache,
+        pulse: StreamClock,
+        reading: Reading | None = None,
+    ) -> None:
+        about = () if reading is None else (reading,)
+        self._plan, self._formula = plan_of_margins(check, *about)
+        self._without: RobustnessMonitor | None = None
+        if reading is None and misses_absent(check):
+            self._without = RobustnessMonitor(check, questions, pulse, WITHOUT_ABSENCE)
         self._pulse = pulse
         signs = SIGNS if self._plan.doubts else (UNFAVOURABLE,)
         self._streams = {sign: MarginStream(self._formula) for sign in signs}
@@ -554,6 +574,8 @@ class RobustnessMonitor:
 
     def step(self) -> None:
         """A frame has come, and the questions were asked of it."""
+        if self._without is not None:
+            self._without.step()
         valuation, known = self._valuation, self._memories
         letters, memories = valuation.read(known.held, known.of, closed=True)
         parents = [self._row(one) if self._rows else 0 for one in letters]
@@ -593,6 +615,12 @@ class RobustnessMonitor:
         names : mapping of str to mapping of int to str
             Names of the entities that each variable may be.
         """
+        found = self._told(levels, names)
+        if self._without is None:
+            return found
+        return apart_from_absence(found, partial(self._without.told, levels, names))
+
+    def _told(self, levels: Sequence[Level], names: Mapping[str, Mapping[int, str]]) -> Robustness:
         bindings, stream = innermost(levels), self._streams[UNFAVOURABLE]
         rows = np.array([self._row(tuple(key)) for key in bindings.tolist()], np.int64)
         found = {sign: one.margins() for sign, one in self._streams.items()}
