@@ -197,12 +197,11 @@ PEOPLE: Final = Scene(
     ],
 )
 @pytest.mark.parametrize(
-    "settings", [{"kinds": ("Vehicle", "Lane", "Road")}, {"exclude_ids": ("p",)}]
+    "config", [Config(kinds=("Vehicle", "Lane", "Road")), Config(exclude_ids=("p",))]
 )
 def test_a_check_of_what_settings_exclude_is_unknown(
-    tmp_path: Path, check: str, expected: str, settings: dict[str, tuple[str, ...]]
+    tmp_path: Path, check: str, expected: str, config: Config
 ) -> None:
-    config = Config(**settings)
     store = store_of(tmp_path / "s.sgstore", {"road": [PEOPLE]}, {"road": config})
     text = f"CHECK c: {check}"
     monitor = Monitor(text, PEOPLE.road, config)
