@@ -59,6 +59,7 @@ from ._horizon import horizon as horizon
 from ._horizon import spoken_kinds as spoken_kinds
 from ._needs import MOTION as MOTION
 from ._needs import Need as Need
+from ._needs import not_computed as not_computed
 from ._needs import of_check as of_check
 from ._needs import of_query as of_query
 from ._operators import Column as Column
@@ -210,6 +211,7 @@ __all__ = [
     "told_lanes",
     "node_of_kind",
     "notes_on",
+    "not_computed",
     "of_check",
     "of_query",
     "parse",

@@ -247,6 +247,11 @@ IN_GRAPH: Final = Attribute(
 )
 """Of queries made here alone: who writes one has the scope."""
 
+COMPUTED: Final = Attribute(
+    "computed", Type.boolean, {}, "whether its relations were computed here, and not imported"
+)
+"""Of a trace, in queries made here alone; its settings say it."""
+
 NODE_ATTRIBUTES: Final = _named(
     (
         Attribute("id", Type.number, {}, "node id, unique in its trace", DisplayUnit.binding),
@@ -627,6 +632,8 @@ class RelationScope:
         A circle around the ego that is in its graph; m.
     farthest : float
         How far from the ego an entity is at most of which something is known; m.
+    without : frozenset of str
+        Relations that are not computed of entities, though a map may have them among its parts.
     """
 
     within: float = 25.0
@@ -639,6 +646,7 @@ class RelationScope:
     near_kinds: tuple[tuple[str, ...], ...] = ()
     radius: float = 0.0
     farthest: float = math.inf
+    without: frozenset[str] = frozenset()
 
     @classmethod
     def of(cls, settings: Mapping[str, Any]) -> Self | None:
@@ -648,6 +656,9 @@ class RelationScope:
             return None
         near, around = settings["proximity"], settings["range"]
         names = ("within", "ego", "static", "ego_within")
+        without = set(settings.get("without", ()))
+        if settings.get("lanes", {}).get("granularity") == "none":
+            without.add("isIn")
         return cls(
             **{name: pairs[name] for name in names},
             kinds=_pairs_of(pairs["kinds"]),
@@ -659,6 +670,7 @@ class RelationScope:
                 around["radius"] if around["shape"] == "radius" else math.inf,
                 around.get("world", 0.0),
             ),
+            without=frozenset(without),
         )
 
 

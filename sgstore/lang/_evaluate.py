@@ -18,7 +18,7 @@ import numpy as np
 
 from sgstore.criticality import RECORDED
 from sgstore.lang import ir as b
-from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit, Type
+from sgstore.lang._catalog import COMPUTED, NODE_ATTRIBUTES, DisplayUnit, Type
 from sgstore.lang._operators import OPERATORS, Column
 from sgstore.pair_numbers import (
     COLUMNS,
@@ -349,6 +349,8 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
                 return lambda at: at.passed[name]
             return lambda at: at.view.frame.get(name)
         case b.TraceAttribute(attribute=attribute):
+            if attribute is COMPUTED:
+                return lambda _: True
             name = attribute.name
             return lambda at: at.view.trace.get(name)
         case b.PairNumber(function=function, a=one, b=other):

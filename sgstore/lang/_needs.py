@@ -323,6 +323,37 @@ def of_check(check: BoundCheck) -> tuple[Need, ...]:
     return _ordered(egos | _of_each(spoken, nodes, strict=True))
 
 
+def not_computed(check: BoundCheck, facts: TraceFacts) -> tuple[str, ...]:
+    """Return the relations that a check asks for and that were not computed in a trace, in order."""
+    if check.unknown_is_false:
+        return ()
+    missing = check.relations - facts.answers
+    if facts.reach is not None and facts.reach.without:
+        spoken = (check.formula, *(q.where for q in check.quantifiers if q.where is not None))
+        missing |= facts.reach.without & frozenset().union(*map(_of_entities, spoken))
+    return tuple(sorted(missing))
+
+
+def _of_entities(expression: Bound) -> frozenset[str]:
+    """Return the relations that an expression asks for of entities."""
+    found: set[str] = set()
+    for part in b.walk(expression):
+        match part:
+            case PairNumber(function=function) if function in WAYS:
+                found.add("isIn")
+            case NodeAttribute(attribute=attribute) if attribute is NODE_ATTRIBUTES["injunction"]:
+                found.add("isIn")
+            case b.BlockValue(scope=scope):
+                for edge in scope.edges:
+                    ends = scope.kinds(edge.src).every | scope.kinds(edge.dst).every
+                    if ends & entity_kinds() and edge.relations != b.any_relation():
+                        found |= edge.relations
+                found = found.union(*map(_of_entities, part.inside))
+            case _:
+                pass
+    return frozenset(found)
+
+
 def of_query(query: b.Query) -> tuple[Need, ...]:
     """Return the needs of a query: what a trace must know so that something can be found in it.
 

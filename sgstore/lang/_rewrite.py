@@ -12,7 +12,9 @@ from itertools import combinations, pairwise, product
 from typing import TYPE_CHECKING, Any, Final, TypeGuard
 
 from sgstore.lang._catalog import (
+    COMPUTED,
     NODE_ATTRIBUTES,
+    TRACE_ATTRIBUTES,
     Attribute,
     Catalog,
     DisplayUnit,
@@ -48,6 +50,7 @@ from sgstore.lang.ir import (
     any_kinds,
     conjuncts,
     ego_kinds,
+    is_one_of,
     nodes_of,
     walk,
     with_operands,
@@ -82,6 +85,7 @@ def _ruled(query: Query, catalog: Catalog) -> Query:
     unfold = partial(unfold_paths, injective=query.injective)
     for rule in (
         nothing_beyond,
+        computed_or_imported,
         push_negations,
         counts_to_existence,
         unfold,
@@ -210,6 +214,21 @@ def nothing_beyond(scope: Scope, catalog: Catalog) -> Scope:
         return with_operands(value, known)
 
     return scope if catalog.world else replace(scope, where=tuple(map(known, scope.where)))
+
+
+def computed_or_imported(scope: Scope, catalog: Catalog) -> Scope:
+    """Relations of traces with settings were computed by them."""
+    ids = [trace.trace_id for trace in catalog.traces if trace.reach is not None]
+    told: Bound = Value(value=bool(ids), type=Type.boolean)
+    if 0 < len(ids) < len(catalog.traces):
+        told = is_one_of(TraceAttribute(TRACE_ATTRIBUTES["id"], Type.number), ids)
+
+    def known(value: Bound) -> Bound:
+        if isinstance(value, TraceAttribute) and value.attribute is COMPUTED:
+            return told
+        return with_operands(value, known)
+
+    return replace(scope, where=tuple(map(known, scope.where)))
 
 
 def push_negations(scope: Scope, _: Catalog) -> Scope:

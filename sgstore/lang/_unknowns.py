@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from sgstore.lang import ir as b
 from sgstore.lang._beyond import beyond_graph, bounded_in, holds
-from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit, RelationScope, Type
+from sgstore.lang._catalog import COMPUTED, NODE_ATTRIBUTES, DisplayUnit, RelationScope, Type
 from sgstore.lang._needs import MEASURED, MOTION, in_traces, related
 from sgstore.pair_numbers import columns_needed
 from sgstore.vocabulary import (
@@ -21,6 +21,7 @@ from sgstore.vocabulary import (
     DIRECTIONS,
     MAP_ONLY,
     SIDES,
+    SIGNALS,
     entity_kinds,
     normalize_name,
 )
@@ -35,10 +36,22 @@ _ANSWERS: Final = frozenset({"IS NULL", "IS NOT NULL", "coalesce", "case"})
 """Operations whose value is known even of unknown operands."""
 
 _FLIPPED: Final = {"<": ">=", "<=": ">", ">": "<=", ">=": "<", "=": "<>", "<>": "="}
-_COMPUTED: Final = frozenset({*BEYOND, *MAP_ONLY, "mayAffect"})
+_EVERYWHERE: Final = frozenset({*BEYOND, *MAP_ONLY, "mayAffect"})
 """Relations that are known beyond the graphs as they are in them."""
 _OF_PAIRS: Final = frozenset({*DIRECTIONS, *SIDES})
 """Relations of all pairs that settings relate."""
+_BOX: Final = frozenset({"heading", "length", "width"})
+_NONE: Final = frozenset[str]()
+_MADE_OF: Final = {
+    **dict.fromkeys((*DIRECTIONS, *SIDES), (_NONE, frozenset({"heading"}))),
+    **dict.fromkeys(("overlaps", "leads", "follows"), (_BOX, _BOX)),
+    "sees": (frozenset({"height"}), _BOX),
+    "isIn": (_BOX, _NONE),
+}
+"""What is measured of source and destination, without which it is not known that a relation does not hold.
+
+Others count as they are recorded: who hides another one, or drives between two.
+"""
 _FALSE: Final = b.Value(value=False, type=Type.boolean)
 _LOOSE: Final = 1 << 20
 """Added to the number of a block that also has the matches of which too little is known."""
@@ -138,7 +151,7 @@ def certain(  # noqa: PLR0911 - a case each
         case b.Operation("AND" | "OR", operands):
             return replace(condition, operands=tuple(map(again, operands)))
         case b.BlockValue():
-            return condition
+            return condition if decided else _sure(condition)
         case b.Operation("NOT", (operand,)):
             doubt = None if decided else unknown(operand)
             if _of_blocks(operand):
@@ -159,8 +172,8 @@ def possible(condition: b.Bound) -> b.Bound:
     match condition:
         case b.Operation("AND" | "OR", operands):
             return replace(condition, operands=tuple(map(possible, operands)))
-        case b.Operation("NOT", (b.BlockValue(),)):
-            return condition  # a match that is known is one
+        case b.Operation("NOT", (b.BlockValue() as block,)):
+            return _not(_sure(block))  # a match that is known is one
         case b.Operation("NOT", (operand,)):
             doubt = unknown(operand)
             return certain(condition) if doubt is None else any_of((certain(condition), doubt))
@@ -265,13 +278,40 @@ def _of_block(block: b.BlockValue) -> tuple[b.Bound, ...]:
     return tuple(found)
 
 
+@lru_cache(maxsize=1024)
+def _sure(block: b.BlockValue) -> b.BlockValue:
+    """``EXISTS`` with only those matches that are certain."""
+    doubted = any(_of_blocks(one) and unknown(one) is not None for one in block.scope.where)
+    loose = [
+        _not(any_of(doubts))
+        for edge in block.scope.edges
+        if "isIn" in edge.relations
+        and "off_road" in block.scope.kinds(edge.dst).every
+        and (doubts := [*_unmeasured_ends(edge, block.scope)])
+    ]  # what has a size reaches farther than its centre, onto a road perhaps
+    if block.word != "EXISTS" or not (loose or doubted):
+        return block
+    where = tuple(certain(pushed(one)) for one in block.scope.where)
+    scope = replace(block.scope, where=(*where, *loose))
+    return replace(block, scope=scope, number=block.number + 3 * _LOOSE)
+
+
 def _exists(
     block: b.BlockValue, edges: tuple[b.Edge, ...], where: tuple[b.Bound, ...], number: int
 ) -> b.Bound:
     """The condition that braces have a match, with other edges and conditions."""
-    if not block.scope.nodes and not edges:
+    asked = frozenset().union(*({edge.src, edge.dst} for edge in edges), *map(b.nodes_of, where))
+    nodes = {key: node for key, node in block.scope.nodes.items() if key in asked}
+    if not nodes and not edges:
         return where[0] if len(where) == 1 else b.Operation("AND", where, Type.boolean)
-    scope = replace(block.scope, edges=edges, where=where)
+    distinct = (
+        pair
+        for pair in block.scope.distinct
+        if not {*pair} & block.scope.nodes.keys() - nodes.keys()
+    )
+    scope = replace(
+        block.scope, nodes=nodes, edges=edges, where=where, distinct=frozenset(distinct)
+    )
     return replace(
         block,
         word="EXISTS",
@@ -289,22 +329,45 @@ def _edges_of(condition: b.Bound) -> frozenset[str]:
 
 
 def _not_computed(edge: b.Edge, block: b.BlockValue) -> b.Bound | None:
-    """The condition that an edge in braces was not computed, as an end of it is beyond the graph.
+    """The condition that it is not known whether there is an edge in braces; ``None``: it always is."""
+    found = [*_beyond(edge, block.scope), *_unmeasured_ends(edge, block.scope)]
+    return any_of(found) if found else None
+
+
+def _beyond(edge: b.Edge, scope: b.Scope) -> Iterable[b.Bound]:
+    """The condition that an edge was not computed, as an end of it is beyond the graph.
 
     A relation of pairs does not hold of two that settings do not relate, nor one of distance of two that are
     farther apart.
     """
-    names = edge.relations - _COMPUTED
-    ends = [block.scope.kinds(key).every & entity_kinds() for key in (edge.src, edge.dst)]
+    names = edge.relations - _EVERYWHERE
+    ends = [scope.kinds(key).every & entity_kinds() for key in (edge.src, edge.dst)]
     if not edge.beyond or not names or not all(ends):
-        return None
+        return
     away = beyond_graph(edge)
     if edge.high > 1 or names - _OF_PAIRS - bounded_in(edge.beyond):
-        return away
-    if not names & _OF_PAIRS:
-        return _both(away, holds(edge, names))
-    return _both(away, in_traces(edge.beyond, lambda reach: _related(edge, reach)))
+        yield away
+    elif not names & _OF_PAIRS:
+        yield _both(away, holds(edge, names))
+    else:
+        yield _both(away, in_traces(edge.beyond, lambda reach: _related(edge, reach)))
 
 
 def _related(edge: b.Edge, reach: RelationScope | None) -> b.Bound:
     return related(edge.src, edge.dst, reach or RelationScope())
+
+
+def _unmeasured_ends(edge: b.Edge, scope: b.Scope) -> Iterable[b.Bound]:
+    """The conditions that something was not measured of an end of an edge, so that it may be missing."""
+    for forward in (True, False) if edge.both else (True,):
+        for end, key in enumerate((edge.src, edge.dst) if forward else (edge.dst, edge.src)):
+            every = scope.kinds(key).every
+            names = frozenset().union(*(_MADE_OF[n][end] for n in edge.relations & _MADE_OF.keys()))
+            bodies = entity_kinds() - frozenset(SIGNALS)
+            if not names or not every & bodies:
+                continue
+            parts = [_is_null(_attribute(key, name)) for name in sorted(names)]
+            computed: b.Bound = b.TraceAttribute(COMPUTED, Type.boolean)
+            if not every <= bodies:
+                computed = _both(computed, b.LabelTest(key, b.any_kinds().only(bodies)))
+            yield _both(any_of(parts), computed)
