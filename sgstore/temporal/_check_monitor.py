@@ -28,7 +28,10 @@ from sgstore.temporal._checks import (
     folded_values,
     innermost,
     levels_of,
+    may_wait,
+    newcomers,
     verdict_of,
+    waits_for_newcomers,
 )
 from sgstore.temporal._formula import (
     TRUE,
@@ -701,15 +704,21 @@ class CheckMonitor:
     def _of(self, key: list[int]) -> _CheckEntry:
         return self._known.of(tuple(key))
 
-    def _levels(self, *, doubted: bool = False) -> list[Level]:
-        """The bindings of each quantifier; ``doubted``: those of the other evaluation."""
+    def _levels(self, *, doubted: bool = False, waiting: bool = False) -> list[Level]:
+        """The bindings of each quantifier.
+
+        ``doubted``: those of the other evaluation; ``waiting``: with those that ``FORSOME`` may be about later.
+        """
         domains = {n: np.array(sorted(met), np.int64) for n, met in self._domains.items()}
+        domains = newcomers(self._check, domains) if waiting else domains
         size = len(self._variables)
 
         def counts(
             quantifier: BoundQuantifier, variables: tuple[str, ...], bindings: Keys
         ) -> Bools:
             bit = self._guards.get(quantifier, 0)
+            if waiting and quantifier.word == "FORSOME":
+                return np.ones(len(bindings), np.bool_)
             rest = (None,) * (size - len(variables))
             found = (self._known.of((*key, *rest)) for key in bindings.tolist())
             every = [(one.doubt if doubted and one.doubt else one).counted for one in found]
@@ -754,7 +763,7 @@ class CheckMonitor:
         best, worst = int(folded_values(levels, codes, HOLDS)[0][0]), self._worst()
         word = "true" if worst == HOLDS else "pending" if worst == PENDING else "unknown"
         if best == VIOLATED:
-            word = "false"
+            word = "pending" if self._waits(levels) else "false"
         spans = [self._spans(entry, last) for entry in entries]
 
         def violations(row: int, names: Mapping[str, str]) -> tuple[Interval, ...]:
@@ -781,6 +790,14 @@ class CheckMonitor:
             found = replace(found, robustness=self._margins.told(levels, self._domains))
         holds = word != "false"
         return found, list(self._at_end(last, holds=holds, bindings=bindings, spans=spans))
+
+    def _waits(self, levels: list[Level]) -> bool:
+        """Tell whether a check that has failed so far waits for who comes later."""
+        if self._compat or not may_wait(self._check):
+            return False
+        wider = self._levels(waiting=True)
+        codes = [self._code_at_end(self._of(key)) for key in innermost(wider).tolist()]
+        return waits_for_newcomers(self._check, levels, wider, np.array(codes, np.int8))
 
     def _reason(self, trace: str) -> str:
         """Why the verdict is unknown: the condition that decides, of whom, and in which frame."""

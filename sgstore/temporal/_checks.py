@@ -18,6 +18,7 @@ from sgstore.lang import (
     compared_in_check,
     compile_checks,
     entities,
+    not_computed,
     of_check,
     relation,
     traces_of,
@@ -83,6 +84,10 @@ if TYPE_CHECKING:
 
 VIOLATED, UNKNOWN, PENDING, HOLDS = range(4)
 """What is known of a binding, in order: the smaller of two holds for both, the greater for either."""
+
+
+NEWCOMER: Final = -(1 << 60)
+"""From here on ids of entities that are in no frame so far."""
 
 
 # Quantifiers: which entities of a trace they are about, and what is true of all, or of some, of them ----
@@ -159,6 +164,45 @@ def levels_of(
         bindings, parents = bindings[kept], parents[kept]
         levels.append(Level(quantifier.word, bindings, parents))
     return levels
+
+
+def newcomers(check: BoundCheck, domains: Mapping[str, Ints]) -> dict[str, Ints]:
+    """Return the domains of a check, with one who is yet to come for each variable of ``FORSOME``."""
+    some = [node for q in check.quantifiers if q.word == "FORSOME" for node in q.nodes]
+    return {
+        node: np.append(domain, NEWCOMER + some.index(node)) if node in some else domain
+        for node, domain in domains.items()
+    }
+
+
+def waits_for_newcomers(
+    check: BoundCheck, levels: Sequence[Level], wider: Sequence[Level], codes: Codes
+) -> bool:
+    """Tell whether a check that has failed may still hold, as ``FORSOME`` is about who comes later, too.
+
+    Parameters
+    ----------
+    check : BoundCheck
+    levels : sequence of Level
+        The bindings that it is about so far.
+    wider : sequence of Level
+        The same with newcomers, and with those of which ``WHERE`` was not true yet.
+    codes : (B,) int8
+        What is known of the last ones of ``wider``. The wait for them has no bound, so what already holds of
+        them is pending only if all that is due is.
+    """
+    known = set(map(tuple, innermost(levels).tolist()))
+    late = np.array([tuple(row) not in known for row in innermost(wider).tolist()], np.bool_)
+    due = (codes != VIOLATED) & ((codes != HOLDS) | (check.end == "pending"))
+    codes = np.where(late, np.where(due, PENDING, VIOLATED), codes).astype(np.int8)
+    return int(folded_values(wider, codes, HOLDS)[0][0]) != VIOLATED
+
+
+def may_wait(check: BoundCheck) -> bool:
+    """Tell whether a check that has failed so far may be fulfilled by who comes later."""
+    return check.end in {"bounded", "pending"} and any(
+        q.word == "FORSOME" for q in check.quantifiers
+    )
 
 
 def folded_values(levels: Sequence[Level], values: Array, most: int = 1) -> list[Array]:
@@ -659,7 +703,13 @@ class StoreCheck:
     @cached_property
     def _lacks(self) -> dict[int, str]:
         """The traces that do not know what the check needs, with the reason."""
-        return lacking(self._file, self._catalog, of_check(self._check))
+        found = lacking(self._file, self._catalog, of_check(self._check))
+        for facts in self._catalog.traces:
+            if missing := not_computed(self._check, facts):
+                reasons = [f"it knows nothing of {', '.join(missing)}"]
+                reasons += [found[facts.trace_id]] if facts.trace_id in found else []
+                found[facts.trace_id] = "; ".join(reasons)
+        return found
 
     @cached_property
     def _short(self) -> Mapping[int, ShortRange]:
@@ -728,10 +778,8 @@ class StoreCheck:
         _, left = traces_of(self._whole, catalog)
         for facts in catalog.traces:
             if facts.trace_id in left and self._check.ego in {None, facts.ego}:
-                missing = sorted(self._whole.relations - facts.answers)
-                reasons = [f"it knows nothing of {', '.join(missing)}"] if missing else []
-                reasons += [lacks[facts.trace_id]] if facts.trace_id in lacks else []
-                yield Verdict(self._check.name, facts.name, "unknown", reason="; ".join(reasons))
+                reason = lacks.get(facts.trace_id, "")
+                yield Verdict(self._check.name, facts.name, "unknown", reason=reason)
 
     @cached_property
     def _absences(self) -> dict[int, int]:
@@ -778,6 +826,11 @@ class StoreCheck:
             word = "false" if best == VIOLATED else "true"
         else:
             word = "pending" if worst == PENDING else "unknown"
+        if word == "false" and not self._compat and may_wait(self._check):
+            wider = self._levels(trace, waiting=True)
+            codes = self._judged(trace, wider).codes
+            if waits_for_newcomers(self._check, levels, wider, codes):
+                word = "pending"
         found = self._reported(
             trace, word, (levels, judged) if word == "false" else (strict, other)
         )
@@ -936,7 +989,10 @@ class StoreCheck:
         least = np.concatenate([nothing, *(part[0] for part in parts)])
         return least, np.concatenate([nothing, *(part[1] for part in parts)])
 
-    def _levels(self, trace: TraceReader, counted: str = FAVOURABLE) -> list[Level]:
+    def _levels(
+        self, trace: TraceReader, counted: str = FAVOURABLE, *, waiting: bool = False
+    ) -> list[Level]:
+        """The bindings of each quantifier; ``waiting``: with those that ``FORSOME`` may be about later."""
         people = self._people.get(trace.trace_id, {})
         domains = {
             node: np.array(sorted(people.get(node, ())), np.int64)
@@ -944,12 +1000,14 @@ class StoreCheck:
         }
         others = [domains[n] for n in self._check.scope.nodes if n not in self._variables]
         apart = np.concatenate([np.zeros(0, np.int64), *others])
+        domains = newcomers(self._check, domains) if waiting else domains
 
         def counts(
             quantifier: BoundQuantifier, variables: tuple[str, ...], bindings: Keys
         ) -> Bools:
             guard = self._guards.get(self._check.quantifiers.index(quantifier))
-            if guard is None or not len(bindings):
+            every = waiting and quantifier.word == "FORSOME"
+            if guard is None or every or not len(bindings):
                 return np.ones(len(bindings), np.bool_)
             size = trace.together
             some = (bindings[low : low + size] for low in range(0, len(bindings), size))

@@ -25,6 +25,7 @@ from sgstore.lang import (
     bind_checks,
     bind_query,
     each_match,
+    not_computed,
     of_check,
     of_query,
     parse,
@@ -259,7 +260,8 @@ class Monitor:
         self._on_event, self._on_step = on_event, on_step
         answers = frozenset(self.generator.answers)
         reach = RelationScope.of(config.as_dict())
-        catalog = Catalog(traces=(TraceFacts(0, trace, "", answers, reach),), online=True)
+        facts = TraceFacts(0, trace, "", answers, reach)
+        catalog = Catalog(traces=(facts,), online=True)
         checks, queries = _bound(text, catalog, parameters or {})
         self._egos: list[str] = []
         self._questions: list[QueryCache] = []
@@ -273,13 +275,13 @@ class Monitor:
         self._watches: list[tuple[int, CheckMonitor, _PendingEvents]] = []
         self._unknown: dict[str, str] = {}
         for check in checks:
-            if check.relations <= answers or check.unknown_is_false:
+            missing = not_computed(check, facts)
+            if not missing:
                 ego, questions = self._of_scope(check.ego, world=check.world)
                 watch = CheckMonitor(check, questions, self._pulse, compat=sgsm_compat)
                 self._watches.append((ego, watch, _PendingEvents(of_check(check))))
             else:
-                missing = ", ".join(sorted(check.relations - answers))
-                self._unknown[check.name] = f"it knows nothing of {missing}"
+                self._unknown[check.name] = f"it knows nothing of {', '.join(missing)}"
         self._follows: list[tuple[int, SequenceMonitor, _PendingEvents]] = []
         for name, query in zip(_names(called, len(queries)), queries, strict=True):
             if query.relations <= answers or query.unknown_is_false:
