@@ -573,11 +573,21 @@ class Told:
     def verdict(self, statement: s.CheckClause) -> str:
         """The verdict of a check of the ego, or of it and each or some v."""
         if not self.checked(statement, unknown=True, due=True)[0]:
-            return "false"
+            return "pending" if self.waits(statement) else "false"
         if self.checked(statement, unknown=False)[0]:
             return "true"
         pending = self.checked(statement, unknown=False, due=True)[0]
         return "pending" if pending else "unknown"
+
+    def waits(self, statement: s.CheckClause) -> bool:
+        """Whether v may be one who comes later: what is due of one who is in no frame so far."""
+        if "FORSOME" not in {one.word for one in statement.quantifiers}:
+            return False
+        binding = {"v": -98, "ego": self.trace.ego if self.trace.ego is not None else -99}
+        with self.counting(False, True, due=True):
+            due = self.true(statement.formula, 0, binding)
+        with self.counting(False, False, due=None):
+            return due and not self.true(statement.formula, 0, binding)
 
     def checked(
         self, statement: s.CheckClause, *, unknown: bool | None = None, due: bool | None = None
