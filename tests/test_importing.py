@@ -20,7 +20,7 @@ from thorough import some
 
 import sgstore
 from sgstore.cli import run
-from sgstore.errors import ConfigError, TraceError
+from sgstore.errors import ConfigError, QueryError, TraceError
 from sgstore.importing import FORMATS, Words, import_graphs
 from sgstore.importing._resolve import Understanding, survey
 from sgstore.importing._run import Blocks, parts_map
@@ -666,6 +666,48 @@ def test_whole_numbers_that_no_float_is_equal_to_are_compared_and_given_exactly(
     assert {str(LARGE), str(2**64 + 1)} <= {value for (value,) in values}
     assert run(["find", str(path), f"MATCH (a:Car) WHERE a.n = {LARGE} RETURN a.n", "--json"]) == 0
     assert str(LARGE) in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "MATCH (a:Car)-[r:near]->(b:Car) RETURN FIRST(a.n) OVER match",
+        "MATCH (a:Car)-[r:near]->(b:Car) RETURN MAX(abs(a.n) + 1) OVER match",
+        "MATCH (a:Car)-[r:near]->(b:Car) RETURN SUM(r.w) OVER match",
+        f"MATCH (a:Car)-[r:near]->(b:Car) WHERE prev(a.n) = {LARGE}",
+        "MATCH (a:Car)-[r:near]->(b:Car) RETURN frame.seq, delta(a.n, 1s)",
+        f"CHECK c: FORALL (a:Car) ALWAYS prev(a.n) <> {LARGE}",
+        f"CHECK c: FORALL (a:Car) ALWAYS a.n <> {LARGE} RETURN a.n",
+    ],
+)
+def test_large_whole_numbers_over_time_are_exact_or_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "s.sgstore"
+    frames = [[{"n": n}, {"n": n - 1}] for n in (LARGE, LARGE - 1, LARGE, LARGE + 1)]
+    import_graphs(path, [nodelink(tmp_path, "a", *frames)], "nodelink")
+    store = Store(path)
+
+    with pytest.raises(QueryError, match=r"values of '[nw]' lie beyond 2\^53"):
+        list(store.check(text) if text.startswith("CHECK") else store.find(text))
+
+
+def test_conditions_on_large_whole_numbers_are_exact_in_each_frame(tmp_path: Path) -> None:
+    path = tmp_path / "s.sgstore"
+    frames = [[{"n": n}, {"n": n - 1}] for n in (LARGE, LARGE - 1, LARGE, LARGE + 1)]
+    import_graphs(path, [nodelink(tmp_path, "a", *frames)], "nodelink")
+    store = Store(path)
+
+    query = f"MATCH (a:Car)-[:near]->(b:Car) WHERE prev(a.n = {LARGE}) RETURN frame.seq"
+    assert [row[0] for row in store.find(query)] == [1, 3]
+    query = f"MATCH (a:Car)-[:near]->(b:Car) RETURN MAX(CASE WHEN a.n = {LARGE} THEN 1 ELSE 0 END) OVER match"
+    assert {row[0] for row in store.find(query)} == {1}
+    later = f"THEN MATCH (a) WHERE a.n = {LARGE - 1}"
+    query = f"MATCH (a:Car)-[:near]->(b:Car) WHERE a.n = {LARGE} {later} RETURN a.n"
+    assert [row[0] for row in store.find(query)] == [LARGE - 1]
+    (verdict,) = store.check(f"CHECK c: FORALL (a:Car) ALWAYS a.n <> {LARGE}")
+    assert [(v.start_seq, v.values["a"]) for v in verdict.violations] == [
+        (0, "car 0"),
+        (3, "car 1"),
+    ]
 
 
 def test_a_text_in_one_file_leaves_the_numbers_of_others_numbers(tmp_path: Path) -> None:

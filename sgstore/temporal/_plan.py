@@ -32,6 +32,7 @@ from itertools import combinations
 from typing import TYPE_CHECKING, Final
 
 import sgstore.temporal._formula as f
+from sgstore.errors import QueryError
 from sgstore.lang import CONNECTIVES, Type, relation, unnumbered_text, value_text
 from sgstore.lang import ir as b
 from sgstore.records import dataclass
@@ -331,6 +332,7 @@ class Plan:
         key = ":" + unnumbered_text(value) + f" of {sorted(things)}"
         name = self._names.get(key)
         if name is None:
+            _refuse_large(value)
             name = self._names[key] = f"{self.prefix}s{len(self.signals) + 1}"
             query = self._query(things, ())
             self.signals[name] = Ask(name, query, self._variables(things), value, edges)
@@ -591,3 +593,26 @@ def way_text(way: StepWay) -> str:
 def length_text(length: Length) -> str:
     """A length of time."""
     return f"{length.amount}frames" if length.frames else f"{length.amount / 1e9:g}s"
+
+
+def _refuse_large(value: b.Bound) -> None:
+    """Refuse a value over time of whole numbers that no float is equal to: columns have 64-bit floats.
+
+    Conditions are asked of each frame, exactly.
+
+    Raises
+    ------
+    QueryError
+    """
+    match value:
+        case b.NodeAttribute(attribute=attribute) | b.EdgeAttribute(attribute=attribute):
+            if attribute.whole:
+                raise QueryError(
+                    f"values of '{attribute.name}' lie beyond 2^53, and values over time are 64-bit floats",
+                    hint="compare it in one frame, such as x.n = 9007199254740993, or import it as text",
+                )
+        case b.Operation(operands=operands, type=Type.number):
+            for operand in operands:
+                _refuse_large(operand)
+        case _:
+            pass
