@@ -238,12 +238,13 @@ def test_blocks_frames_and_steps_agree_on_what_is_carried() -> None:
         assert carriers == {"ego": None, "truck": None, "t": ids["truck"]}
 
 
-def test_a_trailer_behind_a_drawbar_is_pulled_if_the_recording_says_so() -> None:
+@pytest.mark.parametrize("kind", ["trailer", "car", "vehicle"])
+def test_a_trailer_behind_a_drawbar_is_pulled_if_the_recording_says_so(kind: str) -> None:
     for told in ("", "t"):
         frame = Frame(0, "truck")
         size = {"heading": 0.0, "width": 2.5, "height": 3.0}
         frame.add("truck", "truck", 0, 0, 1.5, length=6, trailer=told, **size)
-        frame.add("t", "trailer", -6, 0, 1.5, length=5, **size)
+        frame.add("t", kind, -6, 0, 1.5, length=5, **size)
         of = {r for _, r, *_ in SceneGraphGenerator(None, Config()).step(frame).edges}
         assert of & {*CLOSE, "tows"} == ({"tows"} if told else {"super_near"})
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 FRAMES = 100
 SPEED, WIDTH, LENGTH = 8.3, 1.8, 4.7
+ANGLES, YAW_RATE = (12.3, 1.7, -3.3), 5.3
 """Numbers that 32 bits hold as less, or more, than the text."""
 
 
@@ -38,6 +39,9 @@ def _things(t: float) -> list[Any]:
     ]
     for thing in things[:2]:
         thing.base.dimension.width, thing.base.dimension.length = WIDTH, LENGTH
+    turned, rate = things[2].base.orientation, things[2].base.orientation_rate
+    turned.yaw, turned.pitch, turned.roll = (math.radians(angle) for angle in ANGLES)
+    rate.yaw = math.radians(YAW_RATE)
     return things
 
 
@@ -107,6 +111,40 @@ def test_a_literal_is_rounded_to_the_precision_of_the_column(
 def test_what_is_computed_is_rounded_too(store: Store, sgql: str, rows: int) -> None:
     found = store.find(f"MATCH (v:Vehicle) WHERE {sgql} RETURN v.id", **_given(sgql))
     assert len(list(found)) == rows
+
+
+CONVERTED = ("heading", "pitch", "roll", "yaw_rate", "accel")
+SIGNS = (">=", "<=", "=", "<>", ">", "<")
+
+
+@pytest.mark.parametrize("name", CONVERTED)
+def test_converted_columns_are_compared_in_32_bits_in_each_way(store: Store, name: str) -> None:
+    """The view has 64 bits of them, which SQL casts: ``heading::FLOAT >= 12.3``."""
+    column = f"{name}::FLOAT"
+    values = {value for (value,) in store.sql(f"SELECT DISTINCT {column} FROM nodes").values}
+    values -= {None}
+    known = {"heading": 12.3, "pitch": 1.7, "roll": -3.3, "yaw_rate": 5.3, "accel": 3.1}
+    assert known[name] in values
+    frames = [row[0] for row in store.sql("SELECT frame_id FROM frames ORDER BY 1 LIMIT 3").values]
+    for value in values:
+        for sign in SIGNS:
+            asked = list(store.find(f"MATCH (v:Car) WHERE v.{name} {sign} {value} RETURN v.id"))
+            sql = f"SELECT count(*) FROM nodes WHERE kind = 'car' AND {column} {sign} {value}"
+            assert store.sql(sql).values == [(len(asked),)], sign
+            query = (
+                f"MATCH (v:Car) WHERE frame.id IN $frames AND v.{name} {sign} {value} RETURN v.id"
+            )
+            part = len(list(store.find(query, frames=frames)))
+            events: list[Any] = []
+            online = (
+                f"MATCH (v:Car) WHERE v.{name} {sign} {value} RETURN FIRST(v.{name}) OVER match"
+            )
+            for frame in frames:
+                monitor = Monitor(online, period_s=0.1, on_event=events.append)
+                monitor.look([store.file.graph(frame)])
+                monitor.finish()
+            assert len(events) == part
+        assert len(list(store.find(f"MATCH (v:Car) WHERE v.{name} = {value} RETURN v.id"))) > 0
 
 
 def _given(text: str) -> dict[str, Any]:

@@ -58,7 +58,7 @@ _LANE_HALF: Final = (
 )
 """Half the extent of a footprint along the lane."""
 _ALONG_LANES: Final = """DEFINE PREDICATE ttc_lane(a, b) AS
-  CASE WHEN lane_dist(a, b) > 0 AND {speeds} > 0
+  CASE WHEN lane_dist(a, b) > 0 AND {speeds} >= 0.000001
   THEN max(lane_dist(a, b) - {halves}, 0) / ({speeds}) END""".format(
     speeds=" - ".join(_LANE_SPEED.replace("@", one) for one in "ab"),
     halves=" - ".join(_LANE_HALF.replace("@", one) for one in "ab"),

@@ -4,7 +4,8 @@ A trailer and its tractor touch for ever, and so do a rider and the bicycle: tha
 follows the other. So they are no pair: no other relation holds between them but those of direction and sight,
 and the numbers of the pair are unknown.
 
-*Who is carried* is said by the recording (:attr:`sgstore.world.Entities.trailer`) or seen: a trailer that
+*Who is carried* is said by the recording (:attr:`sgstore.world.Entities.trailer`), whatever the kind of what is
+pulled, or seen: a trailer that
 touches a vehicle ahead of it, or a person whose centre is within the footprint of a two-wheeler and who faces
 its way, in the first frame that has both. What touches later has come there. A pair ends for good where the
 two are farther apart than :data:`APART`.
@@ -60,7 +61,7 @@ class Hitches:
         self._kind: Codes = np.zeros(0, np.int8)
         self._seen: Bools = np.zeros(0, np.bool_)
         self._carrier: Ints = np.zeros(0, np.int64)
-        self._trailers: dict[str, int] = {}
+        self._vehicles: dict[str, int] = {}
         self._said: dict[str, int] = {}
 
     def learn(self, entities: Entities) -> None:
@@ -69,13 +70,13 @@ class Hitches:
         self._kind = np.append(self._kind, entities.kind)
         self._seen = np.append(self._seen, np.zeros(count, np.bool_))
         self._carrier = np.append(self._carrier, np.full(count, -1))
-        for row in np.flatnonzero(entities.kind == _TRAILER).tolist():
-            self._trailers[entities.ident[row]] = entities.first + row
+        for row in np.flatnonzero(IS_VEHICLE[entities.kind]).tolist():
+            self._vehicles[entities.ident[row]] = entities.first + row
         for row, trailer in enumerate(entities.trailer):
             if trailer:
                 self._said[trailer] = entities.first + row
-        for trailer in [ident for ident in self._said if ident in self._trailers]:
-            self._carrier[self._trailers[trailer]] = self._said.pop(trailer)
+        for trailer in [ident for ident in self._said if ident in self._vehicles]:
+            self._carrier[self._vehicles[trailer]] = self._said.pop(trailer)
 
     def see(self, frames: FrameBlock, bodies: Callable[[Rows], Bodies]) -> Ints:
         """Carrier of each state of the next block: node id, or -1.
