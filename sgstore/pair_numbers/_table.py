@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Final
 
 import sgstore.pair_numbers._boxes as boxes
@@ -145,37 +145,55 @@ def _is_of(name: str, one: str) -> bool:
 def _side(one: str, names: Sequence[str]) -> str:
     """The states as those of a or b, with functions of it alone: worked out once, not for each of its pairs."""
     made = [f"{pair_sql(name, lambda n: f'{n[2:]}::DOUBLE')} AS {name}" for name in names]
-    return f"(SELECT {', '.join(['*', *made])} FROM inside.state) {one}"  # noqa: S608
-
-
-def _no_pairs() -> str:
-    """The pairs that are none, with their marks. Those of storeys take long, where there are any."""
-    sides = low_and_high_sql(lambda n: n if n == "kind" else f"{n}::DOUBLE")
-    heights = ", ".join(f"{text} AS {name}" for name, text in sides.items())
-    places = "x::DOUBLE AS x, y::DOUBLE AS y, pitch::DOUBLE AS pitch"
-    side = f"(SELECT frame_id, node_id, carrier, {places}, {heights} FROM inside.state)"  # noqa: S608
-    carried = "SELECT frame_id, node_id, carrier FROM inside.state WHERE carrier IS NOT NULL"
-
-    def text(name: str) -> str:
-        return _NAME.sub(lambda at: column(at[0]), EXPRESSIONS[name])
-
-    def column(name: str) -> str:
-        return f"({text(name)})" if name in EXPRESSIONS else f"{name[0]}.{name[2:]}"
-
-    bits = UNEVEN["near_flat"] | UNEVEN["near_storeys"]
-    bound = ("a.carrier = b.node_id", "b.carrier = a.node_id", "a.carrier = b.carrier")
+    if one == "b":
+        return f"(SELECT {', '.join(['*', *made])} FROM inside.state) b"  # noqa: S608
+    # Once for each state of a, so that pairs of ordinary traces cost next to nothing.
+    bits = UNEVEN["near_flat"] | UNEVEN["near_storeys"] | UNEVEN["carried"]
+    made.append(f"coalesce(t.uneven & {bits} <> 0, true) AS uneven")
     return (
-        "(SELECT *, NULL AS level, 0 AS solid FROM (SELECT frame_id,"  # noqa: S608
-        " unnest(list_value(node_id, carrier)) AS one, unnest(list_value(carrier, node_id)) AS other"
-        f" FROM ({carried})"
-        f" UNION SELECT a.frame_id, a.node_id, b.node_id FROM ({carried}) a JOIN ({carried}) b"
-        " ON b.frame_id = a.frame_id AND b.carrier = a.carrier AND b.node_id <> a.node_id)"
-        f" UNION ALL SELECT a.frame_id, a.node_id, b.node_id, {text('level')}, {text('solid')}"
-        f" FROM inside.trace t JOIN {side} a ON a.frame_id >> 24 = t.trace_id"
-        f" JOIN {side} b ON b.frame_id = a.frame_id AND b.node_id <> a.node_id"
-        f" WHERE (t.uneven IS NULL OR t.uneven & {bits} <> 0)"
-        f" AND NOT coalesce({' OR '.join(bound)}, FALSE))"
+        f"(SELECT {', '.join(['s.*', *made])} FROM inside.state s"  # noqa: S608
+        " JOIN inside.trace t ON t.trace_id = s.frame_id >> 24) a"
     )
+
+
+_DOUBTFUL: Final = (
+    "CASE WHEN a.uneven THEN NOT coalesce(a.height > 0 AND b.height > 0"
+    " AND abs(b.z - a.z) * 2 <= a.height + b.height, FALSE)"
+    " OR coalesce(a.carrier = b.node_id OR b.carrier = a.node_id OR a.carrier = b.carrier, FALSE)"
+    " ELSE FALSE END AS doubtful"
+)
+"""Whether a pair may have a mark. Most have none: their boxes are solid and overlap in height."""
+_CALLED: Final = {
+    "a_kind": "src_kind",
+    "b_kind": "dst_kind",
+    "a_node_id": "src",
+    "b_node_id": "dst",
+}
+"""Columns of the views that marks are made of."""
+
+
+def _marked(pairs: str) -> str:
+    """Pairs of states with their marks, which are worked out for the doubtful ones only."""
+    heights = {
+        f"{one}_{side}": made
+        for one in "ab"
+        for side, made in low_and_high_sql(partial(_of_side, one)).items()
+    }
+    sides = [f"CASE WHEN doubtful THEN {made} END AS {name}" for name, made in heights.items()]
+    text = f"SELECT *, {', '.join(sides)} FROM ({pairs})"  # noqa: S608
+    marks = [
+        f"CASE WHEN doubtful THEN {pair_sql(mark, _part_of_mark)} ELSE 0e0 END AS {mark}"
+        for mark in sorted(MARKS)
+    ]
+    return f"SELECT *, {', '.join(marks)} FROM ({text})"  # noqa: S608
+
+
+def _of_side(one: str, name: str) -> str:
+    return _CALLED[f"{one}_kind"] if name == "kind" else f"{one}_{name}::DOUBLE"
+
+
+def _part_of_mark(name: str) -> str:
+    return f"({EXPRESSIONS[name]})" if name in EXPRESSIONS else _CALLED.get(name, name)
 
 
 def pairs_view(view: str = "pairs") -> tuple[str, str]:
@@ -202,15 +220,14 @@ def pairs_view(view: str = "pairs") -> tuple[str, str]:
     columns += [f"{name[0]}.{name[2:]}::DOUBLE AS {name}" for name in inputs]
     columns += [f"{one}.{name}" for one, names in sides.items() for name in names]
     columns += [
-        f"CASE WHEN n.one IS NULL THEN 0 ELSE n.{mark} END AS {mark}" for mark in sorted(MARKS)
+        f"{one}.{name} AS {one}_{name}" for one in "ab" for name in ("height", "pitch", "carrier")
     ]
+    columns.append(_DOUBTFUL)
     joined = (
         f"{_side('a', sides['a'])} JOIN {_side('b', sides['b'])}"
         " ON b.frame_id = a.frame_id AND b.node_id <> a.node_id"
-        f" LEFT JOIN {_no_pairs()} n"
-        " ON n.frame_id = a.frame_id AND n.one = a.node_id AND n.other = b.node_id"
     )
-    text = f"SELECT {', '.join(columns)} FROM {joined}"  # noqa: S608
+    text = _marked(f"SELECT {', '.join(columns)} FROM {joined}")  # noqa: S608
     left = sorted(wanted.difference(*sides.values()))
     for stage in range(1, 1 + max(stage_of(name, MARKS) for name in left)):
         layer = [f"{pair_sql(n, str)} AS {n}" for n in left if stage_of(n, MARKS) == stage]
