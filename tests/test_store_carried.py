@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import random
 import struct
 from dataclasses import dataclass
 from fractions import Fraction
@@ -15,6 +16,7 @@ import av
 import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2
+from permuting import Recorded
 from recordings import Recorder, car, ns
 
 from sgstore.config import Config, Payloads
@@ -210,6 +212,27 @@ def test_the_run_is_found_in_files_of_any_make(tmp_path, how) -> None:
     carried = store.carried(f"d#{GROUP - 1}", "/cam")
 
     assert carried.data == b"".join(packets[GROUP : 2 * GROUP - 1])
+
+
+@pytest.mark.parametrize("chunking", [True, False])
+def test_the_run_is_in_order_of_time_whatever_the_order_in_the_file(tmp_path, chunking) -> None:
+    packets = encoded("h264", 2 * GROUP)
+    recorded(tmp_path / "d.mcap", WRAPPINGS["protobuf"], packets, "h264")
+    whole = Recorded.of(tmp_path / "d.mcap")
+    for seed in range(3):
+        draw = random.Random(seed)
+        path = tmp_path / str(seed) / "d.mcap"
+        whole.permuted(draw).write(path, draw, size=20_000, chunking=chunking)
+        (outcome,) = ingest(
+            path.with_suffix(".db"), [path], config=Config(payloads=Payloads(join="latest"))
+        )
+        assert outcome.status == "added", outcome
+        store = StoreFile(path.with_suffix(".db"))
+
+        for frame in (1, GROUP // 2, GROUP - 1):
+            last = 2 * frame
+            packet = packets[last // GROUP * GROUP : last + 1]
+            assert store.carried(f"d#{frame}", "/cam").data == b"".join(packet)
 
 
 @pytest.mark.parametrize("how", [{}, {"use_chunking": False}])

@@ -21,9 +21,11 @@ import json
 import re
 import struct
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain, islice, repeat, starmap
+from itertools import islice
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -52,7 +54,7 @@ if TYPE_CHECKING:
     from mcap.records import Channel, Schema
     from numpy.typing import NDArray
 
-    from sgstore.mcap import Recording
+    from sgstore.mcap import Messages, Recording
 
 
 MAX_RUN: Final = 10_000
@@ -92,9 +94,6 @@ _CODECS: Final = (
     ),
 )
 """Key frames: IDR of H.264; BLA, IDR and CRA of H.265. Parameter sets: SPS and PPS, and VPS of H.265."""
-
-_END: Final = 1 << 62
-"""A place behind all messages of a file."""
 
 _UNIT: Final = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
 """A start code of annex B and the first byte of the unit behind it; no unit has one inside."""
@@ -138,8 +137,7 @@ def read_carried(path: Path, *, channel: int, chunk_offset: int, offset: int, le
     codec = next((codec for codec in _CODECS if codec.named.search(form.lower())), None)
     if codec is None or not data:
         return Media("message", message)
-    places = _places(path, channel, chunk_offset, offset)
-    before = map(unwrap, chain.from_iterable(starmap(_before, places)))
+    before = map(unwrap, _before(path, channel, chunk_offset, offset))
     try:
         run, sets = _decodable(codec, data, before)
     except TraceError as error:
@@ -393,71 +391,128 @@ def _parameters(codec: _Codec, data: bytes) -> dict[int, bytes]:
     return found
 
 
-# The messages of a channel before one of them; a message stands at a path, a channel's id, and its place there.
+# The messages of a channel before one of them in time. Chunks that end later are read first: where messages are
+# in order, these are the chunk of the message and those just before it.
 
-Place = tuple["Path", int, int, int]
+_Row = tuple[int, int, int, "Callable[[], bytes]"]
+"""Log time; place of the chunk, outside chunks of the message; offset; data. The first three give the order."""
 
 
-def _places(path: Path, channel: int, chunk_offset: int, offset: int) -> Iterator[Place]:
-    """The place of a message in its file; of a bag then the ends of the files before it, the latest first."""
-    folder = bag_folder(path)
-    if folder is None:
-        yield path, channel, chunk_offset, offset
-        return
-    chunked = chunk_offset >= 0
-    at = chunk_offset if chunked else offset
-    with McapFile(folder) as bag:
-        wanted = bag.channels[channel]
-    for part in reversed(parts_of(folder)):
-        if part.base > at or part.size < 0:
-            continue
-        with McapFile(part.path) as file:
-            own = [n for n, c in file.channels.items() if c.topic == wanted.topic]
-        here = at < part.base + part.size
-        chunk, place = (at - part.base, offset) if chunked else (-1, at - part.base)
-        if not here:
-            chunk, place = (_END, _END) if chunked else (-1, _END)
-        for number in own:
-            yield part.path, number, chunk, place
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """A chunk of a file with messages of a channel, or all messages outside chunks.
+
+    ``base``: where the file begins in its bag. ``chunk``: byte offset, -1 outside chunks. ``end_ns``: latest
+    log time of the messages.
+    """
+
+    path: Path
+    base: int
+    channel: int
+    chunk: int
+    end_ns: int
+
+    def rows(self) -> list[_Row]:
+        """The messages of the channel."""
+        if self.chunk < 0:
+            return _outside_chunks(self.path, self.channel, self.base)
+        with open_regular(self.path) as file:
+            records = read_records(file, read_chunk_head(file, self.chunk))
+        messages, _ = parse_records(records, self.chunk)
+        return [
+            (
+                int(messages.log_time_ns[row]),
+                self.base + self.chunk,
+                int(messages.offset[row]),
+                partial(_copied, messages, row),
+            )
+            for row in np.flatnonzero(messages.channel == self.channel).tolist()
+        ]
 
 
 def _before(path: Path, channel: int, chunk_offset: int, offset: int) -> Iterator[bytes]:
-    """The messages of a channel before one of them, the latest first, as they stand in the file."""
-    if chunk_offset < 0:
-        yield from _before_outside_chunks(path, channel, offset)
+    """The messages of a channel before one of them in time, the latest first."""
+    chunked = chunk_offset >= 0
+    at = chunk_offset if chunked else offset
+    parts = [*_parts(path, channel)]
+    own, base, number = next(one for one in reversed(parts) if one[1] <= at)
+    rows = _Source(own, base, number, chunk_offset - base if chunked else -1, 0).rows()
+    wanted = at, offset if chunked else offset - base
+    last = next((row[:3] for row in rows if row[1:3] == wanted), None)
+    if last is None:
+        raise TraceError("the recording has changed", path=path, offset=at)
+    sources: list[_Source] = []
+    for own, base, number in parts:
+        spans = _chunks(own) if chunked else [(-1, 0, last[0])]
+        sources += [
+            _Source(own, base, number, chunk, min(end, last[0]))
+            for chunk, start, end in spans
+            if start <= last[0]
+        ]
+    sources.sort(key=lambda source: (source.end_ns, source.base + source.chunk))
+    waiting: list[_Row] = []
+    while sources or waiting:
+        while sources and (not waiting or waiting[-1][0] <= sources[-1].end_ns):
+            waiting += (row for row in sources.pop().rows() if row[:3] < last)
+            waiting.sort(key=itemgetter(0, 1, 2))
+        if waiting:
+            yield waiting.pop()[3]()
+
+
+def _copied(messages: Messages, row: int) -> bytes:
+    return bytes(messages.data(row))
+
+
+def _parts(path: Path, channel: int) -> Iterator[tuple[Path, int, int]]:
+    """The files of a recording, where each begins, and the id of a channel of the recording in it."""
+    folder = bag_folder(path)
+    if folder is None:
+        yield path, 0, channel
         return
-    with open_regular(path) as file:
-        for start in reversed(_chunks(path, chunk_offset)):
-            messages, _ = parse_records(read_records(file, read_chunk_head(file, start)), start)
-            mine = messages.channel == channel
-            if start == chunk_offset:
-                mine &= messages.offset < offset
-            for row in np.flatnonzero(mine)[::-1].tolist():
-                yield bytes(messages.data(row))
+    with McapFile(folder) as bag:
+        topic = bag.channels[channel].topic
+    for part in parts_of(folder):
+        if part.size >= 0:
+            with McapFile(part.path) as file:
+                own = [number for number, one in file.channels.items() if one.topic == topic]
+            yield from ((part.path, part.base, number) for number in own)
 
 
-def _chunks(path: Path, last: int) -> list[int]:
-    """Byte offsets of the chunks of a file, up to one of them."""
+def _chunks(path: Path) -> list[tuple[int, int, int]]:
+    """Byte offset, first and last log time of the chunks of a file."""
     with open_regular(path) as file:
-        found: list[int] = read_summary(file, file.seek(0, 2)).chunk_offsets.tolist()
-    if last not in found and not (found and last == _END):
+        offsets: list[int] = read_summary(file, file.seek(0, 2)).chunk_offsets.tolist()
+    if not offsets:
 
         def note(start: int) -> bool:
-            found.append(start)
+            offsets.append(start)
             return False
 
-        found = []
         with McapFile(path) as recording:
             for _ in recording.walk(Findings(), note):
                 pass
-    return [start for start in found if start <= last]
+    found: list[tuple[int, int, int]] = []
+    with open_regular(path) as file:
+        for offset in offsets:
+            _, start, end = found[-1] if found else (0, 0, 0)
+            with suppress(TraceError):  # the error is raised if the chunk is needed
+                head = read_chunk_head(file, offset)
+                start, end = head.start_ns, head.end_ns
+            found.append((offset, start, end))
+    return found
 
 
-def _before_outside_chunks(path: Path, channel: int, last: int) -> Iterator[bytes]:
-    places: list[tuple[int, int, int]] = []
+def _outside_chunks(path: Path, channel: int, base: int) -> list[_Row]:
+    rows: list[_Row] = []
     with McapFile(path) as recording:
         for run in recording.walk(Findings(), lambda _: False):
-            mine = (run.channel == channel) & (run.offset < last)
-            offsets, lengths = run.offset[mine].tolist(), run.length[mine].tolist()
-            places += zip(repeat(-1), offsets, lengths)
-    yield from map(bytes, messages_at(path, reversed(places)))
+            mine = np.flatnonzero(run.channel == channel)
+            columns = run.log_time_ns[mine], run.offset[mine], run.length[mine]
+            for time, offset, length in zip(*(one.tolist() for one in columns), strict=True):
+                rows.append((time, base + offset, offset, partial(_message, path, offset, length)))
+    return rows
+
+
+def _message(path: Path, offset: int, length: int) -> bytes:
+    (data,) = messages_at(path, [(-1, offset, length)])
+    return bytes(data)
