@@ -271,3 +271,17 @@ def test_the_definitions_that_are_tested_with_are_those_of_autoware(data: Path) 
             assert fields(AUTOWARE[name]) == fields(path.read_text(encoding="utf-8")), name
 
     assert checked == sum(name.startswith("autoware_") for name in AUTOWARE)
+
+
+def test_infinite_numbers_of_a_damaged_message_are_missing_without_a_warning_of_numpy(
+    tmp_path: Path,
+) -> None:
+    with Stack(tmp_path / "a.mcap") as stack:
+        for t in (0.0, 0.1):
+            stack.pose(t, 0.0, 0.0)
+            stack.objects(t, [thing("car", 20.0, 1.0, a=(np.inf, 0.0), v=(np.inf, 0.0))])
+    with open_trace(tmp_path / "a.mcap") as trace:
+        (block,) = trace.blocks()
+
+    assert np.isfinite(block.states.x).all()
+    assert not np.isinf(block.states.ax).any()

@@ -560,18 +560,18 @@ def _numbers(objects: Floats, base: Pose | None) -> tuple[Floats, Bools]:
     plain = (available == _NO_HEADING) | ~np.isfinite(told).all(axis=(1, 2))
     told[plain] = np.eye(3)
     turns = outer @ told
-    values[:, :3] = place + objects[:, :3] @ outer.T
     values[:, 3:6] = _angles(turns)
     backwards = (available == _NO_SIGN) & (objects[:, 7] < 0)
     values[backwards, 3] = np.remainder(values[backwards, 3] + 2 * np.pi, 2 * np.pi) - np.pi
     values[plain, 3:6] = np.nan
     moving = ~(objects[:, 19] == 0)  # a detection that has no twist says so
-    values[moving, 6:9] = (turns @ objects[:, 7:10, None])[moving, :, 0]
     values[moving, 12] = objects[moving, 10]
-    values[:, 9:12] = (turns @ objects[:, 11:14, None])[:, :, 0]
     sizes = objects[:, 14:17]
     values[:, 13:16] = np.where((sizes != 0) & np.isfinite(sizes), sizes, np.nan)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers may be infinite
+        values[:, :3] = place + objects[:, :3] @ outer.T
+        values[moving, 6:9] = (turns @ objects[:, 7:10, None])[moving, :, 0]
+        values[:, 9:12] = (turns @ objects[:, 11:14, None])[:, :, 0]
         near: Bools = np.abs(values[:, :3]) < FAR
     return values, np.all(near, axis=1, keepdims=True)[:, 0]
 
