@@ -89,8 +89,8 @@ def needed_for(name: str, without: Marks = frozenset()) -> frozenset[str]:
 
 
 def columns_needed(name: str) -> tuple[frozenset[str], frozenset[str]]:
-    """The columns of a and those of b without which a number of a pair is unknown."""
-    raw = [part for part in needed_for(name) if part not in EXPRESSIONS]
+    """The columns of a and those of b without which a number of a pair is unknown: not those of heights."""
+    raw = [part for part in needed_for(name, MARKS) if part not in EXPRESSIONS]
     raw = [part for part in raw if part[2:] not in {*OPTIONAL, "z"}]
     a, b = (frozenset(part[2:] for part in raw if part[0] == one) for one in "ab")
     return a, b
