@@ -128,6 +128,7 @@ CHECKS = [
     " CHECK ever: FORSOME (a:Car) EVENTUALLY a.x > 100 AND EXISTS {(a)-[:near]->(b)} ROBUSTNESS",
     "CHECK told: FORALL (a:Car) ALWAYS a.speed < 5 RETURN MAX(a.speed) OVER match AS most, a.name",
     "CHECK seen: FORSOME (a:Car) EVENTUALLY EXISTS {(a)-[:near]->(b)}; CHECK still: ALWAYS ego.speed < 3",
+    "USING RANGE 5 CHECK close: FORALL (a:Car) ALWAYS NOT EXISTS {(a)-[:near]->(b)}",
 ]
 
 
@@ -440,7 +441,7 @@ RULES = {
     },
     "BoundCheck": {
         *("name", "scope", "quantifiers", "formula", "reset", "relations", "injective", "ego"),
-        *("unknown_is_false", "end", "gaps", "robustness", "returns", "world", "range"),
+        *("unknown_is_false", "end", "gaps", "robustness", "returns", "world", "range", "limit"),
     },
     "Scope": {"nodes", "outer", "edges", "where", "distinct"},
     "Aggregate": {"word", "operand", "distinct", "type", "share"},
@@ -464,7 +465,7 @@ VALUES = {
 UNITS = {
     *("plain", "degrees", "east", "north", "up", "light", "derived", "along", "given", "velocity"),
     *("standing", "binding", "owner", "whole", "label", "seconds", "classed", "weather", "clock"),
-    *("span", "role", "recording", "own", "counted", "seen"),
+    *("span", "role", "recording", "own", "counted", "seen", "inside"),
 }
 """Units: ``counted`` and ``seen`` speak of all traces, and are given to each bundle (lang/_parts.py)."""
 
