@@ -313,23 +313,7 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
         case b.NodeValue(node=node):
             return lambda at: at.nodes[node]
         case b.NodeAttribute(node=node, attribute=attribute):
-            if attribute.unit is DisplayUnit.binding:
-                return lambda at: at.nodes[node]
-            if attribute.unit is DisplayUnit.role:
-                return lambda at: at.view.role_of(at.nodes[node])
-            if attribute is NODE_ATTRIBUTES["injunction"]:
-                return lambda at: _in_junction(at, at.nodes[node])
-            if attribute is NODE_ATTRIBUTES["type"]:
-                return lambda at: _type_of(at.view.nodes[at.nodes[node]])
-            if attribute.unit is DisplayUnit.inside:
-                return lambda at: at.view.draws(at.nodes[node])
-            name = attribute.name
-            if attribute is NODE_ATTRIBUTES["lifetime"]:
-                return lambda at: _lifetime(at.nodes[node], at.view.nodes[at.nodes[node]])
-            if attribute.unit is DisplayUnit.own:
-                of = _OWN[attribute.type]
-                return lambda at: of(at.view.nodes[at.nodes[node]].get(name))
-            return lambda at: at.view.nodes[at.nodes[node]].get(name)
+            return _of_node(node, attribute)
         case b.LabelTest(node=node, kinds=kinds):
             return lambda at: at.view.is_one(at.nodes[node], kinds)
         case b.EdgeRelation(edge=edge):
@@ -368,6 +352,27 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
             b.Aggregate() | b.GroupKey() | b.Tense() | b.SignalCall() | b.StepTime() | b.OverMatch()
         ):
             raise TypeError(f"{expression} has no value of its own")
+
+
+def _of_node(node: int, attribute: Attribute) -> Evaluate:  # noqa: PLR0911 - a case each
+    """Return the function that gives an attribute of a node."""
+    if attribute.unit is DisplayUnit.binding:
+        return lambda at: at.nodes[node]
+    if attribute.unit is DisplayUnit.role:
+        return lambda at: at.view.role_of(at.nodes[node])
+    if attribute is NODE_ATTRIBUTES["injunction"]:
+        return lambda at: _in_junction(at, at.nodes[node])
+    if attribute is NODE_ATTRIBUTES["type"]:
+        return lambda at: _type_of(at.view.nodes[at.nodes[node]])
+    if attribute.unit is DisplayUnit.inside:
+        return lambda at: at.view.draws(at.nodes[node])
+    name = attribute.name
+    if attribute is NODE_ATTRIBUTES["lifetime"]:
+        return lambda at: _lifetime(at.nodes[node], at.view.nodes[at.nodes[node]])
+    if attribute.unit is DisplayUnit.own:
+        of = _OWN[attribute.type]
+        return lambda at: of(at.view.nodes[at.nodes[node]].get(name))
+    return lambda at: at.view.nodes[at.nodes[node]].get(name)
 
 
 def _in_junction(at: Binding, node: int) -> bool | None:

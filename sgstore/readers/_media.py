@@ -399,7 +399,7 @@ _Row = tuple[int, int, int, "Callable[[], bytes]"]
 
 
 @dataclass(frozen=True, slots=True)
-class _Source:
+class _FilmSource:
     """A chunk of a file with messages of a channel, or all messages outside chunks.
 
     ``base``: where the file begins in its bag. ``chunk``: byte offset, -1 outside chunks. ``end_ns``: latest
@@ -436,16 +436,16 @@ def _before(path: Path, channel: int, chunk_offset: int, offset: int) -> Iterato
     at = chunk_offset if chunked else offset
     parts = [*_parts(path, channel)]
     own, base, number = next(one for one in reversed(parts) if one[1] <= at)
-    rows = _Source(own, base, number, chunk_offset - base if chunked else -1, 0).rows()
+    rows = _FilmSource(own, base, number, chunk_offset - base if chunked else -1, 0).rows()
     wanted = at, offset if chunked else offset - base
     last = next((row[:3] for row in rows if row[1:3] == wanted), None)
     if last is None:
         raise TraceError("the recording has changed", path=path, offset=at)
-    sources: list[_Source] = []
+    sources: list[_FilmSource] = []
     for own, base, number in parts:
         spans = _chunks(own) if chunked else [(-1, 0, last[0])]
         sources += [
-            _Source(own, base, number, chunk, min(end, last[0]))
+            _FilmSource(own, base, number, chunk, min(end, last[0]))
             for chunk, start, end in spans
             if start <= last[0]
         ]
