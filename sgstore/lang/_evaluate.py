@@ -354,7 +354,7 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
             raise TypeError(f"{expression} has no value of its own")
 
 
-def _of_node(node: int, attribute: Attribute) -> Evaluate:  # noqa: PLR0911 - a case each
+def _of_node(node: str, attribute: Attribute) -> Evaluate:  # noqa: PLR0911 - a case each
     """Return the function that gives an attribute of a node."""
     if attribute.unit is DisplayUnit.binding:
         return lambda at: at.nodes[node]
