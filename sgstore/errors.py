@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 
 
 class SgstoreError(Exception):
-    """Anything that sgstore refuses to do; the message says what is wrong and what would be right."""
+    """Base class of the errors of sgstore. The message has the fault and the remedy."""
 
     def as_dict(self) -> dict[str, object]:
-        """The error as data: ``error``, the name of its class, ``reason``, and what it knows of the place."""
+        """Return the error as data: ``error`` (name of its class), ``reason``, and the place if it is known."""
         reason = getattr(self, "reason", str(self))
         about: dict[str, object] = {"error": type(self).__name__, "reason": reason}
         for name in ("path", "channel", "time_ns", "offset", "road", "element", "extra"):
@@ -55,7 +55,7 @@ def place_named(path: str | Path) -> str:
 
 
 def url_named(path: str | Path) -> str | None:
-    """The URL that a path stands for; ``None``: it is a path on this machine."""
+    """Return the URL in a path, or ``None`` for a path on this machine."""
     return place_named(path) if _URL.match(str(path)) else None
 
 
@@ -169,7 +169,7 @@ class ConfigError(SgstoreError):
 
 
 class StoreError(SgstoreError):
-    """A store cannot be opened, or lacks what was asked of it."""
+    """A store cannot be opened, or lacks the requested data."""
 
 
 def one_store_needed(collection: str | Path, why: str = "this asks one store") -> StoreError:
@@ -250,7 +250,7 @@ class QueryNameError(QueryError):
 
 
 class AbstractionError(SgstoreError):
-    """An abstraction or a derived set of relations: there is none of the name, or it cannot be made."""
+    """An abstraction or a derived set of relations is missing, or cannot be made."""
 
 
 class ExportError(SgstoreError):
@@ -321,7 +321,7 @@ _ERRORS: Final = {
 
 
 def plain_error(error: SgstoreError) -> dict[str, Any]:
-    """An error as plain values, of which :func:`error_of` makes it again in another process."""
+    """Return an error as plain values, from which :func:`error_of` makes it again in another process."""
     if isinstance(error, QueryError):
         span = (error.span.start, error.span.end) if error.span else None
         about = {"kind": type(error).__name__, "query": error.text, "reason": error.reason}
@@ -331,7 +331,7 @@ def plain_error(error: SgstoreError) -> dict[str, Any]:
 
 
 def error_of(told: Mapping[str, Any]) -> SgstoreError:
-    """The error that :func:`plain_error` has told."""
+    """Return the error from the values of :func:`plain_error`."""
     if "query" in told:
         span = TextSpan(*told["span"]) if told["span"] else None
         kind = _QUERY_ERRORS.get(told["kind"], QueryError)

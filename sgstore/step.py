@@ -100,7 +100,7 @@ class Entity(NamedTuple):
         return self.kind, self.special, self.subkind
 
     def meant(self, told: TypeMeaning | None) -> Entity:
-        """The entity as its type is said to be meant, if anything is said."""
+        """Return the entity with the kind that the meaning of its type gives; unchanged without a meaning."""
         if told is None:
             return self
         kind = KIND_CODE[told.kind]
@@ -108,7 +108,7 @@ class Entity(NamedTuple):
 
 
 class Frame:
-    """One instant, to be filled with what is there.
+    """One instant of a scene. A caller adds its entities, lights and events.
 
     Parameters
     ----------
@@ -360,7 +360,7 @@ def replayed(blocks: Iterable[FrameBlock], recorded: Iterable[str] = ()) -> Iter
 
 
 def _recording(frame: Frame, events: Iterable[Event], known: set[str]) -> Frame:
-    """The frame of a recording, with what happened in it: of which kinds such a recording tells from now on."""
+    """Return a frame with its events. ``known`` gets their kinds; a recording has these from here on."""
     frame.events += [(event.kind, event.ident, event.other) for event in events]
     known.update(kind for kind, _, _ in frame.events)
     frame.recorded = frozenset(known)
@@ -592,7 +592,7 @@ def _moving(states: States) -> list[Attributes]:
 
 
 def _coded(lights: int, light: int, derived: int, gear: float, hand_brake: float) -> Attributes:
-    """Attributes that are no plain numbers: lights, derived flags, gear and hand brake."""
+    """Return the attributes that are stored as codes: lights, derived flags, gear and hand brake."""
     about: Attributes = {}
     if lights >= 0:
         about |= {name: bool(lights >> bit & 1) for bit, name in enumerate(VEHICLE_LIGHTS)}

@@ -816,13 +816,13 @@ def _as_kept(states: States, origin: Origin) -> States:
 
 
 def turned(heading: Floats) -> Floats:
-    """Headings in (-π, π], and so that they still are when they are cut to float32."""
+    """Return headings in (-π, π], also after rounding to float32."""
     # The largest float32 that is not above π: the float32 nearest to π is.
     largest = float(np.nextafter(np.float32(np.pi), np.float32(0)))
     return np.clip(wrapped(heading), -largest, largest)
 
 
 def number(values: Floats) -> NDArray[np.float32]:
-    """float32; what is too large for it becomes infinite."""
+    """Return values as float32. A value beyond its range becomes infinite."""
     with np.errstate(over="ignore"):
         return values.astype(np.float32)

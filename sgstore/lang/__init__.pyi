@@ -109,7 +109,6 @@ from .library import NamedPattern as NamedPattern
 from .library import pattern_named as pattern_named
 from .library import patterns as patterns
 from ._unknowns import CONNECTIVES as CONNECTIVES
-from ._unknowns import any_of as any_of
 from ._unknowns import certain as certain
 from ._unknowns import has_pairs as has_pairs
 from ._unknowns import negated as negated
@@ -120,7 +119,6 @@ from ._unknowns import unknown as unknown
 
 __all__ = [
     "CONNECTIVES",
-    "any_of",
     "certain",
     "has_pairs",
     "negated",

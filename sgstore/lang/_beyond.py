@@ -1,9 +1,9 @@
-"""Relations that end at some distance, of entities beyond the graph: told by where these are.
+"""Distance relations of entities beyond the graph, by their definition.
 
-Of two entities of which one is beyond the graph no edges were computed. But rungs of ``[proximity]`` and
-``overlaps`` are defined by places and sizes, which are known. So in scope ``world`` braces that ask for such an
-edge are asked twice: for the edge, and, of pairs that are not both in the graph, for its definition. No match
-is in both answers, so numbers of matches add up.
+A graph has edges between its own entities only. The rungs of ``[proximity]`` and ``overlaps`` are defined by
+places and sizes, which are also known beyond the graph. In scope ``world`` a block with such an edge is
+therefore evaluated twice: with the edge, and with its definition for pairs that are not both in the graph. No
+match is in both results, so their counts add up.
 """
 
 from __future__ import annotations
@@ -24,10 +24,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
 _MOST: Final = 3
-"""Edges in braces that are told so; there are as many questions as sets of them."""
+"""Edges in braces that are evaluated so: each set of them is one more query.
+
+With more edges, a check is unknown and a pattern matches within the graph.
+"""
 
 _SIDES: Final = 10.0
-"""Half lengths of two bodies, by which their centres are farther apart than their edges; m."""
+"""Half lengths of two bodies together: the distance of centres is greater than that of edges; m."""
 
 
 def beyond_graph(edge: b.Edge) -> b.Bound:
@@ -35,19 +38,18 @@ def beyond_graph(edge: b.Edge) -> b.Bound:
     keys = edge.src, edge.dst
     two = b.Operation("<>", tuple(map(b.NodeValue, keys)), Type.boolean)
     ends = (b.NodeAttribute(key, IN_GRAPH, Type.boolean) for key in keys)
-    away = _any([b.Operation("NOT", (end,), Type.boolean) for end in ends])
-    return b.Operation("AND", (two, away), Type.boolean)
+    return b.all_of(two, b.any_of(map(b.inverse, ends)))
 
 
 def whole_block(block: b.BlockValue, number: int) -> b.Bound:
-    """Return what a block is of all that is known, and with it of pairs beyond the graph.
+    """Return a block that includes pairs beyond the graph.
 
     Parameters
     ----------
     block : BlockValue
-        Asked of the edges that were computed.
+        Has the edges that were computed.
     number : int
-        From which on blocks have no number yet.
+        The first number that no block has yet.
     """
     edges = [edge for edge in block.scope.edges if _is_told(edge, block)]
     if not edges or len(edges) > _MOST or block.word not in _JOINED:
@@ -64,7 +66,7 @@ def whole_block(block: b.BlockValue, number: int) -> b.Bound:
 
 
 def _is_told(edge: b.Edge, block: b.BlockValue) -> bool:
-    """Tell whether the definition of an edge says all of it that was not computed."""
+    """Return true if an edge beyond the graph follows from its definition."""
     if edge.high > 1 or edge.named or not edge.beyond:
         return False
     kinds = [block.scope.kinds(key) for key in (edge.src, edge.dst)]
@@ -103,14 +105,14 @@ def _defined(block: b.BlockValue, edges: tuple[b.Edge, ...], number: int) -> b.B
 
 
 def looks_less(check: b.BoundCheck, ego: b.Node) -> b.BoundCheck:
-    """Return a check of which nobody farther away than it says is part.
+    """Return a check in which an entity farther away than its limit is absent.
 
     Parameters
     ----------
     check : BoundCheck
         With a limit.
     ego : Node
-        Added to its nodes if it does not speak of the ego.
+        Added to its nodes if it has no ego.
     """
     assert check.limit is not None  # noqa: S101 - it has one
     own = [key for key, node in check.scope.nodes.items() if not node.kinds.other]
@@ -129,7 +131,7 @@ def looks_less(check: b.BoundCheck, ego: b.Node) -> b.BoundCheck:
 
 
 def _limited(value: b.Bound, ego: b.Node, limit: float) -> b.Bound:
-    """A value, in whose braces nobody is farther from the ego."""
+    """Return a value whose braces match no entity farther from the ego than the limit."""
     again = partial(_limited, ego=ego, limit=limit)
     if not isinstance(value, b.BlockValue):
         return b.with_operands(value, again)
@@ -151,7 +153,7 @@ def is_limited(node: b.Node) -> bool:
 def within(key: str, ego: str, limit: float) -> b.Bound:
     """Return the condition that the footprint of a node is no farther from the ego's centre than a limit.
 
-    What has no place, or is part of the map, counts as near.
+    A node without a place, or one of the map, counts as near.
     """
 
     def number(name: str) -> b.Bound:
@@ -173,7 +175,7 @@ def within(key: str, ego: str, limit: float) -> b.Bound:
 def holds(edge: b.Edge, names: Iterable[str]) -> b.Bound:
     """Return the condition that an edge has one of some relations by their definition.
 
-    Where settings are not known: that it may have one.
+    If the settings of a trace are not known: the condition that it may have one.
     """
     among = frozenset(names)
 
@@ -187,10 +189,6 @@ def holds(edge: b.Edge, names: Iterable[str]) -> b.Bound:
         return b.Operation("<=", (apart, limit), Type.boolean)
 
     return in_traces(edge.beyond, of_scope)
-
-
-def _any(conditions: list[b.Bound]) -> b.Bound:
-    return b.Operation("OR", tuple(conditions), Type.boolean)
 
 
 def _sum(blocks: list[b.BlockValue]) -> b.Bound:
@@ -209,7 +207,7 @@ def _extreme(word: str, blocks: list[b.BlockValue]) -> b.Bound:
 
 
 _JOINED: Final[Mapping[str, Callable[[list[b.BlockValue]], b.Bound]]] = {
-    "EXISTS": lambda blocks: _any([*blocks]),
+    "EXISTS": b.any_of,
     "COUNT": _sum,
     "MIN": lambda blocks: _extreme("min", blocks),
     "MAX": lambda blocks: _extreme("max", blocks),

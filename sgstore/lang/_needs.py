@@ -31,8 +31,11 @@ from sgstore.lang.ir import (
     PairNumber,
     TraceAttribute,
     Value,
+    all_of,
     any_kinds,
+    any_of,
     ego_kinds,
+    inverse,
     is_one_of,
 )
 from sgstore.pair_numbers import COURSES, TOUCH, WAYS, columns_needed
@@ -87,37 +90,39 @@ def in_traces(scopes: b.Scopes, condition: Callable[[RelationScope | None], Boun
     if len(scopes) < 2:
         return condition(next(reach for reach, _ in scopes))
     number = TraceAttribute(TRACE_ATTRIBUTES["id"], Type.number)
-    return _or(_and(is_one_of(number, ids), condition(reach)) for reach, ids in scopes)
+    return any_of(all_of(is_one_of(number, ids), condition(reach)) for reach, ids in scopes)
 
 
 def related(a: str, b: str, reach: RelationScope | None) -> Bound:
     """Return the condition that the relations of two nodes were computed with some settings."""
     if reach is None:
         return Value(None, Type.boolean)
-    ego = _or(LabelTest(node, ego_kinds()) for node in (a, b))
+    ego = any_of(LabelTest(node, ego_kinds()) for node in (a, b))
     ways: list[Bound] = []
     if reach.ego:
         close = [_up_to(a, b, reach.ego_within, reach)] if reach.ego_within > 0 else []
-        ways.append(_and(ego, *close))
+        ways.append(all_of(ego, *close))
     if reach.within > 0:
         near = _up_to(a, b, reach.within, reach)
-        move = [_not(test) for node in (a, b) for test in (_still(node), LabelTest(node, _SIGNAL))]
-        further = [_not(ego)] if reach.ego else []
-        ways.append(_and(*further, *move, near))
+        move = [
+            inverse(test) for node in (a, b) for test in (_still(node), LabelTest(node, _SIGNAL))
+        ]
+        further = [inverse(ego)] if reach.ego else []
+        ways.append(all_of(*further, *move, near))
         if reach.static:
-            ways.append(_and(*further, _still(a), _still(b), near))
+            ways.append(all_of(*further, _still(a), _still(b), near))
     entities = [LabelTest(node, any_kinds().only(entity_kinds())) for node in (a, b)]
-    return _and(*entities, *_listed(a, b, reach.kinds), _or(ways))
+    return all_of(*entities, *_listed(a, b, reach.kinds), any_of(ways))
 
 
 def _listed(a: str, b: str, kinds: Iterable[tuple[str, ...]]) -> list[Bound]:
     """Return the condition that two nodes have labels that are listed; none where none are."""
     listed = [
-        _and(LabelTest(a, _labelled(one)), LabelTest(b, _labelled(other)))
+        all_of(LabelTest(a, _labelled(one)), LabelTest(b, _labelled(other)))
         for pair in kinds
         for one, other in (pair, pair[::-1])
     ]
-    return [_or(listed)] if listed else []
+    return [any_of(listed)] if listed else []
 
 
 def bounded(a: str, b: str, names: Iterable[str], reach: RelationScope) -> Bound:
@@ -136,21 +141,25 @@ def bounded(a: str, b: str, names: Iterable[str], reach: RelationScope) -> Bound
     for name, high in reach.rungs:
         near = _up_to(a, b, high, reach)
         if name in wanted:
-            ways.append(_and(near, *low))
-        low = [_not(near)]
-    near = [_and(related(a, b, reach), *_listed(a, b, reach.near_kinds), _or(ways))] if ways else []
-    return _or([*near, _touch(a, b, reach)] if "overlaps" in wanted else near)
+            ways.append(all_of(near, *low))
+        low = [inverse(near)]
+    near = (
+        [all_of(related(a, b, reach), *_listed(a, b, reach.near_kinds), any_of(ways))]
+        if ways
+        else []
+    )
+    return any_of([*near, _touch(a, b, reach)] if "overlaps" in wanted else near)
 
 
 def _touch(a: str, b: str, reach: RelationScope) -> Bound:
     """Return the condition that two bodies touch, of which one moves."""
-    solid = [_not(LabelTest(node, _SIGNAL)) for node in (a, b)]
-    moves = _or(_not(_still(node)) for node in (a, b))
-    ego = [] if reach.within > 0 else [_or(LabelTest(node, ego_kinds()) for node in (a, b))]
+    solid = [inverse(LabelTest(node, _SIGNAL)) for node in (a, b)]
+    moves = any_of(inverse(_still(node)) for node in (a, b))
+    ego = [] if reach.within > 0 else [any_of(LabelTest(node, ego_kinds()) for node in (a, b))]
     if not (reach.within > 0 or reach.ego):
         return Value(value=False, type=Type.boolean)
     listed = _listed(a, b, reach.kinds)
-    return _and(
+    return all_of(
         *solid, moves, *ego, *listed, _no_more(_pair("gap", a, b), Value(TOUCH, Type.number))
     )
 
@@ -167,8 +176,8 @@ def _up_to(a: str, b: str, bound: float, reach: RelationScope) -> Bound:
     """Return the condition that two nodes are no further apart; a node without a place is near nothing."""
     limit = Value(bound, Type.number)
     if reach.between == "origins":
-        return _or(
-            _and(*tests, _no_more(distance, limit)) for tests, distance in _between_origins(a, b)
+        return any_of(
+            all_of(*tests, _no_more(distance, limit)) for tests, distance in _between_origins(a, b)
         )
     distance = _pair("dist", a, b)
     if reach.between == "footprints":  # one without extent is a point
@@ -192,8 +201,8 @@ def _between_origins(a: str, b: str) -> Iterable[tuple[list[Bound], Bound]]:
 
 
 def _lies_low(node: str, *, yes: bool) -> Bound:
-    low = _and(LabelTest(node, _VEHICLE), _not(_still(node)))
-    return low if yes else _not(low)
+    low = all_of(LabelTest(node, _VEHICLE), inverse(_still(node)))
+    return low if yes else inverse(low)
 
 
 def _origin(node: str, *, low: bool) -> Bound:
@@ -224,21 +233,6 @@ def _still(node: str) -> Bound:
 
 def _of(word: str, *operands: Bound) -> Bound:
     return Operation(word, operands, Type.number)
-
-
-def _not(condition: Bound) -> Bound:
-    return Operation("NOT", (condition,), Type.boolean)
-
-
-def _and(*conditions: Bound) -> Bound:
-    return conditions[0] if len(conditions) == 1 else Operation("AND", conditions, Type.boolean)
-
-
-def _or(conditions: Iterable[Bound]) -> Bound:
-    found = tuple(conditions)
-    if len(found) < 2:
-        return found[0] if found else Value(value=False, type=Type.boolean)
-    return Operation("OR", found, Type.boolean)
 
 
 # What a trace must know so that it can answer a question at all ---------------------------------
@@ -323,15 +317,15 @@ def of_check(check: BoundCheck) -> tuple[Need, ...]:
     return _ordered(egos | _of_each(spoken, nodes, strict=True))
 
 
-def not_computed(check: BoundCheck, facts: TraceFacts) -> tuple[str, ...]:
-    """Return the relations that a check asks for and that were not computed in a trace, in order."""
+def not_computed(check: BoundCheck, facts: TraceFacts) -> str:
+    """Return the reason if relations that a check asks for were not computed in a trace, or an empty text."""
     if check.unknown_is_false:
-        return ()
+        return ""
     missing = check.relations - facts.answers
     if facts.reach is not None and facts.reach.without:
         spoken = (check.formula, *(q.where for q in check.quantifiers if q.where is not None))
         missing |= facts.reach.without & frozenset().union(*map(_of_entities, spoken))
-    return tuple(sorted(missing))
+    return f"it knows nothing of {', '.join(sorted(missing))}" if missing else ""
 
 
 def _of_entities(expression: Bound) -> frozenset[str]:

@@ -66,13 +66,7 @@ def unknown(value: b.Bound) -> b.Bound | None:
         A value or a condition whose entities are in the frame.
     """
     found = list(dict.fromkeys(_unknown(value)))
-    return any_of(found) if found else None
-
-
-def any_of(conditions: Iterable[b.Bound]) -> b.Bound:
-    """Return the condition that one of some conditions is true."""
-    found = tuple(conditions)
-    return found[0] if len(found) == 1 else b.Operation("OR", found, Type.boolean)
+    return b.any_of(found) if found else None
 
 
 def has_pairs(value: b.Bound) -> bool:
@@ -95,7 +89,7 @@ def negated(condition: b.Bound) -> b.Bound:  # noqa: PLR0911 - a case each
             other = "OR" if word == "AND" else "AND"
             return replace(condition, word=other, operands=tuple(map(negated, operands)))
         case b.Operation("IMPLIES", (left, right)):
-            return b.Operation("AND", (pushed(left), negated(right)), Type.boolean)
+            return b.all_of(pushed(left), negated(right))
         case b.Operation("XOR", operands):
             return negated(spelled_out(operands))
         case b.Operation(word=word) if word in _FLIPPED and has_pairs(condition):
@@ -103,7 +97,7 @@ def negated(condition: b.Bound) -> b.Bound:  # noqa: PLR0911 - a case each
         case b.Value(value=value):
             return replace(condition, value=value is not True)
         case _:
-            return b.Operation("NOT", (condition,), Type.boolean)
+            return b.inverse(condition)
 
 
 def pushed(condition: b.Bound) -> b.Bound:
@@ -114,7 +108,7 @@ def pushed(condition: b.Bound) -> b.Bound:
         case b.Operation("AND" | "OR", operands):
             return replace(condition, operands=tuple(map(pushed, operands)))
         case b.Operation("IMPLIES", (left, right)):
-            return b.Operation("OR", (negated(left), pushed(right)), Type.boolean)
+            return b.any_of((negated(left), pushed(right)))
         case b.Operation("XOR", operands):
             return pushed(spelled_out(operands))
         case _:
@@ -126,8 +120,8 @@ def spelled_out(operands: tuple[b.Bound, ...]) -> b.Bound:
     first, *rest = operands
     for second in rest:
         ways = (
-            b.Operation("AND", (first, b.Operation("NOT", (second,), Type.boolean)), Type.boolean),
-            b.Operation("AND", (b.Operation("NOT", (first,), Type.boolean), second), Type.boolean),
+            b.all_of(first, b.inverse(second)),
+            b.all_of(b.inverse(first), second),
         )
         first = b.Operation("OR", ways, Type.boolean)
     return first
@@ -156,13 +150,13 @@ def certain(  # noqa: PLR0911 - a case each
             doubt = None if decided else unknown(operand)
             if _of_blocks(operand):
                 known = b.Operation("coalesce", (operand, _FALSE), Type.boolean)
-                return _not(known if doubt is None else any_of((known, doubt)))
+                return b.inverse(known if doubt is None else b.any_of((known, doubt)))
             if has_pairs(operand):
                 return condition
-            return _not(b.Operation("coalesce", (operand, doubt or _FALSE), Type.boolean))
+            return b.inverse(b.Operation("coalesce", (operand, doubt or _FALSE), Type.boolean))
         case b.Operation() if _of_blocks(condition):
             doubt = None if decided else unknown(condition)
-            return condition if doubt is None else _both(condition, _not(doubt))
+            return condition if doubt is None else b.all_of(condition, b.inverse(doubt))
         case _:
             return condition
 
@@ -173,13 +167,13 @@ def possible(condition: b.Bound) -> b.Bound:
         case b.Operation("AND" | "OR", operands):
             return replace(condition, operands=tuple(map(possible, operands)))
         case b.Operation("NOT", (b.BlockValue() as block,)):
-            return _not(_sure(block))  # a match that is known is one
+            return b.inverse(_sure(block))  # a match that is known is one
         case b.Operation("NOT", (operand,)):
             doubt = unknown(operand)
-            return certain(condition) if doubt is None else any_of((certain(condition), doubt))
+            return certain(condition) if doubt is None else b.any_of((certain(condition), doubt))
         case _:
             doubt = unknown(condition)
-            return condition if doubt is None else any_of((condition, doubt))
+            return condition if doubt is None else b.any_of((condition, doubt))
 
 
 def undecided(condition: b.Bound) -> b.Bound | None:
@@ -188,7 +182,7 @@ def undecided(condition: b.Bound) -> b.Bound | None:
     It also holds where the condition is true and one of its parts is unknown.
     """
     doubts = [doubt for part in _smallest(condition) if (doubt := unknown(part)) is not None]
-    return _both(any_of(dict.fromkeys(doubts)), possible(condition)) if doubts else None
+    return b.all_of(b.any_of(dict.fromkeys(doubts)), possible(condition)) if doubts else None
 
 
 def _smallest(condition: b.Bound) -> Iterable[b.Bound]:
@@ -197,14 +191,6 @@ def _smallest(condition: b.Bound) -> Iterable[b.Bound]:
             yield from _smallest(operand)
     else:
         yield condition
-
-
-def _not(condition: b.Bound) -> b.Bound:
-    return b.Operation("NOT", (condition,), Type.boolean)
-
-
-def _both(one: b.Bound, other: b.Bound) -> b.Bound:
-    return b.Operation("AND", (one, other), Type.boolean)
 
 
 def _of_blocks(condition: b.Bound) -> bool:
@@ -233,7 +219,7 @@ def _unknown(value: b.Bound) -> Iterable[b.Bound]:  # noqa: C901 - a case each
                 for name in sorted((names - {"vy", "ay"}) & MEASURED)
             ]
             if parts:
-                yield _both(any_of(parts), _is_null(value))
+                yield b.all_of(b.any_of(parts), _is_null(value))
         case b.FrameAttribute(attribute=attribute):
             if attribute.unit in {DisplayUnit.weather, DisplayUnit.clock}:
                 yield _is_null(value)
@@ -255,7 +241,7 @@ def _unmeasured(node: str, name: str, value: b.Bound) -> b.Bound:
     if name not in MOTION:
         return _is_null(value)
     still = b.Operation("coalesce", (_attribute(node, "is_static"), _FALSE), Type.boolean)
-    return _both(_is_null(value), _not(still))
+    return b.all_of(_is_null(value), b.inverse(still))
 
 
 @lru_cache(maxsize=1024)
@@ -267,13 +253,13 @@ def _of_block(block: b.BlockValue) -> tuple[b.Bound, ...]:
         doubts += _unknown(block.value)
     found: list[b.Bound] = []
     if doubts:
-        wanted = (*map(possible, where), any_of(dict.fromkeys(doubts)))
+        wanted = (*map(possible, where), b.any_of(dict.fromkeys(doubts)))
         found.append(_exists(block, block.scope.edges, wanted, _LOOSE))
     apart = {edge.key: one for edge in block.scope.edges if (one := _not_computed(edge, block))}
     if apart:
         rest = tuple(edge for edge in block.scope.edges if edge.key not in apart)
         told = (one for one in where if not _edges_of(one) & apart.keys())
-        wanted = (*map(possible, told), any_of(dict.fromkeys(apart.values())))
+        wanted = (*map(possible, told), b.any_of(dict.fromkeys(apart.values())))
         found.append(_exists(block, rest, wanted, 2 * _LOOSE))
     return tuple(found)
 
@@ -283,7 +269,7 @@ def _sure(block: b.BlockValue) -> b.BlockValue:
     """``EXISTS`` with only those matches that are certain."""
     doubted = any(_of_blocks(one) and unknown(one) is not None for one in block.scope.where)
     loose = [
-        _not(any_of(doubts))
+        b.inverse(b.any_of(doubts))
         for edge in block.scope.edges
         if "isIn" in edge.relations
         and "off_road" in block.scope.kinds(edge.dst).every
@@ -303,7 +289,7 @@ def _exists(
     asked = frozenset().union(*({edge.src, edge.dst} for edge in edges), *map(b.nodes_of, where))
     nodes = {key: node for key, node in block.scope.nodes.items() if key in asked}
     if not nodes and not edges:
-        return where[0] if len(where) == 1 else b.Operation("AND", where, Type.boolean)
+        return b.all_of(*where)
     distinct = (
         pair
         for pair in block.scope.distinct
@@ -331,7 +317,7 @@ def _edges_of(condition: b.Bound) -> frozenset[str]:
 def _not_computed(edge: b.Edge, block: b.BlockValue) -> b.Bound | None:
     """The condition that it is not known whether there is an edge in braces; ``None``: it always is."""
     found = [*_beyond(edge, block.scope), *_unmeasured_ends(edge, block.scope)]
-    return any_of(found) if found else None
+    return b.any_of(found) if found else None
 
 
 def _beyond(edge: b.Edge, scope: b.Scope) -> Iterable[b.Bound]:
@@ -348,9 +334,9 @@ def _beyond(edge: b.Edge, scope: b.Scope) -> Iterable[b.Bound]:
     if edge.high > 1 or names - _OF_PAIRS - bounded_in(edge.beyond):
         yield away
     elif not names & _OF_PAIRS:
-        yield _both(away, holds(edge, names))
+        yield b.all_of(away, holds(edge, names))
     else:
-        yield _both(away, in_traces(edge.beyond, lambda reach: _related(edge, reach)))
+        yield b.all_of(away, in_traces(edge.beyond, lambda reach: _related(edge, reach)))
 
 
 def _related(edge: b.Edge, reach: RelationScope | None) -> b.Bound:
@@ -369,5 +355,5 @@ def _unmeasured_ends(edge: b.Edge, scope: b.Scope) -> Iterable[b.Bound]:
             parts = [_is_null(_attribute(key, name)) for name in sorted(names)]
             computed: b.Bound = b.TraceAttribute(COMPUTED, Type.boolean)
             if not every <= bodies:
-                computed = _both(computed, b.LabelTest(key, b.any_kinds().only(bodies)))
-            yield _both(any_of(parts), computed)
+                computed = b.all_of(computed, b.LabelTest(key, b.any_kinds().only(bodies)))
+            yield b.all_of(b.any_of(parts), computed)

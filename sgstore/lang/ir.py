@@ -680,6 +680,24 @@ def passed_values(query: Query) -> tuple[FrameAttribute, ...]:
     return found
 
 
+def any_of(conditions: Iterable[Bound]) -> Bound:
+    """Return the condition that one of some conditions is true; false without conditions."""
+    found = tuple(conditions)
+    if len(found) < 2:
+        return found[0] if found else Value(value=False, type=Type.boolean)
+    return Operation("OR", found, Type.boolean)
+
+
+def all_of(*conditions: Bound) -> Bound:
+    """Return the condition that some conditions, at least one, are true."""
+    return conditions[0] if len(conditions) == 1 else Operation("AND", conditions, Type.boolean)
+
+
+def inverse(condition: Bound) -> Operation:
+    """Return the condition that another one is false."""
+    return Operation("NOT", (condition,), Type.boolean)
+
+
 def is_one_of(value: Bound, numbers: Iterable[int]) -> Operation:
     """The condition that a value is one of some numbers."""
     choices = Choices(tuple(Value(number, Type.number) for number in numbers))

@@ -705,10 +705,9 @@ class StoreCheck:
         """The traces that do not know what the check needs, with the reason."""
         found = lacking(self._file, self._catalog, of_check(self._check))
         for facts in self._catalog.traces:
-            if missing := not_computed(self._check, facts):
-                reasons = [f"it knows nothing of {', '.join(missing)}"]
-                reasons += [found[facts.trace_id]] if facts.trace_id in found else []
-                found[facts.trace_id] = "; ".join(reasons)
+            reasons = not_computed(self._check, facts), found.get(facts.trace_id, "")
+            if any(reasons):
+                found[facts.trace_id] = "; ".join(filter(None, reasons))
         return found
 
     @cached_property

@@ -275,13 +275,13 @@ class Monitor:
         self._watches: list[tuple[int, CheckMonitor, _PendingEvents]] = []
         self._unknown: dict[str, str] = {}
         for check in checks:
-            missing = not_computed(check, facts)
-            if not missing:
+            reason = not_computed(check, facts)
+            if not reason:
                 ego, questions = self._of_scope(check.ego, world=check.world)
                 watch = CheckMonitor(check, questions, self._pulse, compat=sgsm_compat)
                 self._watches.append((ego, watch, _PendingEvents(of_check(check))))
             else:
-                self._unknown[check.name] = f"it knows nothing of {', '.join(missing)}"
+                self._unknown[check.name] = reason
         self._follows: list[tuple[int, SequenceMonitor, _PendingEvents]] = []
         for name, query in zip(_names(called, len(queries)), queries, strict=True):
             if query.relations <= answers or query.unknown_is_false:
