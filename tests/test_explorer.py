@@ -231,7 +231,9 @@ def test_lanes_are_the_parts_of_the_pattern(page: Any, town_store: Path) -> None
     graph = store.graph(f"town#{first.start_seq}")
     bound = [first.values["e"], first.values["v"]]
     met = {n for a, b, _ in graph.edges if {a, b} & {*bound} for n in (a, b)}
-    shown = page.locator("svg[aria-label=Neighbours] g rect").count()
+    drawn = page.locator("svg[aria-label=Neighbours] g rect")
+    drawn.first.wait_for(state="attached")
+    shown = drawn.count()
     assert len(bound) < shown <= len(met)
     seen(page, "neighbours")
     page.get_by_role("button", name="Beside").click()
