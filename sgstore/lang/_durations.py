@@ -1,4 +1,4 @@
-"""How long a step of a sequence lasts, bound."""
+"""Bound durations of sequence steps."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Length:
-    """A length of time: ``amount`` nanoseconds, or frames."""
+    """Duration of ``amount`` nanoseconds or frames."""
 
     amount: int
     frames: bool
@@ -25,20 +25,20 @@ _COMPARE: Final[Mapping[str, Callable[[Any, int, int], Any]]] = {
     "<": lambda length, amount, by: length < amount - by,
     "=": lambda length, amount, by: abs(length - amount) <= by,
 }
-"""Comparisons, what differs by no more than a tolerance being the same."""
+"""Comparisons that treat lengths within a tolerance as equal."""
 
 
 @dataclass(frozen=True, slots=True)
 class BoundHold:
-    """Duration that a step must have: from the first to the last frame of its run.
+    """Duration that a step must have, from the first to the last frame of its run.
 
     Attributes
     ----------
     comparison : str
     length : Length
-        In frames: how many there are.
+        Duration to compare with; if in frames, the number of frames.
     inclusive : bool
-        Whether the time of one median period is added to that of the run.
+        True if one median frame period is added to the duration of the run.
     """
 
     comparison: str
@@ -46,14 +46,14 @@ class BoundHold:
     inclusive: bool
 
     def fits(self, length: Any, tolerance: int) -> Any:
-        """Tell whether a run that is so long lasts as it must.
+        """Return true for runs whose length meets the comparison.
 
         Parameters
         ----------
         length : int or (R,) int
-            Nanoseconds, or frames.
+            Length of the run; ns or frames.
         tolerance : int
-            Of times; ns.
+            Tolerance for times; ns.
 
         Returns
         -------

@@ -1,4 +1,4 @@
-"""Expressions of the IR that are made of no others: constants, attributes, numbers of pairs."""
+"""Leaf expressions of the IR: constants, attributes and numbers of pairs."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A constant.
+    """Bound constant.
 
     Attributes
     ----------
     value, type
     closed : bool
-        Whether it is a canonical word of the vocabulary, not a text of the user's.
+        True for a canonical word of the vocabulary, false for a text of the user.
     unit : str
-        ``s`` or ``frames`` if it was written as a length of time, such as ``2s``; no part of what it is.
+        ``s`` or ``frames`` if it was written as a duration, such as ``2s``. Ignored in comparisons.
     span : TextSpan or None
-        Where a length of time was written.
+        Place of the duration in the query.
     written : float or None
-        The number as it was written, if it was rounded for a comparison.
+        The original number, if it was rounded for a comparison.
     """
 
     value: int | float | str | bool | None
@@ -39,13 +39,13 @@ class Value:
 
     @property
     def shown(self) -> float | str | bool | None:
-        """The constant as the query has it."""
+        """Constant as written in the query, before rounding."""
         return self.value if self.written is None else self.written
 
 
 @dataclass(frozen=True, slots=True)
 class Choices:
-    """A list of constants, after ``IN``."""
+    """List of constants after ``IN``."""
 
     items: tuple[Value, ...]
     type: Type = Type.list
@@ -53,7 +53,7 @@ class Choices:
 
 @dataclass(frozen=True, slots=True)
 class NodeValue:
-    """A node itself."""
+    """Reference to a node."""
 
     node: str
     type: Type = Type.node
@@ -61,7 +61,7 @@ class NodeValue:
 
 @dataclass(frozen=True, slots=True)
 class NodeAttribute:
-    """An attribute of a node."""
+    """Attribute of a node."""
 
     node: str
     attribute: Attribute
@@ -79,7 +79,7 @@ class LabelTest:
 
 @dataclass(frozen=True, slots=True)
 class EdgeRelation:
-    """The relation that an edge variable is bound to."""
+    """Relation that an edge variable is bound to."""
 
     edge: str
     type: Type = Type.text
@@ -87,7 +87,7 @@ class EdgeRelation:
 
 @dataclass(frozen=True, slots=True)
 class EdgeAttribute:
-    """An attribute of an edge from an entity to a lane."""
+    """Attribute of an edge from an entity to a lane."""
 
     edge: str
     attribute: Attribute
@@ -96,7 +96,7 @@ class EdgeAttribute:
 
 @dataclass(frozen=True, slots=True)
 class FrameAttribute:
-    """``frame.name``."""
+    """Attribute of the frame: ``frame.name``."""
 
     attribute: Attribute
     type: Type
@@ -104,7 +104,7 @@ class FrameAttribute:
 
 @dataclass(frozen=True, slots=True)
 class TraceAttribute:
-    """``trace.name``."""
+    """Attribute of the trace: ``trace.name``."""
 
     attribute: Attribute
     type: Type
@@ -112,7 +112,7 @@ class TraceAttribute:
 
 @dataclass(frozen=True, slots=True)
 class PairNumber:
-    """A number of an ordered pair of entities."""
+    """Number computed for an ordered pair of entities, such as ``gap(a, b)``."""
 
     function: str
     a: str
@@ -122,17 +122,17 @@ class PairNumber:
 
 @dataclass(frozen=True, slots=True)
 class Happened:
-    """Test that something is recorded as having happened in a frame.
+    """Test that the recording has an event of a kind in this frame.
 
     Attributes
     ----------
     kind : str
-        Of the event: one of :data:`sgstore.vocabulary.EVENT_KINDS`; or the name of a table of a user's own.
+        Kind of the event, one of :data:`sgstore.vocabulary.EVENT_KINDS`; or the name of a user table.
     nodes : tuple of str
-        To whom: none, one or two.
+        Nodes that the event involves: none, one or two.
     table : tuple of str
-        Of a table: the columns that say to whom, as many as there are nodes; for no node one that is empty.
-        Empty: it is an event of the recording, which says it of two in either order.
+        For a user table: the columns with the entities, one for each node; one empty name if there are no
+        nodes. Empty for an event of the recording, where the order of two entities does not matter.
     """
 
     kind: str

@@ -1,4 +1,4 @@
-"""Kinds that a node of a pattern may have, as sets: if it is the ego, and if it is not."""
+"""Sets of kinds that a node of a pattern may have, with separate sets for the ego."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from sgstore.vocabulary import KINDS, RELATIONS, entity_kinds
 
 @dataclass(frozen=True, slots=True)
 class Kinds:
-    """Kinds that a node may have: if it is the ego, and if it is not."""
+    """Kinds that a node may have: one set for the ego, one set for other nodes."""
 
     ego: frozenset[str]
     other: frozenset[str]
@@ -27,30 +27,30 @@ class Kinds:
         return bool(self.ego or self.other)
 
     def only(self, kinds: frozenset[str]) -> Kinds:
-        """Those of some kinds."""
+        """Return a copy limited to the given kinds."""
         return Kinds(self.ego & kinds, self.other & kinds)
 
     @property
     def every(self) -> frozenset[str]:
-        """All kinds, whether ego or not."""
+        """All kinds, of the ego or of other nodes."""
         return self.ego | self.other
 
     @property
     def one_a_frame(self) -> bool:
-        """Tell whether there is no more than one such node in a frame, for it must be the ego."""
+        """True if the node must be the ego, so that a frame has at most one such node."""
         return not self.other
 
 
 def any_kinds() -> Kinds:
-    """Return all kinds that are known now: readers, settings and stores may add some."""
+    """Return all known kinds. Readers, settings and stores may add kinds."""
     return Kinds(entity_kinds(), frozenset(KINDS))
 
 
 def ego_kinds() -> Kinds:
-    """Return all kinds that are known now, of the ego alone."""
+    """Return all known kinds for the ego, and no kinds for other nodes."""
     return Kinds(entity_kinds(), frozenset())
 
 
 def any_relation() -> frozenset[str]:
-    """Return all relations that are known now: stores and settings may add some."""
+    """Return all known relations. Stores and settings may add relations."""
     return frozenset(RELATIONS)

@@ -1,4 +1,4 @@
-"""Links between the steps of a sequence, and the sequences that an expression of steps stands for."""
+"""Time links between the steps of a sequence, and the sequences of an expression of steps."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class StepLink:
-    """Relation in time between a step and the one before it.
+    """Relation in time between a step and the previous step.
 
     Attributes
     ----------
     kind : str
-        ``then``: from ``after`` on, up to ``within``, and in a later frame; ``immediately``: in the next frame;
-        ``until``: in the frame after a run of the step before; ``while``: in the same frame.
+        ``then``: in a later frame, at least ``after`` and at most ``within`` later; ``immediately``: in the
+        next frame; ``until``: in the frame after a run of the previous step; ``while``: in the same frame.
     after, within : Length or None
     """
 
@@ -29,14 +29,14 @@ class StepLink:
 
 @dataclass(frozen=True, slots=True)
 class StepWay:
-    """A sequence that an expression of steps stands for.
+    """One of the sequences that an expression of steps stands for.
 
     Attributes
     ----------
     steps : tuple of int
-        Numbers of its steps; one that is repeated is there several times.
+        Numbers of the steps. A repeated step occurs several times.
     happen : tuple of int
-        Those of them that happen, and are not absent.
+        Numbers of the steps that must occur, without absent steps.
     links : tuple of StepLink
     """
 

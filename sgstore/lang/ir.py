@@ -1,10 +1,10 @@
-"""The IR: bound patterns, sequences and checks.
+"""Intermediate representation (IR): bound patterns, sequences and checks.
 
-Every name is resolved and every value typed. The stages after the binder share these classes.
+All names are resolved and all values have types. The stages after the binder share these classes.
 
-A *scope* is what stands in one ``MATCH`` or one pair of braces: nodes, edges, conditions that all must be true,
-and which nodes must differ. Nodes have keys that are unique in the query whatever the case of letters; those of
-unnamed nodes begin with ``#``.
+A *scope* is the content of one ``MATCH`` or one pair of braces: nodes, edges, conditions that must all be
+true, and pairs of nodes that must differ. Node keys are unique in the query, ignoring case. Keys of unnamed
+nodes begin with ``#``.
 """
 
 from __future__ import annotations
@@ -44,20 +44,20 @@ if TYPE_CHECKING:
 
 
 Scopes = tuple[tuple[RelationScope | None, tuple[int, ...]], ...]
-"""Which pairs of entities are related in traces, and the ids of the traces; ``None``: that is not known."""
+"""Scopes of relations, each with the ids of its traces. ``None`` means an unknown scope."""
 
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """A node of a pattern.
+    """Node of a pattern.
 
     Attributes
     ----------
     key : str
     kinds : Kinds
     role : str
-        ``named`` in the query and part of what is found; ``unnamed``, but counted; or ``hidden``: made by a
-        rewriting, only asked to exist.
+        ``named``: part of the match; ``unnamed``: without a name, but counted; ``hidden``: made by a
+        rewriting, must only exist.
     span : TextSpan
     """
 
@@ -69,7 +69,7 @@ class Node:
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """An edge of a pattern, or a path of ``low`` to ``high`` edges.
+    """Edge of a pattern, or a path of ``low`` to ``high`` edges.
 
     Attributes
     ----------
@@ -79,17 +79,17 @@ class Edge:
         Keys of its nodes.
     relations : frozenset of str
     both : bool
-        Whether it may also run from ``dst`` to ``src``.
+        True if the edge may also run from ``dst`` to ``src``.
     low, high : int
     named : bool
-        Whether its relation is part of a match.
+        True if the relation is part of a match.
     span : TextSpan
     known : bool
-        Whether it is asked of all that is known in the scope: it stands in braces. One of a pattern is an
-        edge of the graph in every scope.
+        True for an edge in braces: it is searched in all data of the scope. An edge of a pattern is searched
+        in the graph only.
     beyond : Scopes
-        Of one in braces, in scope ``world``: which relations the traces have. Empty where it is told of all
-        that is known, or nothing is beyond the graphs.
+        For an edge in braces in scope ``world``: the relations of the traces. Empty if the edge covers all
+        data, or if there is no data outside the graphs.
     """
 
     key: str
@@ -110,7 +110,7 @@ class Edge:
 
 @dataclass(frozen=True, slots=True)
 class Operation:
-    """Anything that is computed of its operands: ``AND``, ``<``, ``+``, ``abs``, ``IN``, ``IS NULL``."""
+    """Operator or function with its operands: ``AND``, ``<``, ``+``, ``abs``, ``IN``, ``IS NULL``."""
 
     word: str
     operands: tuple[Bound, ...]
@@ -119,7 +119,7 @@ class Operation:
 
 @dataclass(frozen=True, slots=True)
 class BlockValue:
-    """``EXISTS {…}``, ``COUNT {…}``, ``MIN {… | value}``; ``number`` tells the blocks of a query apart."""
+    """Bound block: ``EXISTS {…}``, ``COUNT {…}`` or ``MIN {… | value}``. ``number`` is unique in the query."""
 
     word: str
     scope: Scope
@@ -129,15 +129,15 @@ class BlockValue:
 
     @property
     def inside(self) -> tuple[Bound, ...]:
-        """The conditions in its braces, and the value behind them."""
+        """The conditions inside the braces, and the value after them."""
         return self.scope.where if self.value is None else (*self.scope.where, self.value)
 
 
 @dataclass(frozen=True, slots=True)
 class Aggregate:
-    """``COUNT(*)``, ``AVG(x)``, … over the matches of a query; ``COUNT(*)`` has no operand.
+    """Aggregate over the matches of a query, such as ``COUNT(*)`` or ``AVG(x)``. ``COUNT(*)`` has no operand.
 
-    ``share`` is that of a percentile: 0.95 is the 95th.
+    ``share`` is the fraction of a percentile: 0.95 is the 95th percentile.
     """
 
     word: str
@@ -149,7 +149,7 @@ class Aggregate:
 
 @dataclass(frozen=True, slots=True)
 class GroupKey:
-    """A value by which matches are grouped, beside what is counted of them: the column that is called so."""
+    """Value by which an aggregating query groups its matches. ``name`` is the column that holds it."""
 
     name: str
     type: Type
@@ -157,7 +157,7 @@ class GroupKey:
 
 @dataclass(frozen=True, slots=True)
 class Tense:
-    """An operator of time: its operands at other frames than this one.
+    """Temporal operator: its operands are evaluated at other frames.
 
     Attributes
     ----------
@@ -166,10 +166,10 @@ class Tense:
     operands : tuple of Bound
         One or two conditions.
     low, high : int
-        From when to when it looks, away from this frame; ns, or frames. ``high`` is ``None`` if it looks as far
-        as the trace goes.
+        Bounds of the time window, relative to this frame, in ns or frames. If ``high`` is ``None``, the
+        window reaches to the end of the trace.
     frames : bool
-        Whether the bound counts frames.
+        True if the bounds count frames.
     """
 
     word: str
@@ -182,7 +182,7 @@ class Tense:
 
 @dataclass(frozen=True, slots=True)
 class SignalCall:
-    """A function of how something went.
+    """Function of a value over time, such as ``prev`` or ``delta``.
 
     Attributes
     ----------
@@ -193,9 +193,9 @@ class SignalCall:
         A value, a condition (``run_length``, ``since_true``, ``robustness``), or a node (``age``,
         ``exists_now``).
     by : int
-        How far ``delta`` looks back, and how long a window is; ns, or frames.
+        Time step of ``delta``, or length of a window; ns or frames.
     frames : bool
-        Whether ``by``, or the number that it gives, counts frames; else time.
+        True if ``by``, or the result, counts frames; otherwise they are times.
     type : Type
     """
 
@@ -207,44 +207,44 @@ class SignalCall:
 
 
 WINDOWS: Final = ("min_over", "max_over", "avg_over", "sum_over")
-"""Functions of the values of the last frames."""
+"""Functions over a window of the last frames."""
 
 ANGLES: Final = frozenset(
     {"heading", "pitch", "roll", "bearing", "rel_heading", "apparent_heading", "heading_error"}
 )
-"""Values that come round after 360 degrees."""
+"""Names of angles: values that wrap around at 360 degrees."""
 
 
 @dataclass(frozen=True, slots=True)
 class StepTime:
-    """The time of a step of a sequence; s since the trace began. ``step`` is its number."""
+    """Time of a sequence step, in seconds since the start of the trace. ``step`` is its number."""
 
     step: int
     type: Type = Type.number
 
 
 OF_MATCH: Final = ("min", "max", "avg", "sum", "first", "last", "argmin", "argmax")
-"""Functions of the values during a match."""
+"""Functions over the frames of a match."""
 
 PLACES: Final = frozenset({"argmin", "argmax"})
-"""Those of them that tell of a frame."""
+"""Functions over a match that select one frame."""
 
 
 @dataclass(frozen=True, slots=True)
 class OverMatch:
-    """A value made of those that an expression has in the frames of a match, or of a part of it.
+    """Function over the frames of a match, or over a part of the match.
 
     Attributes
     ----------
     word : str
         One of :data:`OF_MATCH`.
     operand : Bound
-        A value at a frame.
+        Value in each frame.
     start, end : int or None
-        Numbers of the steps in whose frames the part begins and ends; the same: the run of frames in which the
-        step holds. ``None``: the match.
+        Numbers of the steps at which the part begins and ends. If equal: the run of frames in which the step
+        holds. ``None`` means the whole match.
     at : Bound or None
-        Of ``argmin`` and ``argmax``: the value that is told of the frame.
+        For ``argmin`` and ``argmax``: the value to return from the selected frame.
     type : Type
     """
 
@@ -286,12 +286,12 @@ class Scope:
     Attributes
     ----------
     nodes : mapping of str to Node
-        Its own nodes by key.
+        Own nodes by key.
     outer : mapping of str to Kinds
-        Nodes of scopes around it that it, or a block in it, speaks of; with what they may be here.
+        Nodes of enclosing scopes that this scope or its blocks use, with the kinds allowed here.
     edges : tuple of Edge
     where : tuple of Bound
-        Conditions; each must be true.
+        Conditions that must all be true.
     distinct : frozenset of pairs
         Keys of nodes that must not be bound to the same node.
     """
@@ -303,14 +303,14 @@ class Scope:
     distinct: frozenset[tuple[str, str]]
 
     def kinds(self, key: str) -> Kinds:
-        """Return the kinds of a node of this scope, or of one that it speaks of."""
+        """Return the kinds of a node of this scope, or of an outer node that it uses."""
         return self.nodes[key].kinds if key in self.nodes else self.outer[key]
 
 
 # Queries ------------------------------------------------------------------------------------------
 
 FRAME_COLUMNS: Final = ("frame_id", "trace", "seq", "time_ns", "t")
-"""Columns that say which frame a row is of: ``t`` is seconds since the trace began."""
+"""Columns that identify the frame of a row. ``t`` is in seconds since the start of the trace."""
 
 INTERVAL_COLUMNS: Final = (
     "trace",
@@ -322,7 +322,8 @@ INTERVAL_COLUMNS: Final = (
     "end",
     "frames",
 )
-"""Columns of an interval: its ends by number, simulation time, and seconds since the trace began."""
+"""Columns of an interval: its ends as frame numbers, simulation times, and seconds since the start of the
+trace."""
 
 CLIP_COLUMNS: Final = ("trace", "start_ns", "end_ns")
 """Columns of a clip: log times, offsets included."""
@@ -332,14 +333,14 @@ Form = Literal["rows", "intervals", "clips", "subgraphs"]
 
 @dataclass(frozen=True, slots=True)
 class ReturnColumn:
-    """A value to return, and what it is called.
+    """Returned value with its column name.
 
     Attributes
     ----------
     name : str
     value : Bound
     single : bool
-        Whether the value has 32 bits: it is returned as the shortest text of these.
+        True if the value has 32 bits. It is returned with the shortest decimal text of that number.
     """
 
     name: str
@@ -349,7 +350,7 @@ class ReturnColumn:
 
 @dataclass(frozen=True, slots=True)
 class SortKey:
-    """Key to order by: a value, or the name of a result."""
+    """Sort key: a value, or the name of a result column."""
 
     value: Bound | str
     descending: bool
@@ -357,7 +358,7 @@ class SortKey:
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """At most ``number`` results of each value of ``per`` (of all, if it is ``None``)."""
+    """Limit of ``number`` results for each value of ``per``. ``None`` means a limit for all results."""
 
     number: int
     per: Bound | str | None
@@ -365,32 +366,32 @@ class Sampling:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """Values and form in which matches are returned.
+    """Columns and form in which matches are returned.
 
     Attributes
     ----------
     form : str
         ``rows``, ``intervals``, ``clips`` or ``subgraphs``.
     columns : tuple of ReturnColumn
-        Values returned; empty without ``RETURN``.
+        Returned values; empty without ``RETURN``.
     whole : bool
-        Whether frame and variables are returned too: without ``RETURN``, or for ``*``.
+        True if the frame and the variables are returned too: without ``RETURN``, or for ``*``.
     framed : bool
-        Whether the frame is returned with the values.
+        True if the frame is returned with the values.
     distinct : bool
     having : Bound or None
-        What must be true of a group, or of an interval, so that it is returned.
+        Condition that a returned group or interval must meet.
     order : tuple of SortKey
     sample : Sampling or None
     top : Sampling or None
-        How many of each value are returned: the first ones.
+        Limit of the first results for each value.
     skip : int
-        How many rows are left out before the first.
+        Number of rows to skip.
     limit : int or None
     before, after : int
         Offsets of clips; ns, negative is earlier.
     keyed : bool
-        Whether intervals and clips also have what puts those of several stores in order: see
+        True if intervals and clips also have the columns that order results of several stores: see
         :mod:`sgstore.lang._parts`.
     """
 
@@ -411,7 +412,7 @@ class Result:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the columns that are not values: those of frames, intervals or clips."""
+        """Names of the identifying columns: those of frames, intervals or clips."""
         if self.form == "subgraphs":
             return FRAME_COLUMNS
         if self.form != "rows":
@@ -420,7 +421,7 @@ class Result:
 
     @property
     def values(self) -> list[Bound]:
-        """The expressions in it: what it returns, groups must fulfil, orders by and samples by."""
+        """All expressions of the result: columns, ``HAVING``, sort keys and sampling keys."""
         per = [chosen.per for chosen in (self.sample, self.top) if chosen is not None]
         values = [*(column.value for column in self.columns), *(key.value for key in self.order)]
         every = (*values, self.having, *per)
@@ -428,18 +429,18 @@ class Result:
 
     @property
     def aggregated(self) -> bool:
-        """Tell whether it counts or sums over matches, rather than listing them."""
+        """True if the result aggregates over matches instead of listing them."""
         having = [] if self.having is None else [self.having]
         values = (*(column.value for column in self.columns), *having)
         return any(isinstance(e, Aggregate) for value in values for e in walk(value))
 
     @property
     def chooses(self) -> bool:
-        """Tell whether it lists some of the rows only, so many of them or so many of each value."""
+        """True if only some rows are returned: with ``SKIP`` or ``LIMIT``."""
         return self.limit is not None or self.top is not None or self.skip > 0
 
     def changed(self, change: Callable[[Bound], Bound]) -> Result:
-        """The same with a change made to every value."""
+        """Return a copy with a function applied to every value."""
 
         def key(value: Bound | str) -> Bound | str:
             return value if isinstance(value, str) else change(value)
@@ -459,16 +460,16 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class PathValue:
-    """A path that has a name: its value is the list of its nodes.
+    """Named path. Its value is the list of its nodes.
 
     Attributes
     ----------
     place : FrameAttribute
-        What stands for it.
+        Placeholder for the path in expressions.
     nodes : tuple of str
-        Keys of the nodes that are written in it.
+        Keys of the nodes written in the path.
     edges : tuple of (str, bool)
-        Keys of the edges between these, and whether each is written from its ``dst`` to its ``src``.
+        Keys of the edges between these nodes. The flag is true if the edge is written from ``dst`` to ``src``.
     """
 
     place: FrameAttribute
@@ -478,7 +479,7 @@ class PathValue:
 
 @dataclass(frozen=True, slots=True)
 class PathWay:
-    """A pattern whose paths with names have certain lengths; ``nodes`` are the keys of the nodes of each."""
+    """Pattern with fixed lengths of its named paths. ``nodes`` are the node keys of each path."""
 
     scope: Scope
     nodes: tuple[tuple[str, ...], ...]
@@ -486,17 +487,17 @@ class PathWay:
 
 @dataclass(frozen=True, slots=True)
 class MatchStage:
-    """A pattern of a query in several parts.
+    """``MATCH`` stage of a query with several stages.
 
     Attributes
     ----------
     scope : Scope
-        What stands in ``MATCH``; its outer nodes are those of the stages before that it speaks of.
+        Pattern of the ``MATCH``. Its outer nodes are the nodes of earlier stages that it uses.
     optional : bool
-        Whether what goes before stays where it has no match.
+        True for ``OPTIONAL MATCH``: earlier matches are kept if this stage has no match.
     paths : tuple of PathValue
     ways : tuple of PathWay
-        Of a rewritten query: the pattern once for all the lengths that its paths may have.
+        In a rewritten query: one pattern for each combination of path lengths.
     """
 
     scope: Scope
@@ -507,27 +508,27 @@ class MatchStage:
 
 @dataclass(frozen=True, slots=True)
 class WithStage:
-    """``WITH``: what of the matches so far is passed on, frame by frame.
+    """``WITH`` stage: selects the variables and values that later stages can use, frame by frame.
 
     Attributes
     ----------
     before, after : Scope
-        Nodes and edges that are bound before and after it; without conditions.
+        Nodes and edges bound before and after the stage; without conditions.
     nodes : tuple of (str, str)
-        Keys of the nodes that it passes on, after and before.
+        Keys of the passed nodes, after and before the stage.
     edges : tuple of (Edge, str)
-        The edges that it passes on, and their keys before.
+        Passed edges, and their keys before the stage.
     values : tuple of ReturnColumn
-        What it works out.
+        Computed values.
     places : tuple of FrameAttribute
-        What stands for each of them behind it.
+        Placeholder for each value in later stages.
     grouped : bool
-        Whether what is not passed on ends here, each combination of the rest being there once: with an
-        aggregate, or with ``DISTINCT``.
+        True with an aggregate or with ``DISTINCT``: variables that are not passed end here, and each
+        combination of passed values occurs once.
     order : tuple of SortKey
     skip : int
     limit : int or None
-        Of the rows of each frame.
+        Limit of rows in each frame.
     where : tuple of Bound
     """
 
@@ -545,12 +546,12 @@ class WithStage:
 
     @property
     def expressions(self) -> tuple[Bound, ...]:
-        """All expressions in it."""
+        """All expressions of the stage."""
         order = (key.value for key in self.order if not isinstance(key.value, str))
         return (*(column.value for column in self.values), *order, *self.where)
 
     def changed(self, change: Callable[[Bound], Bound]) -> WithStage:
-        """The same with a change made to every expression."""
+        """Return a copy with a function applied to every expression."""
         values = tuple(replace(column, value=change(column.value)) for column in self.values)
         order = tuple(
             replace(key, value=change(key.value))
@@ -563,59 +564,59 @@ class WithStage:
 Stage = MatchStage | WithStage
 
 PASSED: Final = ":with "
-"""What the names of values begin with that ``WITH`` passes on."""
+"""Prefix of the names of values that ``WITH`` passes on."""
 
 
 def passed_on(
     name: str, kind: Type, precision: str = "", *, stored: bool = False
 ) -> FrameAttribute:
-    """What stands for a value that ``WITH`` passes on, each time another."""
+    """Return a new placeholder for a value that ``WITH`` passes on."""
     attribute = Attribute(name, kind, {}, "", DisplayUnit.whole, precision=precision, stored=stored)
     return FrameAttribute(attribute, kind)
 
 
 def is_passed_on(value: Bound) -> TypeGuard[FrameAttribute]:
-    """Tell whether something stands for a value that ``WITH`` passes on."""
+    """True if the expression is a placeholder for a value that ``WITH`` passes on."""
     return isinstance(value, FrameAttribute) and value.attribute.name.startswith(PASSED)
 
 
 def is_path(value: Bound) -> bool:
-    """Tell whether something stands for a path."""
+    """True if the expression is a placeholder for a path."""
     return is_passed_on(value) and value.attribute.name.rpartition(" ")[2][0] == "p"
 
 
 @dataclass(frozen=True, slots=True)
 class Query:
-    """A bound query.
+    """Bound query.
 
     Attributes
     ----------
     scope : Scope
-        What stands in ``MATCH``; of a query with steps or stages, their nodes and the edges that have names,
-        without conditions.
+        Pattern of the ``MATCH``. With steps or stages: all their nodes and their named edges, without
+        conditions.
     result : Result
     relations : frozenset of str
-        Relations that it names, anywhere: what a trace must be able to answer.
+        All relations named in the query. A trace must know them.
     injective : bool
-        Whether different nodes of a pattern are bound to different nodes.
+        True if different nodes of a pattern must be bound to different nodes.
     ego : str or None
-        The simulator's id of the ego that was chosen.
+        Simulator id of the chosen ego.
     unknown_is_false : bool
-        Whether relations that a trace cannot answer count as absent.
+        True if relations that a trace does not know count as absent.
     steps : tuple of BoundStep
-        Of a query that looks at more than one frame at a time; else empty.
+        Steps of a query over several frames; otherwise empty.
     links : tuple of StepLink
-        Between the steps; empty where :attr:`alternatives` have them.
+        Links between the steps; empty if :attr:`alternatives` hold them.
     alternatives : tuple of StepWay
-        Of an expression of steps: all sequences that it stands for.
+        All sequences that an expression of steps stands for.
     policy : str
-        Which matches of a sequence are told: ``all``, ``first``, ``longest``.
+        Matches of a sequence to return: ``all``, ``first``, ``longest``.
     gaps : str
         Whether a gap in the recording ends a run (``break``) or not (``bridge``).
     stages : tuple of MatchStage and WithStage
-        Of a query with ``OPTIONAL MATCH``, ``WITH`` or a path with a name: its parts; the first is a pattern.
+        Parts of a query with ``OPTIONAL MATCH``, ``WITH`` or a named path. The first is a pattern.
     world : bool
-        Whether it is about all that is known of the world around, beyond the graphs, too.
+        True in scope ``world``: the query also covers data outside the graphs.
     """
 
     scope: Scope
@@ -634,7 +635,7 @@ class Query:
 
     @property
     def ways(self) -> tuple[StepWay, ...]:
-        """The sequences of its steps: mostly one."""
+        """Sequences that the steps form; usually one."""
         if self.alternatives:
             return self.alternatives
         happen = tuple(n for n, step in enumerate(self.steps) if not step.absent)
@@ -642,35 +643,35 @@ class Query:
 
     @property
     def spans(self) -> bool:
-        """Tell whether a match may be of several frames, so that it is told once."""
+        """True if a match may span several frames. Such a match is returned once."""
         return len(self.steps) > 1 or bool(self.alternatives)
 
     @property
     def certain(self) -> frozenset[int]:
-        """Numbers of the steps that happen in every match."""
+        """Numbers of the steps that occur in every match."""
         return frozenset.intersection(*(frozenset(way.happen) for way in self.ways))
 
     @property
     def patterns(self) -> tuple[Scope, ...]:
-        """All its patterns: of its steps, of its stages, or the one that it is."""
+        """All patterns: those of the steps and stages, or the only pattern."""
         stages = (stage.scope for stage in self.stages if isinstance(stage, MatchStage))
         found = (*(step.scope for step in self.steps), *stages)
         return found or (self.scope,)
 
     @property
     def required(self) -> tuple[Scope, ...]:
-        """The patterns of a frame without which there is no match: all but those of ``OPTIONAL MATCH``."""
+        """Single-frame patterns that every match needs: all except those of ``OPTIONAL MATCH``."""
         stages = (s for s in self.stages if isinstance(s, MatchStage) and not s.optional)
         return tuple(stage.scope for stage in stages) or (self.scope,)
 
     @property
     def first(self) -> Scope:
-        """The pattern of a frame that it begins with."""
+        """First single-frame pattern of the query."""
         return self.required[0]
 
 
 def passed_values(query: Query) -> tuple[FrameAttribute, ...]:
-    """What stands for the values that matches of a query have in the end."""
+    """Return placeholders for the passed values that a match has after the last stage."""
     found: tuple[FrameAttribute, ...] = ()
     for stage in query.stages:
         if isinstance(stage, WithStage):
@@ -681,7 +682,7 @@ def passed_values(query: Query) -> tuple[FrameAttribute, ...]:
 
 
 def any_of(conditions: Iterable[Bound]) -> Bound:
-    """Return the condition that one of some conditions is true; false without conditions."""
+    """Return the condition that at least one condition is true. Without conditions it is false."""
     found = tuple(conditions)
     if len(found) < 2:
         return found[0] if found else Value(value=False, type=Type.boolean)
@@ -689,28 +690,28 @@ def any_of(conditions: Iterable[Bound]) -> Bound:
 
 
 def all_of(*conditions: Bound) -> Bound:
-    """Return the condition that some conditions, at least one, are true."""
+    """Return the condition that all given conditions are true. At least one condition is required."""
     return conditions[0] if len(conditions) == 1 else Operation("AND", conditions, Type.boolean)
 
 
 def inverse(condition: Bound) -> Operation:
-    """Return the condition that another one is false."""
+    """Return the negation of a condition."""
     return Operation("NOT", (condition,), Type.boolean)
 
 
 def is_one_of(value: Bound, numbers: Iterable[int]) -> Operation:
-    """The condition that a value is one of some numbers."""
+    """Return the condition that a value is in a list of numbers."""
     choices = Choices(tuple(Value(number, Type.number) for number in numbers))
     return Operation("IN", (value, choices), Type.boolean)
 
 
 def node_among(node: str, ids: Iterable[int]) -> Operation:
-    """The condition that a node is one of those with some ids."""
+    """Return the condition that the id of a node is in a list of ids."""
     return is_one_of(NodeAttribute(node, NODE_ATTRIBUTES["id"], Type.number), ids)
 
 
 def operands_of(expression: Bound) -> tuple[Bound, ...]:
-    """The expressions that one is made of, but not what stands in the braces of a block."""
+    """Return the direct operands of an expression. The content of blocks is not included."""
     match expression:
         case Operation(operands=operands) | Tense(operands=operands):
             return operands
@@ -723,7 +724,7 @@ def operands_of(expression: Bound) -> tuple[Bound, ...]:
 
 
 def with_operands(expression: Bound, change: Callable[[Bound], Bound]) -> Bound:
-    """An expression with a change made to each of its :func:`operands_of`."""
+    """Return an expression with a function applied to each of its :func:`operands_of`."""
     match expression:
         case Operation(operands=operands) | Tense(operands=operands):
             return replace(expression, operands=tuple(map(change, operands)))
@@ -736,30 +737,31 @@ def with_operands(expression: Bound, change: Callable[[Bound], Bound]) -> Bound:
 
 
 def walk(expression: Bound) -> Iterator[Bound]:
-    """An expression and all its parts, but not what stands in the blocks in it."""
+    """Yield an expression and all its subexpressions. The content of blocks is not included."""
     yield expression
     for operand in operands_of(expression):
         yield from walk(operand)
 
 
 def conjuncts(expression: Bound) -> list[Bound]:
-    """The conditions that an expression joins by ``AND``."""
+    """Return the conditions that an expression joins by ``AND``."""
     if isinstance(expression, Operation) and expression.word == "AND":
         return [part for operand in expression.operands for part in conjuncts(operand)]
     return [expression]
 
 
 def is_temporal(expression: Bound) -> bool:
-    """Tell whether an expression looks at more than one frame."""
+    """True if an expression uses more than one frame."""
     return any(
         isinstance(part, Tense | SignalCall | StepTime | OverMatch) for part in walk(expression)
     )
 
 
 def is_formula(expression: Bound) -> bool:
-    """Tell whether a part of a value is a condition over time: true or false, since there nothing is unknown.
+    """True if part of a value is a condition over time. Such a condition is never unknown.
 
-    What ``AND`` joins are conditions of their own, as in ``WHERE``: one of this frame alone may be unknown.
+    Conditions joined by ``AND`` are handled separately, as in ``WHERE``. A condition on this frame alone may
+    be unknown.
     """
     if not isinstance(expression, Operation):
         return isinstance(expression, Tense)
@@ -771,7 +773,7 @@ def is_formula(expression: Bound) -> bool:
 
 
 def is_angle(value: Bound) -> bool:
-    """Tell whether a value comes round after 360 degrees."""
+    """True if a value is an angle, which wraps around at 360 degrees."""
     match value:
         case NodeAttribute(attribute=attribute) | EdgeAttribute(attribute=attribute):
             return attribute.name in ANGLES
@@ -782,12 +784,12 @@ def is_angle(value: Bound) -> bool:
 
 
 def is_counted(expression: Bound) -> bool:
-    """Tell whether an expression speaks of all matches, and not of one of them alone."""
+    """True if an expression contains an aggregate over all matches."""
     return any(isinstance(part, Aggregate) for part in walk(expression))
 
 
 def nodes_of(expression: Bound) -> frozenset[str]:
-    """Keys of the nodes that an expression speaks of; of a block's, those outside it."""
+    """Return keys of the nodes used in an expression. For a block, only nodes outside it count."""
     found: set[str] = set()
     for part in walk(expression):
         match part:
@@ -805,32 +807,32 @@ def nodes_of(expression: Bound) -> frozenset[str]:
 
 
 def edges_of(expression: Bound) -> frozenset[str]:
-    """Keys of the edges that an expression speaks of; what stands in blocks speaks of none outside."""
+    """Return keys of the edges used in an expression, without the edges inside blocks."""
     edges = (EdgeRelation, EdgeAttribute)
     return frozenset(part.edge for part in walk(expression) if isinstance(part, edges))
 
 
 def blocks_of(expression: Bound) -> tuple[BlockValue, ...]:
-    """The blocks in an expression, not those within them."""
+    """Return the blocks in an expression, without blocks nested in them."""
     return tuple(part for part in walk(expression) if isinstance(part, BlockValue))
 
 
-# Bound forms of what happens over time: the steps and links of a sequence, and checks -----------
+# Bound steps of sequences, and bound checks -----------
 
 
 @dataclass(frozen=True, slots=True)
 class BoundStep:
-    """A step of a sequence.
+    """Bound step of a sequence.
 
     Attributes
     ----------
     scope : Scope
-        What one frame must show; nodes of other steps have the same keys here.
+        Pattern that one frame must match. Nodes shared with other steps have the same keys.
     when : tuple of Bound
-        Further conditions, which look at other frames.
+        Further conditions, which use other frames.
     hold : BoundHold or None
     absent : bool
-        Whether it must not happen between its neighbours.
+        True for ``NOT MATCH``: the pattern must not occur between the neighbouring steps.
     span : TextSpan
     """
 
@@ -843,17 +845,17 @@ class BoundStep:
 
 @dataclass(frozen=True, slots=True)
 class BoundQuantifier:
-    """``FORALL`` or ``FORSOME``: over the entities of a trace.
+    """Bound ``FORALL`` or ``FORSOME`` over the entities of a trace.
 
     Attributes
     ----------
     word : str
     nodes : tuple of str
-        Keys of its variables.
+        Keys of the variables.
     where : Bound or None
-        What must be true of them in some frame, so that they count.
+        Condition that the entities must meet in at least one frame to be included.
     absent : bool
-        Whether a condition on an absent one of them counts for it; else it is false.
+        True if a condition on an absent entity counts as true; otherwise it is false.
     """
 
     word: str
@@ -864,39 +866,38 @@ class BoundQuantifier:
 
 @dataclass(frozen=True, slots=True)
 class BoundCheck:
-    """A bound check: what is to be true from the first frame of a trace on.
+    """Bound check: a condition that must be true from the first frame of a trace.
 
     Attributes
     ----------
     name : str
     scope : Scope
-        The nodes that it speaks of: its variables, and the ego; without conditions.
+        Nodes of the check: its variables and the ego; without conditions.
     quantifiers : tuple of BoundQuantifier
     formula : Bound
     reset : Bound or None
-        After a violation, the check begins anew in the frame after that in which this holds.
+        After a violation, the check restarts in the frame after this condition holds.
     relations : frozenset of str
     injective : bool
     ego : str or None
     unknown_is_false : bool
         As in :class:`Query`.
     end : str
-        How the end of a trace is taken: ``bounded`` (an operator whose bound is not over is pending, others
-        have failed), ``strong`` (what is still due is missed), ``weak`` (it is forgiven), ``pending`` (all that
-        is still due is pending).
+        Meaning of the end of a trace for unmet obligations: ``bounded`` (pending if the bound has not passed,
+        otherwise failed), ``strong`` (failed), ``weak`` (met), ``pending`` (pending).
     gaps : str
-        Whether a gap in the recording ends a run (``break``) or not (``bridge``); with ``unknown`` nothing is
-        known of what happened in it.
+        Whether a gap in the recording ends a run (``break``) or not (``bridge``); with ``unknown`` the events
+        in the gap are unknown.
     robustness : bool
-        Whether it is asked by how much the formula is true, or false.
+        True if the robustness of the formula is computed: the margin by which it is true or false.
     returns : tuple of ReturnColumn
-        Values of each violation.
+        Values to return for each violation.
     world : bool
         As in :class:`Query`.
     range : float or None
-        How far from the ego it looks, as it says; m. ``None``: as its formula says.
+        Explicit range of the check around the ego; m. ``None`` means the range of the formula.
     limit : float or None
-        The same, if traces may know more: who is farther is as if absent.
+        The range, if traces may cover more. Entities farther away count as absent; m.
     """
 
     name: str

@@ -1,6 +1,6 @@
-"""Syntax trees: a query as it was written, every part with its place in the text.
+"""Syntax tree of a query as written. Each part has its position in the text.
 
-Nothing here is checked against a vocabulary; that is the binder's work. :mod:`sgstore.lang._parse` makes these
+Words are not checked against a vocabulary here; the binder does that. :mod:`sgstore.lang._parse` makes these
 trees from text.
 """
 
@@ -19,21 +19,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Constant:
-    """A number, a text, a truth value or NULL as it stands in the query."""
+    """Number, text, truth value or ``NULL`` in a query."""
 
     value: int | float | str | bool | None
     span: TextSpan
 
 
 LONGEST: Final = 1e18
-"""More than a trace lasts in any unit; the largest amount of a :class:`Duration`."""
+"""Largest amount of a :class:`Duration`. No trace is this long in any unit."""
 TOO_LONG: Final = "no length of time that a trace may have"
-"""Message about one that is longer."""
+"""Message for a duration above the limit."""
 
 
 @dataclass(frozen=True, slots=True)
 class Duration:
-    """A length of time: ``amount`` of ``ms``, ``s``, ``min`` or ``frames``."""
+    """Duration: ``amount`` in ``ms``, ``s``, ``min`` or ``frames``."""
 
     amount: float
     unit: str
@@ -41,13 +41,13 @@ class Duration:
 
     @property
     def ns(self) -> int:
-        """The same in nanoseconds; meaningless in frames."""
+        """Duration in nanoseconds. Not valid for a duration in frames."""
         return round(self.amount * {"ms": 1e6, "s": 1e9, "min": 60e9}.get(self.unit, 0))
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """``$name``: a value that comes with the query."""
+    """Query parameter ``$name``. Its value is passed with the query."""
 
     name: str
     span: TextSpan
@@ -55,7 +55,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """A name that a pattern binds, or ``ego``, ``frame``, ``trace``."""
+    """Name bound by a pattern, or ``ego``, ``frame`` or ``trace``."""
 
     name: str
     span: TextSpan
@@ -63,7 +63,7 @@ class Variable:
 
 @dataclass(frozen=True, slots=True)
 class AttributeOf:
-    """``owner.name``."""
+    """Attribute access: ``owner.name``."""
 
     owner: Variable
     name: str
@@ -72,7 +72,7 @@ class AttributeOf:
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """``name(arguments)``; ``COUNT(DISTINCT x)`` is a call too."""
+    """Function call: ``name(arguments)``. ``COUNT(DISTINCT x)`` is also a call."""
 
     name: str
     arguments: tuple[Expression, ...]
@@ -83,14 +83,14 @@ class Call:
 
 @dataclass(frozen=True, slots=True)
 class CountAll:
-    """``COUNT(*)``."""
+    """The expression ``COUNT(*)``."""
 
     span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
 class ListOf:
-    """``[a, b, …]``."""
+    """List: ``[a, b, …]``."""
 
     items: tuple[Expression, ...]
     span: TextSpan
@@ -98,7 +98,7 @@ class ListOf:
 
 @dataclass(frozen=True, slots=True)
 class Logic:
-    """``NOT a``, ``a AND b AND …``, ``OR``, ``XOR``, ``a IMPLIES b``."""
+    """Logical expression: ``NOT a``, ``a AND b AND …``, ``OR``, ``XOR`` or ``a IMPLIES b``."""
 
     word: Literal["NOT", "AND", "OR", "XOR", "IMPLIES"]
     operands: tuple[Expression, ...]
@@ -107,7 +107,7 @@ class Logic:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """``a = b`` and the like; also ``STARTS WITH``, ``ENDS WITH``, ``CONTAINS``, ``=~``."""
+    """Comparison such as ``a = b``, ``STARTS WITH``, ``ENDS WITH``, ``CONTAINS`` or ``=~``."""
 
     word: str
     left: Expression
@@ -117,7 +117,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class NullTest:
-    """``a IS NULL``; negated: ``a IS NOT NULL``."""
+    """Null test: ``a IS NULL``, or ``a IS NOT NULL`` if ``negated``."""
 
     operand: Expression
     negated: bool
@@ -126,7 +126,7 @@ class NullTest:
 
 @dataclass(frozen=True, slots=True)
 class Membership:
-    """``a IN list``; negated: ``a NOT IN list``."""
+    """Membership test: ``a IN list``, or ``a NOT IN list`` if ``negated``."""
 
     operand: Expression
     choices: Expression
@@ -136,7 +136,7 @@ class Membership:
 
 @dataclass(frozen=True, slots=True)
 class Arithmetic:
-    """``first sign term sign term …`` with signs of one rank, from left to right."""
+    """Chain of operators of equal precedence, evaluated from left to right: ``a + b - c``."""
 
     first: Expression
     rest: tuple[tuple[str, Expression], ...]
@@ -145,7 +145,7 @@ class Arithmetic:
 
 @dataclass(frozen=True, slots=True)
 class Negative:
-    """``-a``."""
+    """Negation of a number: ``-a``."""
 
     operand: Expression
     span: TextSpan
@@ -153,7 +153,7 @@ class Negative:
 
 @dataclass(frozen=True, slots=True)
 class BlockExpression:
-    """``EXISTS {…}``, ``COUNT {…}``, and ``MIN {… | value}`` with ``MAX``, ``AVG``, ``SUM``."""
+    """Block with braces: ``EXISTS {…}``, ``COUNT {…}``, or ``MIN``, ``MAX``, ``AVG``, ``SUM {… | value}``."""
 
     word: str
     block: Block
@@ -163,7 +163,7 @@ class BlockExpression:
 
 @dataclass(frozen=True, slots=True)
 class When:
-    """``WHEN condition THEN value``: a branch of a ``CASE``."""
+    """Branch of a ``CASE``: ``WHEN condition THEN value``."""
 
     condition: Expression
     value: Expression
@@ -172,7 +172,10 @@ class When:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """``CASE WHEN condition THEN value … ELSE value END``; ``CASE x WHEN y`` is ``CASE WHEN x = y``."""
+    """Expression ``CASE WHEN condition THEN value … ELSE value END``.
+
+    ``CASE x WHEN y`` is read as ``CASE WHEN x = y``.
+    """
 
     branches: tuple[When, ...]
     otherwise: Expression | None
@@ -181,9 +184,9 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Temporal:
-    """An operator of the temporal layer with its operands and its bound: times from and to, or ``None``.
+    """Temporal operator with its operands and its time bound. ``None`` means unbounded.
 
-    The upper end of a bound is ``None`` where it is ``INF``.
+    The upper end of a bound is ``None`` for ``INF``.
     """
 
     word: str
@@ -194,7 +197,7 @@ class Temporal:
 
 @dataclass(frozen=True, slots=True)
 class OverExpression:
-    """``call OVER match``, ``call OVER start``, or ``call OVER start..end``: of a match, or of its steps."""
+    """Function over a match or over its steps: ``call OVER match``, ``call OVER start..end``."""
 
     call: Expression
     start: Variable | None
@@ -204,7 +207,7 @@ class OverExpression:
 
 @dataclass(frozen=True, slots=True)
 class HappensExpression:
-    """``HAPPENS kind(arguments)``: whether something is recorded as having happened in the frame."""
+    """Event test: ``HAPPENS kind(arguments)`` is true if the frame has a recorded event."""
 
     kind: str
     arguments: tuple[Expression, ...]
@@ -236,7 +239,7 @@ Expression = (
 
 
 Given = Constant | Duration | Parameter | Variable
-"""What a scenario may be given."""
+"""Expressions that can be arguments of a scenario."""
 
 
 # Patterns -----------------------------------------------------------------------------------------
@@ -244,7 +247,7 @@ Given = Constant | Duration | Parameter | Variable
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """A label as written; the name ``%`` stands for any."""
+    """Label as written. The name ``%`` stands for any label."""
 
     name: str
     span: TextSpan
@@ -252,7 +255,7 @@ class Label:
 
 @dataclass(frozen=True, slots=True)
 class LabelLogic:
-    """``!a``, ``a & b``, ``a | b``."""
+    """Combination of labels: ``!a``, ``a & b`` or ``a | b``."""
 
     word: Literal["!", "&", "|"]
     operands: tuple[LabelExpression, ...]
@@ -264,7 +267,7 @@ LabelExpression = Label | LabelLogic
 
 @dataclass(frozen=True, slots=True)
 class Property:
-    """``name: value`` in braces."""
+    """Property in braces of a pattern: ``name: value``."""
 
     name: str
     value: Expression
@@ -273,7 +276,7 @@ class Property:
 
 @dataclass(frozen=True, slots=True)
 class NodePattern:
-    """``(name:label {properties} WHERE condition)``; every part may be absent."""
+    """Node pattern: ``(name:label {properties} WHERE condition)``. Each part is optional."""
 
     name: str | None
     label: LabelExpression | None
@@ -285,7 +288,7 @@ class NodePattern:
 
 @dataclass(frozen=True, slots=True)
 class EdgePattern:
-    """``-[name:label*low..high {properties} WHERE condition]->``; ``low`` is ``None`` for a single edge."""
+    """Edge pattern: ``-[name:label*low..high {properties} WHERE condition]->``."""
 
     name: str | None
     label: LabelExpression | None
@@ -299,7 +302,7 @@ class EdgePattern:
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """Nodes with edges between them, one node more than edges; ``name = (a)-->(b)`` has a name."""
+    """Path: nodes with edges between them, such as ``name = (a)-->(b)``. The name is optional."""
 
     nodes: tuple[NodePattern, ...]
     edges: tuple[EdgePattern, ...]
@@ -309,7 +312,7 @@ class Path:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Paths and a condition: what stands in a ``MATCH`` or in braces."""
+    """Paths and a condition: the content of a ``MATCH`` or of braces."""
 
     paths: tuple[Path, ...]
     where: Expression | None
@@ -321,7 +324,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """``USING name value``."""
+    """Query setting: ``USING name value``."""
 
     name: str
     value: str | Parameter
@@ -330,7 +333,7 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One thing to return: a value with its name, ``*``, ``FRAMES``, ``INTERVALS``, ``SUBGRAPHS``, ``CLIPS``.
+    """Item to return: a named value, ``*``, ``FRAMES``, ``INTERVALS``, ``SUBGRAPHS`` or ``CLIPS``.
 
     ``before`` and ``after`` are the two offsets of ``CLIPS``; ns, negative is earlier.
     """
@@ -345,7 +348,7 @@ class Item:
 
 @dataclass(frozen=True, slots=True)
 class Sort:
-    """``value ASC`` or ``DESC``."""
+    """Sort key: ``value ASC`` or ``value DESC``."""
 
     value: Expression
     descending: bool
@@ -353,7 +356,7 @@ class Sort:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """``SAMPLE number PER value``."""
+    """Sampling clause: ``SAMPLE number PER value``."""
 
     number: int
     per: Expression | None
@@ -362,7 +365,7 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class Returns:
-    """``RETURN DISTINCT items HAVING … ORDER BY … SAMPLE … LIMIT n PER … SKIP … LIMIT …``.
+    """Return clause: ``RETURN DISTINCT items HAVING … ORDER BY … SAMPLE … LIMIT n PER … SKIP … LIMIT …``.
 
     ``top`` is ``LIMIT n PER value``.
     """
@@ -380,7 +383,7 @@ class Returns:
 
 @dataclass(frozen=True, slots=True)
 class HoldClause:
-    """``FOR >= duration INCLUSIVE``: how long a step must last."""
+    """Minimum or maximum duration of a step: ``FOR >= duration INCLUSIVE``."""
 
     comparison: str
     duration: Duration | Parameter
@@ -390,17 +393,17 @@ class HoldClause:
 
 @dataclass(frozen=True, slots=True)
 class StepClause:
-    """One step of a sequence.
+    """Step of a sequence.
 
     Attributes
     ----------
     block : Block
-        What stands after ``MATCH``; of ``HOLDS (condition)`` a block without paths.
+        Pattern after ``MATCH``. For ``HOLDS (condition)``: a block without paths.
     absent : bool
-        Whether it is ``NOT MATCH``.
+        True for ``NOT MATCH``.
     hold : HoldClause or None
     name : str or None
-        What ``AS`` calls it.
+        Name after ``AS``.
     span : TextSpan
     """
 
@@ -413,7 +416,7 @@ class StepClause:
 
 @dataclass(frozen=True, slots=True)
 class ScenarioStep:
-    """``MATCH name(parameter = value, …)``: the steps of a scenario that has a name."""
+    """Call of a named scenario as a step: ``MATCH name(parameter = value, …)``."""
 
     name: str
     given: tuple[Argument, ...]
@@ -423,7 +426,7 @@ class ScenarioStep:
 
 @dataclass(frozen=True, slots=True)
 class Argument:
-    """``name = value``: the value of a parameter of a scenario, or another name for one of its variables."""
+    """Argument of a scenario, ``name = value``: a parameter value, or a new name for a variable."""
 
     name: str
     value: Given
@@ -432,14 +435,14 @@ class Argument:
 
 @dataclass(frozen=True, slots=True)
 class LinkClause:
-    """Link between two steps: when the second one comes after the first.
+    """Time relation between two steps of a sequence.
 
     Attributes
     ----------
     kind : str
         ``then``, ``immediately``, ``until`` or ``while``.
     after, within : Duration, Parameter or None
-        Least and greatest time of ``then``.
+        Shortest and longest time of ``then``.
     span : TextSpan
     """
 
@@ -451,13 +454,13 @@ class LinkClause:
 
 @dataclass(frozen=True, slots=True)
 class GroupStep:
-    """``(A | B THEN C){2,3}``: one of several sequences, so many times, one time after another.
+    """Group of alternative sequences with a repeat count: ``(A | B THEN C){2,3}``.
 
     Attributes
     ----------
     alternatives : tuple of SequenceClause
     low, high : int
-        How often, at least and at most.
+        Smallest and largest number of repetitions.
     span : TextSpan
     """
 
@@ -469,7 +472,7 @@ class GroupStep:
 
 @dataclass(frozen=True, slots=True)
 class SequenceClause:
-    """Steps with links between them; there is one step more than links."""
+    """Steps with links between them. There is one step more than links."""
 
     steps: tuple[StepClause | ScenarioStep | GroupStep, ...]
     links: tuple[LinkClause, ...]
@@ -478,7 +481,7 @@ class SequenceClause:
 
 @dataclass(frozen=True, slots=True)
 class LaterMatch:
-    """``OPTIONAL MATCH …``, or ``MATCH …`` behind one or behind ``WITH``."""
+    """``OPTIONAL MATCH …``, or a ``MATCH …`` after an ``OPTIONAL MATCH`` or a ``WITH``."""
 
     block: Block
     optional: bool
@@ -487,7 +490,7 @@ class LaterMatch:
 
 @dataclass(frozen=True, slots=True)
 class WithClause:
-    """``WITH DISTINCT items ORDER BY … SKIP … LIMIT … WHERE …``."""
+    """``WITH`` clause: ``WITH DISTINCT items ORDER BY … SKIP … LIMIT … WHERE …``."""
 
     distinct: bool
     items: tuple[Item, ...]
@@ -500,7 +503,7 @@ class WithClause:
 
 @dataclass(frozen=True, slots=True)
 class MatchClause:
-    """``USING … MATCH … WHERE … THEN … OPTIONAL MATCH … WITH … RETURN …``."""
+    """Complete query: ``USING … MATCH … WHERE … THEN … OPTIONAL MATCH … WITH … RETURN …``."""
 
     settings: tuple[Setting, ...]
     sequence: SequenceClause
@@ -510,14 +513,14 @@ class MatchClause:
 
     @property
     def block(self) -> Block:
-        """The pattern of its first step; of a scenario, an empty one."""
+        """Pattern of the first step. If the step is a scenario, the pattern is empty."""
         first = self.sequence.steps[0]
         return first.block if isinstance(first, StepClause) else Block((), None, first.span)
 
 
 @dataclass(frozen=True, slots=True)
 class UnionClause:
-    """``MATCH … UNION MATCH …``; not ``distinct``: ``UNION ALL``."""
+    """Union of queries: ``MATCH … UNION MATCH …``, or ``UNION ALL`` if not ``distinct``."""
 
     parts: tuple[MatchClause, ...]
     distinct: bool
@@ -526,7 +529,7 @@ class UnionClause:
 
 @dataclass(frozen=True, slots=True)
 class Formal:
-    """A parameter of a definition; that of a scenario may have a value that it takes if none is given."""
+    """Formal parameter of a definition. A parameter of a scenario may have a default value."""
 
     name: str
     default: Constant | Duration | None
@@ -535,7 +538,7 @@ class Formal:
 
 @dataclass(frozen=True, slots=True)
 class Define:
-    """``DEFINE PREDICATE name(parameters) AS condition``, ``DEFINE SCENARIO name(parameters) AS sequence``."""
+    """Definition of a predicate or scenario: ``DEFINE PREDICATE name(parameters) AS condition``."""
 
     name: str
     parameters: tuple[Formal, ...]
@@ -546,7 +549,7 @@ class Define:
 
 @dataclass(frozen=True, slots=True)
 class QuantifiedNode:
-    """``name:label`` after ``FORALL`` or ``FORSOME``."""
+    """Quantified variable ``name:label`` after ``FORALL`` or ``FORSOME``."""
 
     name: str
     label: LabelExpression
@@ -555,7 +558,7 @@ class QuantifiedNode:
 
 @dataclass(frozen=True, slots=True)
 class QuantifierClause:
-    """``FORALL (a:Label, b:Label WHERE condition ABSENT AS TRUE)``, or ``FORSOME``."""
+    """Quantifier: ``FORALL (a:Label, b:Label WHERE condition ABSENT AS TRUE)``, or ``FORSOME``."""
 
     word: str
     nodes: tuple[QuantifiedNode, ...]
@@ -566,7 +569,7 @@ class QuantifierClause:
 
 @dataclass(frozen=True, slots=True)
 class CheckClause:
-    """``USING … CHECK name: quantifiers formula RESET WHEN condition ROBUSTNESS RETURN items``."""
+    """Check: ``USING … CHECK name: quantifiers formula RESET WHEN condition ROBUSTNESS RETURN items``."""
 
     settings: tuple[Setting, ...]
     name: str | None
