@@ -1,12 +1,12 @@
-"""RoadMap: lanes, roads, junctions, crosswalks and signals as arrays, with look-ups for many things at once.
+"""The road map: lanes, roads, junctions, crosswalks and signals as arrays, with bulk look-ups.
 
-A map is read once (:mod:`sgstore.opendrive`), is never changed, and is asked in bulk: which lanes do
-these thousand footprints touch, which parts of the map lie around these sixty egos. Every answer is a set,
-because lanes overlap in junctions and storeys lie above one another.
+A map is read once (:mod:`sgstore.opendrive`) and never changes. Queries are bulk queries: the lanes
+under a thousand footprints, or the parts of the map around sixty egos. Every answer is a set,
+because lanes overlap in junctions and storeys are above one another.
 
-Nodes. Every part of a map that can be a node of a scene graph has a node id below zero: ``off_road`` is
--1, then come lanes, roads, junctions, roundabouts, crosswalks, signals and objects, in this order. ``nodes``
-lists them all.
+Nodes. Every part of a map that can be a node of a scene graph has a negative node id: ``off_road``
+is -1, then follow lanes, roads, junctions, roundabouts, crosswalks, signals and objects, in this
+order. ``nodes`` lists them all.
 """
 
 import lazy_loader

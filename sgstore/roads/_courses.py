@@ -1,10 +1,9 @@
-"""How lanes run: their curvature and slope, metre by metre.
+"""Curvature and slope of lanes, metre by metre.
 
-A lane is cut into equal stretches of about :data:`STRETCH`, one at least and 10,000 at most. Its curvature on
-a stretch is by how much its centre line turns from one end of it to the other, over the length; its slope is
-by how much it rises, over the length as seen from above. So neither depends on how densely a file has its
-points, and a fault of a file at one point (a piece of a road that does not go on quite as the one before
-ended) stays small.
+A lane is cut into 1 to 10,000 equal stretches of about :data:`STRETCH`. The curvature of a stretch
+is the turn of its centre line from end to end, divided by the length. The slope is the rise divided
+by the length seen from above. Therefore neither depends on the density of the points in a file. A
+fault at one point (a small step between two pieces of a road) has a small effect.
 """
 
 from __future__ import annotations
@@ -25,31 +24,31 @@ if TYPE_CHECKING:
     Heights = Callable[[Ints, Floats], Floats]
 
 STRETCH: Final = 1.0
-"""About how long a stretch is over which curvature and slope are means; m."""
+"""Approximate length of a stretch; curvature and slope are means over it; m."""
 _MOST: Final = 10_000
-"""Stretches of a lane: of one that is longer than 10 km, they are longer, too."""
+"""Greatest number of stretches of a lane. A lane longer than 10 km has longer stretches."""
 _MOST_IN_ALL: Final = 1 << 20
-"""About so many stretches of all lanes together: a map of strangers may be of any size."""
+"""Approximate greatest number of stretches of all lanes together: maps from other sources can have any size."""
 _DIGITS: Final = 7
-"""Digits that are kept of both, so that stretches of a straight line or an arc are one."""
+"""Digits of curvature and slope. Rounding joins the stretches of a straight line or an arc."""
 
 
 @dataclass(frozen=True, slots=True)
 class LaneCourses:
-    """Stretches of lanes, ordered by lane and start; those of a lane follow one another; shape (n,).
+    """Stretches of lanes with curvature and slope, ordered by lane and start; shape (n,).
 
-    A place before the start of its lane is on the first stretch, one beyond the end on the last.
+    A place before the start of its lane is on the first stretch, a place after the end on the last.
 
     Attributes
     ----------
     lane : int64
         Lanes, counted from 0.
     start, end : float64
-        Along the centre line of the lane; m. Of the last stretch of a lane the end is infinite.
+        Along the centre line of the lane; m. The end of the last stretch of a lane is infinite.
     curvature : float64
-        Positive where the lane turns to the left as its traffic sees it; 1/m.
+        Positive where the lane turns to the left, seen in the direction of travel; 1/m.
     slope : float64
-        Rise over run in the direction of travel: 0.05 is 5 % uphill. NaN: the map has no heights.
+        Rise over run in the direction of travel: 0.05 is 5 % uphill. NaN if the map has no heights.
     """
 
     lane: Ints
@@ -63,24 +62,25 @@ class LaneCourses:
 
     @classmethod
     def none(cls) -> LaneCourses:
-        """Nothing is known of any lane."""
+        """Return an empty table: no lane has a known course."""
         nowhere = np.zeros(0)
         return cls(np.zeros(0, np.int64), nowhere, nowhere, nowhere, nowhere)
 
     def rows(self) -> Iterator[tuple[int, float, float, float]]:
-        """Node id of the lane, start, curvature and slope of each."""
+        """Yield node id of the lane, start, curvature and slope of each stretch."""
         columns = (self.start, self.curvature, self.slope)
         return zip((-2 - self.lane).tolist(), *(one.tolist() for one in columns), strict=True)
 
 
 def lane_courses(ribbons: Ribbons, heights: Heights | None) -> LaneCourses:
-    """The courses of lanes.
+    """Compute curvature and slope along lanes.
 
     Parameters
     ----------
     ribbons : Ribbons
     heights : callable or None
-        Lanes, and places along them, m → heights there, m. ``None``: nothing is known of any.
+        Function from lanes and places along them (m) to heights (m). ``None`` means unknown
+        heights.
     """
     lengths = ribbons.lengths
     wanted = np.clip(np.rint(lengths / STRETCH), 1, _MOST)
@@ -90,7 +90,7 @@ def lane_courses(ribbons: Ribbons, heights: Heights | None) -> LaneCourses:
     number = np.arange(len(lane)) - (np.cumsum(counts) - counts)[lane]
     step = lengths[lane] / counts[lane]
     start, end = number * step, (number + 1) * step
-    # Where a stretch ends the next begins: places are the starts, and behind the last of a lane its end.
+    # A stretch ends where the next one begins: the places are all starts, and the end of each lane.
     last = np.flatnonzero(number == counts[lane] - 1)
     at_lane = np.insert(lane, last + 1, lane[last])
     at = np.insert(start, last + 1, end[last])
@@ -108,7 +108,7 @@ def lane_courses(ribbons: Ribbons, heights: Heights | None) -> LaneCourses:
 
 
 def _joined(every: LaneCourses) -> LaneCourses:
-    """The same with one stretch for those that follow one another and are alike."""
+    """Join neighbouring stretches that have the same curvature and slope."""
     if not len(every):
         return every
     slope = np.nan_to_num(every.slope)

@@ -1,4 +1,4 @@
-"""Outlines of a road map as plain columns, simplified, for programs that draw it."""
+"""Simplified outlines of a road map as plain columns, for drawing programs."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ if TYPE_CHECKING:
     from sgstore.roads._map import RoadMap
 
 TOLERANCE: Final = 0.05
-"""How far a simplified outline may be from what it was; m."""
+"""Greatest distance between a simplified outline and the original; m."""
 
 
 @dataclass(frozen=True, slots=True)
 class DrawnOutlines:
-    """Rings and lines of a map, one behind the other, in the order in which they are painted.
+    """Rings and lines of a map, in painting order.
 
     Attributes
     ----------
     origin : (float, float)
-        The place that the points are about; m, in the axes of the map.
+        Origin of the points; m, in the axes of the map.
     words : tuple of str
-        Types of lanes, and kinds of what is no lane.
+        Types of lanes, and kinds of the other nodes.
     x, y : (N,) float32
         Points; m.
     start : (R + 1,) uint32
         First point of each ring or line; the last entry is the number of points.
     node : (R,) int32
-        Node id of what it outlines.
+        Node id of the outlined part.
     word : (R,) uint8
         Index into ``words``.
     closed : (R,) uint8
-        Whether it encloses an area.
+        1 if the outline encloses an area.
     """
 
     origin: tuple[float, float]
@@ -52,20 +52,20 @@ class DrawnOutlines:
 
 
 def drawn_outlines(road_map: RoadMap, tolerance: float = TOLERANCE) -> DrawnOutlines:
-    """Outlines of lanes, crosswalks and objects of a map.
+    """Return the outlines of lanes, crosswalks and objects of a map.
 
     Parameters
     ----------
     road_map : RoadMap
     tolerance : float
-        How far they may be from what they were; m.
+        Greatest distance between an outline and the original; m.
     """
     nodes = road_map.nodes
     kinds = [str(KINDS[kind]) for kind in nodes.kind.tolist()]
     names = [lane or kind for lane, kind in zip(nodes.lane_type, kinds, strict=True)]
     words = tuple(dict.fromkeys(names))[:255]
     codes = np.array([min(words.index(name) if name in words else 254, 254) for name in names])
-    # What people walk on lies below what is driven on where both are drawn, and crossings above both.
+    # Pavements are painted below carriageways, and crossings above both.
     layer = np.array([_layer(word) for word in words] or [0])[codes] if len(codes) else codes
     shapes = shapely.simplify(road_map.outlines(), tolerance)
     parts, row = shapely.get_parts(shapes, return_index=True)

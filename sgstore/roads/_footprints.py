@@ -1,9 +1,10 @@
-"""Look-up of the lanes that footprints touch, with overlap and offset: the one that every frame needs most.
+"""Look-up of the lanes that footprints touch, with overlap and offset.
 
-A lane is a chain of quadrangles (:class:`~sgstore.roads._ribbons.Ribbons`), short where it bends. Footprints
-and quadrangles are brought together by the cells of a grid; separating axes tell which of them touch, and
-the share of a footprint in a quadrangle is a sum over the quadrangle's edges in closed form. All of it is
-numpy over chunks of footprints that fit the caches; shapely's intersection alone would take longer.
+Every frame needs this look-up, so it must be fast. A lane is a chain of quadrangles
+(:class:`~sgstore.roads._ribbons.Ribbons`), short where it bends. A grid brings footprints and
+nearby quadrangles together. Separating axes find the pairs that touch. The share of a footprint in
+a quadrangle is a sum over the quadrangle's edges in closed form. numpy does this over chunks of
+footprints that fit the caches; shapely's intersection takes longer.
 """
 
 from __future__ import annotations
@@ -25,29 +26,30 @@ if TYPE_CHECKING:
 
 
 TOUCH: Final = 1e-3
-"""Footprints this close to a lane touch it, so that no seam between lanes is a gap; m."""
+"""A footprint this close to a lane touches it, so that a seam between lanes is not a gap; m."""
 
 _CELL: Final = 4.0
 """Edge of a grid cell; m."""
 _CHUNK: Final = 1 << 13
-"""Pairs of a footprint and a cell that are worked on at a time."""
+"""Pairs of a footprint and a cell that are processed at a time."""
 _MOST_ENTRIES: Final = 32
-"""Cells that a quadrangle may lie in on average; the grid is made coarser until it is so."""
+"""Greatest mean number of cells per quadrangle; a grid above it is made coarser."""
 _MOST_IN_ALL: Final = 1 << 21
-"""Quadrangles in all cells together that any grid may have, and a larger one as many as four for each of its
-own: an entry takes some 60 bytes as the grid is made. Lanes of towns need 2 to 7 for each."""
+"""Greatest number of entries in a grid (an entry is a quadrangle in a cell). A larger map may have
+four entries for each of its quadrangles. An entry takes about 60 bytes. Lanes of towns need 2 to 7
+entries each."""
 _POINT: Final = 1e-9
-"""Lengths below this are none; m."""
+"""Lengths below this count as zero; m."""
 _MOST_STEPS: Final = 256
-"""Quadrangles that are walked along a lane to the one beside a footprint's centre."""
+"""Greatest number of quadrangles between a footprint and the quadrangle at its centre."""
 
 
 @dataclass(frozen=True, slots=True)
 class Touches:
-    """Footprints and lanes that touch, ordered by footprint and lane; shape (H,).
+    """Pairs of a footprint and a lane that touch, ordered by footprint and lane; shape (H,).
 
     ``row``, ``lane`` (from 0), ``overlap``, ``offset``, ``heading_error`` as in
-    :class:`~sgstore.roads.LaneHits`; ``inside``: the footprint's centre lies in the lane.
+    :class:`~sgstore.roads.LaneHits`; ``inside``: True if the footprint's centre is in the lane.
     """
 
     row: Ints
@@ -60,10 +62,11 @@ class Touches:
 
 @dataclass(frozen=True, slots=True)
 class _Quads:
-    """Quadrangles of lanes, in the order of lanes and along them; shape (Q,), corners (4, Q).
+    """Quadrangles of lanes, ordered by lane and along it; shape (Q,), corners (4, Q).
 
-    Corners run right start, right end, left end, left start: counter-clockwise, ``turn`` +1, unless the
-    lane has a negative width there. All of one lies within ``radius`` of its middle.
+    The corners are right start, right end, left end, left start: counter-clockwise, ``turn`` +1,
+    unless the lane has a negative width there. The whole quadrangle is within ``radius`` of its
+    middle.
     """
 
     lane: Ints
@@ -115,10 +118,10 @@ def _quads(ribbons: Ribbons) -> _Quads:
 
 
 def _unfold(x: Floats, y: Floats) -> None:
-    """End cross sections that cross where they cross, in place.
+    """Cut end cross sections at their crossing point, in place.
 
-    On the inner side of a bend that is tighter than the lane is wide, the border runs backwards, beyond the
-    centre of the bend: nothing is there that is not in the lane anyhow.
+    In a bend that is tighter than the lane is wide, the inner border runs backwards, beyond the
+    centre of the bend. This part adds no area to the lane.
     """
     from_x, from_y = x[0] - x[3], y[0] - y[3]  # from left to right, at the start
     to_x, to_y = x[1] - x[2], y[1] - y[2]  # and at the end
@@ -137,7 +140,7 @@ def _unfold(x: Floats, y: Floats) -> None:
 
 
 class _Grid:
-    """Cells of a square grid, each with the quadrangles that lie in it; empty cells are not kept."""
+    """Square grid of cells with the quadrangles in each cell; without empty cells."""
 
     def __init__(self, quads: _Quads) -> None:
         low = np.stack((quads.x.min(axis=0), quads.y.min(axis=0)))
@@ -149,7 +152,7 @@ class _Grid:
         while True:
             self.first, last = self.cells(low), self.cells(high)
             self.shape = last.max(axis=1, initial=0)[:, None] + 1
-            # As floats: far lanes have more cells than a whole number can count.
+            # As floats: the number of cells of distant lanes can overflow an integer.
             entries = (last - self.first + 1).prod(axis=0, dtype=np.float64).sum()
             if entries <= most and self.shape.max() < 1 << 30:
                 break
@@ -163,13 +166,13 @@ class _Grid:
         self.keys, self.begin = key[begin], np.append(begin, len(key))
 
     def cells(self, places: Floats) -> Ints:
-        """(2, N) int64: the cells that places (2, N) lie in."""
+        """Return the cells (2, N), int64, of the places (2, N)."""
         return np.floor((places - self.origin) / self.cell).astype(np.int64)
 
     def pairs(self, first: Ints, last: Ints) -> tuple[Ints, Ints]:
-        """Numbers of the rectangles of cells ``first`` to ``last`` (2, N), and the quadrangles in them.
+        """Return pairs of rectangle and quadrangle for rectangles of cells ``first`` to ``last`` (2, N).
 
-        Each pair comes once: one that shares several cells counts in the first of them alone.
+        Each pair occurs once: a pair that shares several cells counts in the first of them.
         """
         row, x, y = _cells_between(first, last)
         key = x * self.shape[1] + y
@@ -180,7 +183,8 @@ class _Grid:
         cell = np.repeat(np.arange(len(place)), sizes)
         at = np.arange(len(cell)) + (self.begin[place] - np.cumsum(sizes) + sizes)[cell]
         quad = self.quad[at]
-        # In the first cell of the rectangle everything counts; in others what does not begin before.
+        # In the first cell of the rectangle all quadrangles count; in the others only those that
+        # begin there.
         inner_x, inner_y = (x > first[0][row])[cell], (y > first[1][row])[cell]
         once = (~inner_x | (self.first[0][quad] == x[cell])) & (
             ~inner_y | (self.first[1][quad] == y[cell])
@@ -189,7 +193,7 @@ class _Grid:
 
 
 def _cells_between(first: Ints, last: Ints) -> tuple[Ints, Ints, Ints]:
-    """Numbers and cells of all rectangles of cells from ``first`` to ``last``, both (2, N) and included."""
+    """Return rectangle number and cell for all cells from ``first`` to ``last`` (2, N), both included."""
     spans = np.maximum(last - first + 1, 0)
     sizes = spans[0] * spans[1]
     row = np.repeat(np.arange(len(sizes)), sizes)
@@ -200,7 +204,7 @@ def _cells_between(first: Ints, last: Ints) -> tuple[Ints, Ints, Ints]:
 
 @dataclass(frozen=True, slots=True)
 class _Shapes:
-    """Footprints, shape (N,): ``a`` and ``b`` are half their length and width, ``z`` their height."""
+    """Footprints; shape (N,). ``a`` and ``b`` are half of length and width, ``z`` is the height."""
 
     x: Floats
     y: Floats
@@ -213,7 +217,7 @@ class _Shapes:
 
     @classmethod
     def of(cls, boxes: Floats, z: Floats) -> _Shapes:
-        """From boxes (N, 5); a side that is missing or 0 is as long as what counts as touching."""
+        """Make footprints from boxes (N, 5); a missing or zero side gets the length :data:`TOUCH`."""
         half = np.maximum(np.nan_to_num(np.abs(boxes[:, 3:5].T)) / 2, TOUCH / 2)
         heading = np.nan_to_num(boxes[:, 2])
         x, y = np.ascontiguousarray(boxes[:, :2].T)
@@ -221,13 +225,13 @@ class _Shapes:
 
 
 class LaneIndex:
-    """All lanes of a map, to be asked what touches them.
+    """Index of all lanes of a map, for look-ups by footprint.
 
     Parameters
     ----------
     ribbons : Ribbons
     storey : float
-        Greatest difference of height between a footprint and what it touches; m.
+        Greatest difference of height between a footprint and a lane that it touches; m.
     """
 
     def __init__(self, ribbons: Ribbons, storey: float) -> None:
@@ -236,13 +240,13 @@ class LaneIndex:
         self._storey = storey
 
     def touches(self, boxes: Floats, z: Floats) -> Touches:
-        """Lanes that footprints (N, 5) at heights (N,) touch; see :meth:`sgstore.roads.RoadMap.lanes_of`."""
+        """Return the lanes that footprints touch; see :meth:`sgstore.roads.RoadMap.lanes_of`."""
         shapes = _Shapes.of(boxes, z)
         found = [self._touching(shapes)] if worth() else self._touching_in_chunks(shapes)
         return chained([_no_touches(), *(self._gathered(shapes, *touching) for touching in found)])
 
     def _touching(self, shapes: _Shapes) -> tuple[Ints, Ints, Bools, Floats]:
-        """Footprints and quadrangles that touch, whether the centre is inside, and numbers: share, … area."""
+        """Return pairs of footprint and quadrangle that touch, a mask of centres inside, and numbers."""
         from sgstore.roads import _loops
 
         grid, quads = self._grid, self._quads
@@ -272,7 +276,7 @@ class LaneIndex:
             )
 
     def _cells(self, shapes: _Shapes) -> tuple[Ints, Ints, Ints]:
-        """Footprints that are somewhere, and the first and the last cell of each, (2, R)."""
+        """Return footprints with a finite position, and the first and last cell of each, (2, R)."""
         grid = self._grid
         cos, sin = np.abs(shapes.cos), np.abs(shapes.sin)
         reach = np.stack((cos * shapes.a + sin * shapes.b, sin * shapes.a + cos * shapes.b)) + TOUCH
@@ -287,7 +291,7 @@ class LaneIndex:
         return rows, first, last
 
     def _candidates(self, shapes: _Shapes) -> Iterator[tuple[Ints, Ints]]:
-        """Footprints and quadrangles that are close, each pair once, by chunks of footprints."""
+        """Yield pairs of a footprint and a close quadrangle, each pair once, in chunks of footprints."""
         grid, quads = self._grid, self._quads
         rows, first, last = self._cells(shapes)
         if not len(rows):
@@ -330,11 +334,11 @@ class LaneIndex:
         return Touches(row, lane[best], overlap, offset, error, within)
 
     def _aside(self, shapes: _Shapes, row: Ints, quad: Ints) -> tuple[Floats, Floats]:
-        """Lateral offset and heading error of footprints on the lanes of these quadrangles.
+        """Return lateral offset and heading error of footprints on the lanes of these quadrangles.
 
-        What counts is the place of the lane whose cross section runs through the footprint's centre. It may be
-        in a quadrangle that the footprint does not touch, which is walked to. Between its ends the centre
-        line is taken for the parabola that has the ends' headings.
+        The offset refers to the place of the lane whose cross section runs through the footprint's
+        centre. This place may be in a quadrangle that the footprint does not touch. Between two
+        cross sections the centre line is approximated by the parabola with their headings.
         """
         quads = self._quads
         here = _Pairs.of(quads, shapes, row, quad)
@@ -344,7 +348,7 @@ class LaneIndex:
             at = quad[walking]
             step = ((there > 1) & ~quads.last[at]).astype(np.int64)
             step -= (there < 0) & ~quads.first[at]
-            # Where a lane is folded two quadrangles may send on to each other: nobody turns back.
+            # In a folded lane two quadrangles may point to each other; the search never turns back.
             goes = np.flatnonzero((step != 0) & (step != -towards))
             walking, towards = walking[goes], step[goes]
             if not len(walking):
@@ -363,12 +367,12 @@ class LaneIndex:
 
 
 def _first_least(values: Floats, starts: Ints) -> Ints:
-    """Row of the first least value of each group; the groups start at ``starts``."""
+    """Return the row of the first minimum of each group; groups begin at ``starts``."""
     least = np.minimum.reduceat(values, starts)
     group = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(values)))
     rows = np.flatnonzero(values == least[group])[::-1]
     first = np.empty(len(starts), np.int64)
-    first[group[rows]] = rows  # of several assignments to one place the last holds
+    first[group[rows]] = rows  # numpy keeps the last of several assignments to one place
     return first
 
 
@@ -379,7 +383,7 @@ def _no_touches() -> Touches:
 
 @dataclass(frozen=True, slots=True)
 class _Pairs:
-    """Footprints and quadrangles, shape (n,); corners (4, n) in the footprint's axes, its centre the origin."""
+    """Pairs of footprint and quadrangle; shape (n,)."""
 
     row: Ints
     quad: Ints
@@ -391,8 +395,8 @@ class _Pairs:
 
     @classmethod
     def of(cls, quads: _Quads, shapes: _Shapes, row: Ints, quad: Ints) -> _Pairs:
-        # The corners of one quadrangle are fetched together, from one line of the cache, and then kept in runs
-        # of memory, one for each corner: that is what makes the sums below fast.
+        # The four corners of a quadrangle are fetched together, from one cache line. Then each
+        # corner gets its own run of memory, which makes the sums below fast.
         corners = quads.corners.take(quad, axis=0).T
         x = np.subtract(corners[:4], shapes.x[row], order="C")
         y = np.subtract(corners[4:], shapes.y[row], order="C")
@@ -401,7 +405,7 @@ class _Pairs:
         return cls(row, quad, shapes.a[row], shapes.b[row], quads.turn[quad], along, across)
 
     def take(self, rows: Ints) -> _Pairs:
-        """Some of the pairs."""
+        """Return the pairs of these rows."""
         return _Pairs(
             self.row[rows],
             self.quad[rows],
@@ -413,7 +417,7 @@ class _Pairs:
         )
 
     def touching(self) -> tuple[Bools, Bools]:
-        """Masks of pairs that no axis separates, and of those with the footprint's centre in the quadrangle."""
+        """Return masks of the pairs that touch, and of the pairs with the centre in the quadrangle."""
         a, b = self.a + TOUCH, self.b + TOUCH
         x, y = self.x, self.y
         apart = (x.min(axis=0) > a) | (x.max(axis=0) < -a)
@@ -428,21 +432,22 @@ class _Pairs:
         return ~apart, inside
 
     def middle_line(self) -> tuple[Floats, Floats, Floats, Floats]:
-        """Start of the centre line of each quadrangle, and the way to its end."""
+        """Return the start of each quadrangle's centre line, and the vector to its end."""
         x, y = (self.x[0] + self.x[3]) / 2, (self.y[0] + self.y[3]) / 2
         return x, y, (self.x[1] + self.x[2]) / 2 - x, (self.y[1] + self.y[2]) / 2 - y
 
     def beside(self) -> tuple[Floats, Floats]:
-        """Place of the footprint's centre along the centre line, 0 … 1 from end to end; squared distance."""
+        """Return the footprint centre's share along the centre line (0 … 1), and its squared distance."""
         x, y, along_x, along_y = self.middle_line()
         share = -(x * along_x + y * along_y) / np.maximum(along_x**2 + along_y**2, 1e-18)
         at = np.clip(share, 0.0, 1.0)
         return share, (x + at * along_x) ** 2 + (y + at * along_y) ** 2
 
     def between(self) -> Floats:
-        """Place of the footprint's centre between both cross sections, 0 … 1 from the start to the end.
+        """Return the place of the footprint's centre between both cross sections, 0 … 1.
 
-        Unlike the feet on straight pieces it runs on from quadrangle to quadrangle without a gap or overlap.
+        Unlike the projection, this share continues from quadrangle to quadrangle without a gap or
+        overlap.
         """
         ahead, start = self._ahead(0, 3)
         behind, end = self._ahead(1, 2)
@@ -451,14 +456,14 @@ class _Pairs:
         return np.where(usable, ahead / np.where(usable, both, 1.0), self.beside()[0])
 
     def _ahead(self, right: int, left: int) -> tuple[Floats, Floats]:
-        """Distance of the footprint's centre ahead of a cross section, and width of the lane there."""
+        """Return the distance of the footprint's centre ahead of a cross section, and the lane width there."""
         across_x, across_y = self.x[left] - self.x[right], self.y[left] - self.y[right]
         width = np.hypot(across_x, across_y)
         ahead = self.y[right] * across_x - self.x[right] * across_y
         return ahead / np.maximum(width, _POINT), width
 
     def common_areas(self) -> Floats:
-        """Area of each footprint that lies in the quadrangle; negative where that is clockwise.
+        """Return the common area of footprint and quadrangle; negative for clockwise quadrangles.
 
         The area of a polygon P in the box [-a, a] × [-b, b] is ∮ x̂ dy along P's edges where |y| ≤ b, with
         x̂ = x held within ±a: Green's theorem for the field (x̂, 0). Along an edge the integral of x̂ is a

@@ -1,10 +1,11 @@
-"""Plain lanes from lane lines, links and borders.
+"""Conversion of lane lines, links and borders to plain lanes.
 
-Lanes told as lines and links → plain lanes.
+The input is lane lines and links, the output is plain lanes.
 
-Simulators that carry no OpenDRIVE tell lanes as lines: each in a direction of its own, which need not be that
-of its traffic, with the ids of the lanes that it touches. Here they get cross sections, run with their
-traffic, and are related to one another. What cannot be used is left out and named.
+Simulators without OpenDRIVE describe lanes as lines with the ids of connected lanes. The direction
+of a line can differ from the direction of its traffic. This module adds cross sections, turns lanes
+into the direction of traffic, and relates them to one another. Unusable lanes are left out and
+named in a warning.
 """
 
 from __future__ import annotations
@@ -49,21 +50,21 @@ MAX_LANES: Final = 30_000
 MAX_WAYS: Final = 20_000
 """Greatest number of ways through areas."""
 MAX_RELATED: Final = 500_000
-"""Greatest number of times that lanes name others as touching them or lying beside them."""
+"""Greatest number of references between lanes (ends that touch, and neighbours)."""
 GAP: Final = 5.0
-"""Ends of lanes that are farther apart do not touch, whatever is told of them; m."""
+"""Ends of lanes with a larger gap do not touch, even if the file links them; m."""
 SEAM: Final = 1.0
 """Gaps up to this length between a lane and the next one are closed; m."""
 LISTED: Final = 8
-"""Lanes that a warning names."""
+"""Greatest number of lanes that a warning names."""
 _MOST_ACROSS: Final = 16
-"""Lanes without traffic that may lie between two lanes that are neighbours across them."""
+"""Greatest number of lanes without traffic between two lanes that count as neighbours."""
 _ABOUT: Final = 1.0
-"""Centre lines of a junction's lanes that come this close to one another belong together; m."""
+"""Lanes of a junction belong together if their centre lines come this close; m."""
 
 
 class Joint(NamedTuple):
-    """A lane that touches an end of another, and with which end: ``start``, ``end``, or empty: not told."""
+    """Another lane that touches an end of a lane, and the end of it: ``start``, ``end`` or empty (unknown)."""
 
     lane: str
     contact: str = ""
@@ -71,18 +72,18 @@ class Joint(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Border:
-    """A line beside a lane.
+    """Line at the side of a lane.
 
     Attributes
     ----------
     line : (k, 3) float64
     to_left, to_right : bool or None
-        Whether traffic may cross it from its right to its left, and back, as the lane's line runs; ``None``:
-        that is not known.
+        True if traffic may cross it from its right to its left (and from left to right), in the
+        direction of the lane's line; ``None`` means unknown.
     ident : str
-        What the lanes that it bounds call it; empty: nothing.
+        Id by which lanes refer to it; empty if there is no id.
     broad : bool
-        Whether it is a broad marking.
+        True for a broad marking.
     """
 
     line: Floats
@@ -94,33 +95,34 @@ class Border:
 
 @dataclass(frozen=True, slots=True)
 class LaneLine:
-    """A lane. Left, right, start and end are those of its line, whichever way its traffic runs.
+    """Lane as a line; left, right, start and end refer to the line, not to the traffic.
 
     Attributes
     ----------
     ident : str
-        What others call it.
+        Id by which other lanes refer to it.
     type : str
-        As OpenDRIVE has it.
+        Lane type of OpenDRIVE.
     centre : (n, 3) float64
         Its centre line; m.
     forward, both : bool
-        Whether traffic runs along the line; whether it runs both ways.
+        ``forward``: traffic runs along the line. ``both``: traffic runs both ways.
     lefts, rights : tuple of Border
         In any order.
     sections : Sections, optional
-        Cross sections along the line, where they are told; else the lines say where they lie.
+        Known cross sections along the line; by default they are computed from the lines.
     before, after : tuple of Joint
-        What touches its start and its end.
+        Lanes that touch its start and its end.
     left_beside, right_beside : tuple of str
     name, road, section, number
-        As :class:`~sgstore.roads.MapNodes` has them; without a road it is one of the lanes side by side.
+        As in :class:`~sgstore.roads.MapNodes`; empty ``road``: it belongs to the road of its
+        neighbours.
     junction : str or None
-        ``None``: it lies in a junction that has no name.
+        ``None`` means a junction without a name.
     speed_limit : float
-        m/s; NaN where there is none.
+        m/s; NaN if there is no limit.
     roundabout : str
-        The one that it is in; empty: none.
+        Its roundabout, or empty.
     """
 
     ident: str
@@ -146,7 +148,7 @@ class LaneLine:
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """A junction that is told as an area, with the ways through it: from which lane to which."""
+    """Junction as an area, with pairs of lanes (from, to) that are connected through it."""
 
     ident: str
     ways: tuple[tuple[str, str], ...]
@@ -154,7 +156,7 @@ class Area:
 
 @dataclass(slots=True)
 class _Network:
-    """Lanes by number, and what touches what."""
+    """Lanes by number, with their contacts."""
 
     lines: list[LaneLine]
     sections: list[Sections]
@@ -166,28 +168,28 @@ class _Network:
         return 1 if self.lines[lane].forward else -1
 
     def end_of(self, lane: int, contact: str) -> Floats:
-        """Start or end point of the line of a lane."""
+        """Return the start or end point of a lane's line."""
         middle = self.sections[lane].middle
         return middle[0 if contact == START else -1]
 
     def gap(self, lane: int, end: str, other: int, contact: str) -> float:
-        """Distance between an end of a lane and an end of another; m."""
+        """Return the distance between an end of a lane and an end of another lane; m."""
         return float(np.hypot(*(self.end_of(lane, end) - self.end_of(other, contact))))
 
     def runs_against(self, lane: int, other: int) -> bool:
-        """Return whether the lines of two lanes side by side run against one another."""
+        """True if the lines of two neighbouring lanes run in opposite directions."""
         key = (lane, other) if lane < other else (other, lane)
         if key not in self._turned:
             self._turned[key] = _turned_round(*(self.sections[row].middle for row in key))
         return self._turned[key]
 
     def exits(self, lane: int, contact: str) -> bool:
-        """Return whether traffic leaves a lane at this end of its line."""
+        """True if traffic leaves a lane at this end of its line."""
         line = self.lines[lane]
         return line.both or line.forward == (contact == END)
 
     def enters(self, lane: int, contact: str) -> bool:
-        """Return whether traffic comes into a lane at this end of its line."""
+        """True if traffic enters a lane at this end of its line."""
         line = self.lines[lane]
         return line.both or line.forward == (contact == START)
 
@@ -195,16 +197,17 @@ class _Network:
 def plain_lanes(
     lines: Sequence[LaneLine], areas: Sequence[Area] = ()
 ) -> tuple[list[PlainLane], list[str]]:
-    """Plain lanes, and warnings of what was left out or had to be guessed.
+    """Return plain lanes, and warnings about skipped or guessed parts.
 
     Raises
     ------
     MapError
-        There are too many lanes, neighbours, or ways.
+        The map has too many lanes, neighbours or ways.
 
     Notes
     -----
-    Each way through an area is a lane: the cubic from the end of one lane to the start of the other.
+    Each way through an area becomes a lane: the cubic from the end of one lane to the start of the
+    other.
     """
     _check_numbers(lines, areas)
     network = _shaped(lines)
@@ -269,7 +272,7 @@ def _check_numbers(lines: Sequence[LaneLine], areas: Sequence[Area]) -> None:
 
 
 def _shaped(lines: Sequence[LaneLine]) -> _Network:
-    """The lanes that have a surface, and it."""
+    """Compute the lane surfaces and return the network of lanes with a surface."""
     network = _Network([], [], {})
     usable: list[LaneLine] = []
     short: list[str] = []
@@ -310,7 +313,7 @@ def _cut(line: LaneLine, lines: Sequence[LaneLine], network: _Network) -> tuple[
 
 
 def about_lanes(lanes: Sequence[str], what: str) -> str:
-    """A warning that names lanes; the first few of many."""
+    """Return a warning that names the first few of these lanes."""
     more = f" and {len(lanes) - LISTED} more" if len(lanes) > LISTED else ""
     return f"{'lanes' if len(lanes) > 1 else 'lane'} {', '.join(lanes[:LISTED])}{more}: {what}"
 
@@ -321,7 +324,7 @@ def _tell(network: _Network, lanes: Sequence[str], what: str) -> None:
 
 
 def _add_ways(network: _Network, areas: Iterable[Area]) -> None:
-    """Lanes for the ways through areas."""
+    """Add lanes for the ways through areas."""
     missing: list[str] = []
     astray: list[str] = []
     for area in areas:
@@ -343,7 +346,7 @@ def _add_ways(network: _Network, areas: Iterable[Area]) -> None:
 
 
 def _touches(line: LaneLine, area: str, *, at_exit: bool) -> bool:
-    """Return whether traffic of a lane comes from or leaves into an area, as far as the lane has joints."""
+    """True if the joints of a lane connect its traffic with an area, or if the lane has no joints."""
     joints = line.after if line.forward == at_exit else line.before
     joints = (*line.before, *line.after) if line.both else joints
     untold = not line.before and not line.after
@@ -373,7 +376,7 @@ def _add_way(network: _Network, area: str, number: int, lanes: tuple[int, int]) 
 
 
 def _gate(network: _Network, lane: int, contact: str) -> tuple[Floats, float, float, float]:
-    """An end of a lane: place, heading of its traffic, width and height."""
+    """Return an end of a lane: place, heading of its traffic, width and height."""
     sections = network.sections[lane]
     at, other = (0, 1) if contact == START else (-1, -2)
     middle = sections.middle
@@ -387,7 +390,7 @@ def _gate(network: _Network, lane: int, contact: str) -> tuple[Floats, float, fl
 
 
 _Joined = tuple[int, str, int, str]
-"""Ends of lanes that touch: lane, which end, other lane, which end of it."""
+"""Ends of lanes that touch: lane, its end, other lane, end of that lane."""
 
 
 def _joints(network: _Network) -> set[_Joined]:
@@ -409,7 +412,7 @@ def _joints(network: _Network) -> set[_Joined]:
 
 
 def _contact(network: _Network, lane: int, end: str, other: int) -> str:
-    """End of the other lane that touches an end of a lane: as it says itself, else the nearer one."""
+    """Return the touching end of the other lane: as its joints state, else the nearer end."""
     line, ident = network.lines[other], network.lines[lane].ident
     says = {
         contact
@@ -430,7 +433,7 @@ def _onto(network: _Network, joints: Iterable[_Joined]) -> list[set[int]]:
 
 
 def _close_seams(network: _Network, joints: Iterable[_Joined]) -> None:
-    """Draw lanes out to the next one where a small gap is left, as in lines of points half a metre apart."""
+    """Extend lanes to the next one across small gaps, as between points half a metre apart."""
     nearest: dict[int, tuple[float, str, int, str]] = {}
     for row, end, other, contact in sorted(joints):
         gap = network.gap(row, end, other, contact)
@@ -452,7 +455,7 @@ _Sides = tuple[set[int], set[int]]
 
 
 def _beside(network: _Network) -> list[_Sides]:
-    """Neighbours on both sides of each line: as it says itself, or as the other says of it."""
+    """Return the neighbours on both sides of each line; a link in one direction is enough."""
     beside: list[_Sides] = [(set(), set()) for _ in network.lines]
     for row, line in enumerate(network.lines):
         for side, idents in enumerate((line.left_beside, line.right_beside)):
@@ -474,18 +477,18 @@ def _beside(network: _Network) -> list[_Sides]:
 
 
 def _turned_round(one: Floats, other: Floats) -> bool:
-    """Return whether two lines side by side run against one another."""
+    """True if two neighbouring lines run in opposite directions."""
     way, back = one[-1] - one[0], other[-1] - other[0]
     same = float(way @ back)
     if abs(same) < 0.5 * float(np.hypot(*way) * np.hypot(*back)):
-        # Both bend: what counts is where they lie next to one another.
+        # Both lines bend: compare their directions where they are next to one another.
         near = along_line(one, other[[0, -1]])
         return bool(near[1] < near[0])
     return same < 0
 
 
 def _across(network: _Network, beside: list[_Sides], row: int, side: int) -> set[int]:
-    """Lanes of traffic that only lanes without traffic part from a lane of traffic."""
+    """Return lanes of traffic that are separated from a lane only by lanes without traffic."""
     if network.lines[row].type not in TRAFFIC:
         return set()
     found: set[int] = set()
@@ -505,7 +508,7 @@ def _across(network: _Network, beside: list[_Sides], row: int, side: int) -> set
 
 
 def _against(network: _Network, row: int, others: Iterable[int]) -> Iterator[int]:
-    """Lanes of traffic beside a lane of traffic whose traffic comes the other way."""
+    """Yield the neighbouring lanes of traffic with oncoming traffic."""
     if network.lines[row].type not in TRAFFIC:
         return
     for other in others:
@@ -519,7 +522,7 @@ def _against(network: _Network, row: int, others: Iterable[int]) -> Iterator[int
 def _changes(
     network: _Network, row: int, beside: _Sides, against: set[int]
 ) -> Iterator[tuple[int, float, float]]:
-    """Stretches where traffic may change from a lane to those beside it, along its direction of travel."""
+    """Yield stretches where traffic may change to a neighbouring lane, in the direction of travel."""
     line, middle = network.lines[row], network.sections[row].middle
     if line.type not in DRIVING:
         return
@@ -543,7 +546,7 @@ def _changes(
 
 
 def _open_stretches(network: _Network, row: int, side: int) -> list[tuple[float, float]]:
-    """Stretches of a lane's line with a border that may be crossed on one side; the nearest border counts."""
+    """Return the stretches of a lane's line whose nearest border on one side may be crossed."""
     line, middle = network.lines[row], network.sections[row].middle
     borders = [b for b in (line.lefts, line.rights)[side] if len(b.line) > 1]
     spans: list[tuple[float, float, float, bool]] = []
@@ -569,7 +572,7 @@ def _open_stretches(network: _Network, row: int, side: int) -> list[tuple[float,
 
 
 def _names(network: _Network) -> list[str]:
-    """Names of lanes, each once: what two lanes would be called alike has its id added."""
+    """Return unique names of lanes; an ambiguous name gets the lane's id as a suffix."""
     wanted = [line.name or line.ident for line in network.lines]
     count: dict[str, int] = defaultdict(int)
     for name in wanted:
@@ -581,7 +584,7 @@ def _names(network: _Network) -> list[str]:
 
 
 def _roads(network: _Network, beside: list[_Sides]) -> list[str]:
-    """Roads of lanes; those that have none belong with the lanes beside them."""
+    """Return the road of each lane; a lane without a road belongs to the road of its neighbours."""
     road = [line.road for line in network.lines]
     for row, line in enumerate(network.lines):
         if road[row]:
@@ -597,7 +600,7 @@ def _roads(network: _Network, beside: list[_Sides]) -> list[str]:
 
 
 def _junctions(network: _Network) -> list[str]:
-    """Junctions of lanes; those without a name are lanes that cross or touch, named after the first."""
+    """Return the junction of each lane; an unnamed junction is a group of lanes that cross or touch."""
     junction = [line.junction or "" for line in network.lines]
     rows = [row for row, line in enumerate(network.lines) if line.junction is None]
     if not rows:
@@ -615,24 +618,24 @@ def _junctions(network: _Network) -> list[str]:
     return junction
 
 
-# Lanes that are told by their borders alone: the line between them, and which lanes share a border ----
-# The pieces of a border come in any order, each in whichever direction; two of them may lie side by side, as
-# double lines do. Which way a lane's line runs is told by what is its left and what its right.
+# Lanes described by their borders only: the middle line, and lanes that share a border. The pieces
+# of a border have any order and direction; two of them can be next to each other, as double lines
+# are. The direction of a lane's line follows from its left and right border.
 
 MAX_PIECES: Final = 1_000
-"""Greatest number of pieces of a border; a lane that has more is left out, and named."""
+"""Greatest number of pieces of a border. A lane with more is left out and named in a warning."""
 _DOUBLE: Final = 1.0
-"""Pieces of a border that are no farther apart lie side by side, unless one goes on from the other; m."""
+"""Pieces of a border this close are parallel (a double line), unless one continues the other; m."""
 _ONE_SIDED: Final = 0.5
-"""Least share of the way between two borders along which they lie as they are told to."""
+"""Least share of the way between two borders along which left and right must be correct."""
 _BORDER_LOOKS: Final = 9
-"""Places along a lane and along a border at which they are looked at."""
+"""Number of sample places along a lane and along a border."""
 _SHARED: Final = 0.1
-"""Least part of a border that two lanes must share to lie side by side, of the shorter lane."""
+"""Least common part of a border of two neighbouring lanes, as a share of the shorter lane."""
 
 
 def middle_between(lefts: Sequence[Floats], rights: Sequence[Floats]) -> Floats:
-    """The line in the middle of two borders, by shares of their lengths.
+    """Return the line in the middle of two borders, by shares of their lengths.
 
     Parameters
     ----------
@@ -642,12 +645,12 @@ def middle_between(lefts: Sequence[Floats], rights: Sequence[Floats]) -> Floats:
     Returns
     -------
     middle : (n, 3) float64
-        It runs so that the left border is to its left.
+        Its direction has the left border on the left.
 
     Raises
     ------
     ValueError
-        A border has no length or too many pieces, or they cross or are the same.
+        A border has no length or too many pieces, or the borders cross or are equal.
     """
     left, right = _chained(lefts, "left"), _chained(rights, "right")
     along = np.hypot(*(left[[0, -1]] - right[[0, -1]])[:, :2].T).sum()
@@ -671,7 +674,7 @@ def middle_between(lefts: Sequence[Floats], rights: Sequence[Floats]) -> Floats:
 
 
 def _chained(pieces: Sequence[Floats], side: str) -> Floats:
-    """The pieces of a border as one line, beginning with the longest: always the next end that is nearest."""
+    """Join the pieces of a border, beginning with the longest and continuing with the nearest end."""
     left = [thin for piece in pieces if len(thin := thinned(piece)) > 1 and run_of(thin)[-1] > 0]
     if not left:
         raise ValueError(f"neither a centre line nor a boundary to its {side}")
@@ -698,7 +701,7 @@ def _chained(pieces: Sequence[Floats], side: str) -> Floats:
 
 
 def _cut_back(line: Floats, other: Floats, end: int) -> Floats:
-    """A border without what reaches beyond the end of the other one, by more than they are apart there."""
+    """Cut the part of a border that extends beyond the end of the other border."""
     run = run_of(line)
     found = feet(other[[end], :2], [line])
     along, apart = float(found.along[0]), float(np.hypot(*(found.at[0] - other[end, :2])))
@@ -714,9 +717,9 @@ def _cut_back(line: Floats, other: Floats, end: int) -> Floats:
 
 
 def with_shared_borders(lines: Sequence[LaneLine]) -> list[LaneLine]:
-    """Lanes with those beside them with which they share a border, on sides of which they tell nothing.
+    """Add neighbours that share a border, on sides without known neighbours.
 
-    Lanes share a border if they lie on either side of it, along one and the same part of it.
+    Two lanes share a border if they are on its two sides, along the same part of it.
     """
     users: dict[str, dict[tuple[int, int], Floats]] = defaultdict(dict)
     for row, line in enumerate(lines):
@@ -754,7 +757,7 @@ def _told(lines: Sequence[LaneLine], key: tuple[int, int]) -> bool:
 
 
 def _place(centre: Floats, border: Floats) -> tuple[float, float, bool]:
-    """From where to where along a border a lane lies, and whether to its left; looked at from both of them."""
+    """Return start and end of a lane along a border, and True if it is on the border's left."""
     centre, border = thinned(centre)[:, :2], border[:, :2]
     own, at = _looks(centre), run_of(border)[-1] * np.linspace(0.0, 1.0, _BORDER_LOOKS)
     onto, back = feet(own, [border]), feet(_looks(border), [centre])
@@ -770,7 +773,7 @@ def _place(centre: Floats, border: Floats) -> tuple[float, float, bool]:
 
 
 def _looks(line: Floats) -> Floats:
-    """Places (n, 2) along a line, at even distances."""
+    """Return places (n, 2) along a line, at equal distances."""
     run = run_of(line)
     at = run[-1] * np.linspace(0.0, 1.0, _BORDER_LOOKS)
     return np.column_stack([np.interp(at, run, column) for column in line[:, :2].T])
@@ -785,20 +788,20 @@ def _share(one: tuple[float, float, bool], other: tuple[float, float, bool]) -> 
 # Junctions of maps that know of none: lanes that lie on others' ways ---------------------------------
 
 _ON_ANOTHER: Final = 0.5
-"""Least length of a centre line in another lane with which the two lie in a junction; m."""
+"""Least length of a centre line inside another lane that makes both a junction; m."""
 _ASKED_AT_ONCE: Final = 100
 
 
 def with_junctions(lines: Sequence[LaneLine]) -> list[LaneLine]:
-    """The same lanes, those of motor traffic whose centre lines run through others of them in junctions.
+    """Assign a junction to lanes for motor traffic whose centre lines run through one another.
 
-    So they do where they cross, part and merge; lanes on different storeys do not. Lanes without sections
-    are left as they are.
+    This applies to lanes that cross, diverge and merge, but not to lanes on different storeys.
+    Lanes without sections stay unchanged.
 
     Raises
     ------
     MapError
-        Too many lanes lie on one another.
+        Too many lanes overlap.
     """
     rows = [row for row, line in enumerate(lines) if line.type in DRIVING and line.sections]
     sections = [one for row in rows if (one := lines[row].sections)]

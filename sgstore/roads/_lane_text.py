@@ -1,15 +1,16 @@
-"""Plain lanes as text, and back: what a store keeps of a map that is no OpenDRIVE.
+"""Text format of plain lanes: stores keep maps without OpenDRIVE in it.
 
-The text is JSON, one lane a line, so that people can read it and tools can compare it::
+The text is JSON with one lane per line, so that people can read it and tools can compare it::
 
     {"format": "sgstore lanes", "version": 1, "warnings": [], "lanes": [
     {"name": "1/0/-1", "type": "driving", …, "left": [x, y, x, y, …], "right": […], "z": […], "onto": [1]},
     …
     ], "signals": [{"name": "7", "kind": "traffic_light", "x": 1.5, "y": -3.0, "lanes": [0]}]}
 
-``signals``, ``crosswalks`` and ``objects`` are left out where there are none. Lengths are rounded to a tenth of
-a millimetre when the text is written, and the map is always made from the text: what is read back is what was
-there before. Texts come from files, so nothing in them is trusted.
+``signals``, ``crosswalks`` and ``objects`` are optional. Lengths are rounded to a tenth of a
+millimetre when the text is written. The map is always made from the text; therefore a map that is
+read back is equal to the original. The texts come from untrusted files; the reader checks every
+value.
 """
 
 from __future__ import annotations
@@ -51,9 +52,9 @@ MAX_NAME: Final = 200
 MAX_RELATED: Final = 1_000
 """Greatest number of lanes that a lane can be related to in one way."""
 OF_LANES: Final = " (lanes)"
-"""What the names of such maps end in: they are less than the OpenDRIVE of the same name."""
+"""Suffix of the names of such maps: they hold less than the OpenDRIVE of the same name."""
 DIGITS: Final = 4
-"""Digits that are kept of a length in metres."""
+"""Decimal digits of a length in metres."""
 
 _NAMES: Final = ("name", "type", "road", "junction", "roundabout")
 _POSE: Final = ("x", "y", "z", "heading")
@@ -61,7 +62,7 @@ _RELATED: Final = ("onto", "left_beside", "right_beside", "against")
 
 
 def is_lane_text(text: str) -> bool:
-    """Return whether a text can be a map of plain lanes, and no OpenDRIVE: it begins as a JSON object."""
+    """True if a text may be a map of plain lanes: it begins like a JSON object."""
     return text[:100].lstrip("\ufeff \t\r\n").startswith("{")
 
 
@@ -72,7 +73,7 @@ def lane_text(
     crosswalks: Sequence[PlainCrosswalk] = (),
     objects: Sequence[PlainObject] = (),
 ) -> str:
-    """The text of plain lanes, signals, crosswalks and objects; ``warnings`` are kept in it."""
+    """Return the text of plain lanes, signals, crosswalks, objects and warnings."""
     head = {"format": FORMAT, "version": VERSION, "warnings": list(warnings)}
     rows = ",\n".join(_dumps(_fields(lane)) for lane in lanes)
     more = ",\n".join(_dumps(_signal_fields(signal)) for signal in signals)
@@ -85,12 +86,12 @@ def lane_text(
 
 
 def read_lane_text(text: str, name: str) -> RoadMap:
-    """The road map that a text of plain lanes describes.
+    """Parse a text of plain lanes into a road map.
 
     Raises
     ------
     MapError
-        It is no such text, is of another version, or something in it is not what it must be.
+        The text has another format or version, or an invalid value.
     """
     if len(text) > MAX_CHARACTERS:
         raise MapError(f"{len(text):,} characters; a text of lanes may have {MAX_CHARACTERS:,}")
@@ -130,7 +131,7 @@ def _no_number(text: str) -> None:
 
 
 def _fields(lane: PlainLane) -> dict[str, Any]:
-    """A lane as JSON has it; what is missing or empty is left out."""
+    """Convert a lane to JSON fields, without empty fields."""
     fields: dict[str, Any] = {key: getattr(lane, key) for key in _NAMES}
     fields |= {"section": lane.section, "number": lane.number}
     fields |= {
@@ -147,7 +148,7 @@ def _fields(lane: PlainLane) -> dict[str, Any]:
 
 
 def _signal_fields(signal: PlainSignal) -> dict[str, Any]:
-    """A signal as JSON has it; what is missing is left out."""
+    """Convert a signal to JSON fields, without missing values."""
     places = {key: round(getattr(signal, key), DIGITS) for key in _POSE}
     told: dict[str, Any] = {key: place for key, place in places.items() if math.isfinite(place)}
     told |= {"name": signal.name, "kind": signal.kind, "lanes": list(signal.lanes)}
@@ -185,7 +186,7 @@ def _lane(row: Any, number: int, lanes: int) -> PlainLane:
 
 
 class _TextRow:
-    """A lane or signal; whatever is asked of it is what it must be, or a :class:`MapError` says what is not."""
+    """Lane or signal of a text; raises :class:`MapError` for an invalid field."""
 
     def __init__(self, fields: dict[str, Any], number: int, lanes: int, what: str = "lane") -> None:
         self._fields = fields
@@ -301,7 +302,7 @@ class _TextRow:
         return tuple(values)
 
     def _stretches(self, key: str, numbers: int) -> tuple[tuple[int, float, float], ...]:
-        """Lanes, and from where to where along them: lists of so many numbers, two where start is end."""
+        """Read lists of lane, start and end along it; start only, if ``numbers`` is 2."""
         values = self._fields.get(key, [])
         shape = "[lane, start, end]" if numbers == 3 else "[lane, along]"
         expected = f"at most {MAX_RELATED} stretches {shape}"

@@ -1,7 +1,8 @@
-"""Plain lanes → ``RoadMap``, and their cross sections from lines.
+"""Conversion of plain lanes to a ``RoadMap``, and cross sections from lines.
 
-A plain lane is its cross sections in the direction of travel and the lanes that it is related to. All else
-that a :class:`~sgstore.roads.RoadMap` holds follows: roads, junctions, turns, conflicts, lengths and widths.
+A plain lane has its cross sections in the direction of travel and its related lanes. All other
+parts of a :class:`~sgstore.roads.RoadMap` follow from them: roads, junctions, turns, conflicts,
+lengths and widths.
 """
 
 from __future__ import annotations
@@ -27,39 +28,39 @@ if TYPE_CHECKING:
 
 
 _SIDEWAYS: Final = 0.9
-"""A step of which a larger share than this goes across the lane is a jump."""
+"""A step is a jump if a larger share of it goes across the lane."""
 _FIRST_LANE: Final = 1
-"""Row of the first lane among the nodes: ``off_road`` comes before it."""
+"""Row of the first lane among the nodes: row 0 is ``off_road``."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlainLane:
-    """A lane. Other lanes are named by their number in the list that this one stands in.
+    """Lane with cross sections; other lanes are referred to by their index in the list of lanes.
 
     Attributes
     ----------
     name, type, road, junction : str
-        As :class:`~sgstore.roads.MapNodes` has them.
+        As in :class:`~sgstore.roads.MapNodes`.
     section, number : int
-        Section and lane number in the road; 0 where there is none.
+        Section and lane number in the road, or 0.
     left, right : (n, 2) float64
-        Ends of the cross sections, in the direction of travel; m. Two at least.
+        Ends of the cross sections, in the direction of travel; m. At least two.
     z : (n,) float64
         Heights of the cross sections; m.
     onto : tuple of int
         Lanes that traffic flows on to.
     left_beside, right_beside : tuple of int
-        Lanes that lie beside it, as its own traffic sees them.
+        Lanes next to it, seen in the direction of its traffic.
     against : tuple of int
-        Those of them whose traffic comes the other way.
+        Its neighbours with oncoming traffic.
     changes : tuple of (int, float, float)
-        Lanes that traffic may change to, from where to where along this one; m.
+        Lanes that traffic may change to, with start and end along this lane; m.
     speed_limit : float
-        m/s; NaN where there is none.
+        m/s; NaN if there is no limit.
     roundabout : str
-        The one that its road is in; empty: none.
+        The roundabout of its road, or empty.
     broad : tuple of str
-        ``left``, ``right``: sides on which a broad marking bounds it.
+        ``left``, ``right``: sides with a broad marking.
     """
 
     name: str
@@ -90,17 +91,17 @@ class PlainSignal:
     name, kind : str
         Its id, and one of :data:`sgstore.vocabulary.SIGNALS`.
     x, y, z, heading : float
-        Where it stands and faces; m, rad. NaN: not known.
+        Position and facing direction; m, rad. NaN means unknown.
     lanes : tuple of int
-        Lanes that it applies to, by their number.
+        Lanes that it applies to, by index.
     stops : tuple of (int, float)
-        Lanes on which it has a place, as the line before which one waits, and where along them; m.
+        Lanes with a stopping place before the signal, and the place along each; m.
     is_stop_line : bool
-        Whether it is a line painted on the road.
+        True for a line painted on the road.
     line : (n, 2) float64
-        Its own line; m. Empty: it is a place.
+        Its own line; m. Empty if it is a point.
     speed_limit : float
-        m/s; NaN where it tells none.
+        m/s; NaN if it has none.
     """
 
     name: str
@@ -118,13 +119,13 @@ class PlainSignal:
 
 @dataclass(frozen=True, slots=True)
 class PlainCrosswalk:
-    """A place where people cross.
+    """Pedestrian crossing.
 
     Attributes
     ----------
     name : str
     outline : (n, 2) float64
-        Corners all around; m. Three at least.
+        Corners all around; m. At least three.
     z : float
         Its height; m.
     """
@@ -136,12 +137,12 @@ class PlainCrosswalk:
 
 @dataclass(frozen=True, slots=True)
 class PlainObject(PlainCrosswalk):
-    """What stands beside the lanes, by its outline on the ground.
+    """Object at the side of lanes, as an outline on the ground.
 
     Attributes
     ----------
     name, outline, z
-        As of :class:`PlainCrosswalk`.
+        As in :class:`PlainCrosswalk`.
     kind : str
         One of :data:`OBJECT_KINDS`.
     """
@@ -162,12 +163,12 @@ def road_map_of(
     text: str,
     warnings: Iterable[str] = (),
 ) -> RoadMap:
-    """The road map of plain lanes, signals, crosswalks and objects; ``text`` is what they were read from.
+    """Build the road map of plain lanes, signals, crosswalks and objects from ``text``.
 
     Raises
     ------
     MapError
-        A junction has more lanes than can be looked at in pairs.
+        A junction has too many lanes for a comparison in pairs.
     """
     ribbons = ribbons_of(lanes)
     surfaces = plain_nodes(lanes, ribbons)
@@ -193,7 +194,7 @@ def road_map_of(
         warnings=warnings,
         stops=_stops(signals, first),
         stop_lines=np.array([first + r for r, s in enumerate(signals) if s.is_stop_line], np.int64),
-        # Formats of lanes as lines have 0 where a point has no height.
+        # Formats of lanes as lines use 0 for an unknown height.
         courses=lane_courses(ribbons, ribbons.height if ribbons.z.any() else None),
         broad_lines=broad_lines(
             [
@@ -206,14 +207,14 @@ def road_map_of(
 
 
 def _stops(signals: Sequence[PlainSignal], first: int) -> tuple[Ints, Ints, Floats]:
-    """Signals, as columns among the nodes, lanes on which they have a place, and where."""
+    """Return signals (columns of nodes), the lanes of their stopping places, and the places."""
     rows = [(first + row, *stop) for row, signal in enumerate(signals) for stop in signal.stops]
     column, lane = np.array([one[:2] for one in rows], np.int64).reshape(-1, 2).T
     return column, lane, np.array([along for *_, along in rows], np.float64)
 
 
 def ribbons_of(lanes: Sequence[PlainLane]) -> Ribbons:
-    """The surface of plain lanes."""
+    """Return the surface of plain lanes."""
     counts = np.array([len(lane.z) for lane in lanes], np.int64)
     offsets = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
     left = np.concatenate([np.zeros((0, 2)), *(lane.left for lane in lanes)])
@@ -225,7 +226,7 @@ def ribbons_of(lanes: Sequence[PlainLane]) -> Ribbons:
     step = np.where(first, 0.0, np.hypot(run_x, run_y))
     run = np.cumsum(step)
     along = run - np.repeat(run[offsets[:-1]], counts)
-    # Where a lane jumps to the side, no traffic goes that way.
+    # Traffic does not follow a sideways jump of a lane.
     across_x, across_y = (left - right).T
     aside = np.abs(run_x * across_x + run_y * across_y)
     width = np.hypot(across_x, across_y)
@@ -245,11 +246,11 @@ def ribbons_of(lanes: Sequence[PlainLane]) -> Ribbons:
 
 
 def headings(x: Floats, y: Floats, first: Bools, alone: Floats | None = None) -> Floats:
-    """Headings of polylines at their points: (N,), not wrapped; ``first`` marks where each line begins.
+    """Return headings of polylines at their points, (N,), not wrapped; ``first`` marks line starts.
 
-    A line of one point has that of ``alone``. Within a line it is the mean of the two pieces' directions,
-    weighted by their lengths, so that the cubic through points and headings strays from neither far; at an end
-    it is what the nearest piece would have if it were part of a circle.
+    A line of one point has the heading ``alone``. An inner point has the mean of the directions of
+    both pieces, weighted by their lengths; the cubic through points and headings then stays close
+    to both. An end has the heading of a circle through its piece.
     """
     if not len(x):
         return np.zeros(0)
@@ -265,7 +266,7 @@ def headings(x: Floats, y: Floats, first: Bools, alone: Floats | None = None) ->
     heading = np.where(both, into + turn * share, np.where(after > 0, out, into))
     if alone is not None:
         heading = np.where(total > 0, heading, alone)
-    # A line's ends: as far beyond the piece's direction as its other end is before it.
+    # Ends of a line: mirror the heading of the other end at the direction of the piece.
     starts, ends = np.flatnonzero(~both & (after > 0)), np.flatnonzero(~both & (before > 0))
     for rows, others, pieces in ((starts, starts + 1, out), (ends, ends - 1, into)):
         bend = wrapped(heading[others] - pieces[rows])
@@ -275,7 +276,7 @@ def headings(x: Floats, y: Floats, first: Bools, alone: Floats | None = None) ->
 
 
 def plain_nodes(lanes: Sequence[PlainLane], ribbons: Ribbons) -> MapNodes:
-    """The nodes of plain lanes with these surfaces."""
+    """Return the nodes of plain lanes with these surfaces."""
     every, length = np.arange(len(ribbons)), ribbons.lengths
     middle = ribbons.at(every, length / 2)
     turns = turn_words(turned(ribbons))
@@ -299,7 +300,7 @@ def plain_nodes(lanes: Sequence[PlainLane], ribbons: Ribbons) -> MapNodes:
 
 
 def _road_nodes(lanes: Sequence[PlainLane], ribbons: Ribbons) -> MapNodes:
-    """Roads in the order of their first lanes; a road is as long as the longest lanes of its sections."""
+    """Return roads ordered by first lane; the length is the sum of the longest lanes per section."""
     junction: dict[str, str] = {}
     longest: dict[str, dict[int, float]] = {}
     for lane, length in zip(lanes, ribbons.lengths.tolist(), strict=True):
@@ -335,7 +336,7 @@ def _crosswalk_nodes(crosswalks: Sequence[PlainCrosswalk]) -> MapNodes:
 
 
 def _object_nodes(objects: Sequence[PlainObject]) -> MapNodes:
-    """Objects as the smallest boxes around them, which look along their longer side."""
+    """Return objects as their smallest bounding boxes; the heading is along the longer side."""
     boxes = [shapely.Polygon(one.outline).minimum_rotated_rectangle for one in objects]
     sides = np.array([np.diff(shapely.get_coordinates(box)[:3], axis=0) for box in boxes])
     sides = sides.reshape(-1, 2, 2)
@@ -415,11 +416,11 @@ def _edges(
 
 
 Edge = tuple[str, "Ints", "Ints"]
-"""A relation, and the rows of its sources and destinations among the nodes."""
+"""Relation, with the rows of sources and destinations among the nodes."""
 
 
 def edges_of(parts: Sequence[Edge]) -> MapEdges:
-    """Edges among rows of nodes as edges among node ids, each once, ordered."""
+    """Convert edges between rows of nodes to unique, ordered edges between node ids."""
     code = np.concatenate([np.full(len(src), RELATION_CODE[name]) for name, src, _ in parts])
     src = np.concatenate([s for _, s, _ in parts])
     dst = np.concatenate([d for _, _, d in parts])
@@ -428,7 +429,7 @@ def edges_of(parts: Sequence[Edge]) -> MapEdges:
 
 
 def _spread(groups: Sequence[tuple[int, ...]]) -> Ints:
-    """(n, 2): each row's number with each of its group."""
+    """Return (n, 2): the row of each group with each member of the group."""
     row = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
     return np.column_stack((row, np.array([*chain(*groups)], np.int64)))
 
@@ -446,25 +447,26 @@ def _lane_changes(lanes: Sequence[PlainLane]) -> LaneChanges:
 # Cross sections of lanes that are told as lines: a centre line and its borders --------------------
 
 APART: Final = 0.05
-"""Least distance between points of a line that are kept, and between cross sections; m."""
+"""Least distance between kept points of a line, and between cross sections; m."""
 WIDE: Final = 3.5
-"""Width of a lane of which nothing tells how wide it is; m."""
+"""Default lane width; m."""
 NEIGHBOURS: Final = (2.0, 6.0)
-"""Distances of centre lines between which lanes side by side tell how wide they are; m."""
+"""Range of centre line distances from which the width of neighbouring lanes is derived; m."""
 _LOOKS: Final = 9
-"""Places along a lane at which the distance of those beside it is looked at."""
+"""Number of sample places along a lane for the distance to its neighbours."""
 _STEP: Final = 1.0
-"""Distance of the cross sections of a way through an area; m."""
+"""Distance between the cross sections of a way through an area; m."""
 _FEW: Final = 20_000
-"""Pairs of a place and a piece of a line up to which looking at all of them takes less than a tree."""
+"""Up to this number of pairs (place, piece of a line), brute force is faster than a tree."""
 _AHEAD: Final = 0.2, 0.1, 0.5
-"""How far ahead or behind a cross section the end of a border may be that is taken for it: so many metres, and
-this share of its distance to the side; at the ends of a lane, which need not be square, this share of it."""
+"""Greatest offset along the lane between a cross section and a border end that is used for it:
+metres, and the share of its sideways distance; at the ends of a lane, which can be oblique, the
+last share."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sections:
-    """Cross sections along a line, in its own direction; shape (n, 2) and (n,)."""
+    """Cross sections along a line, in the line's direction; shape (n, 2) and (n,)."""
 
     left: Floats
     right: Floats
@@ -476,18 +478,18 @@ class Sections:
         object.__setattr__(self, "middle", (self.left + self.right) / 2)
 
     def turned_round(self) -> Sections:
-        """The same against the line's direction."""
+        """Return the sections against the line's direction."""
         return Sections(self.right[::-1], self.left[::-1], self.z[::-1])
 
     def up_to(self, left: Floats, right: Floats, z: float) -> Sections:
-        """The same with one more cross section at the end of the line."""
+        """Append a cross section at the end of the line."""
         return Sections(
             np.vstack((self.left, left)), np.vstack((self.right, right)), np.append(self.z, z)
         )
 
 
 def thinned(line: Floats) -> Floats:
-    """A line (n, 3) without points that are closer than :data:`APART` to the one before; its end stays."""
+    """Remove points of a line (n, 3) that are closer than :data:`APART` to the previous one; keep the end."""
     if len(line) < 2:
         return line
     step = np.hypot(*np.diff(line[:, :2], axis=0).T)
@@ -505,15 +507,16 @@ def thinned(line: Floats) -> Floats:
 
 
 def run_of(line: Floats) -> Floats:
-    """(n,): length of a line (n, 2 or 3) up to each of its points, as seen from above; m."""
+    """Return the length (n,) of a line up to each of its points, seen from above; m."""
     return np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))))
 
 
 @dataclass(frozen=True, slots=True)
 class Feet:
-    """The points of lines that are nearest to some places; shape (n,) and (n, 2).
+    """Nearest points on lines to some places; shape (n,) and (n, 2).
 
-    ``along``: length of the line up to there, lines laid end to end. ``is_end``: it is the end of a line.
+    ``along``: length of the line up to the point, with all lines laid end to end. ``is_end``: True
+    at the end of a line.
     """
 
     at: Floats
@@ -522,17 +525,17 @@ class Feet:
 
 
 def sections_between(left: Floats, right: Floats) -> Sections:
-    """Cross sections of a lane from its two borders, by shares of their lengths, at every point of both.
+    """Compute cross sections of a lane from its two borders, at every point of both.
 
     Parameters
     ----------
     left, right : (n, 3) and (m, 3) float64
-        In the direction of the lane, thinned; two points at least.
+        In the direction of the lane, thinned; at least two points.
 
     Notes
     -----
-    Points of both that lie across from one another, to :data:`APART`, are the ends of one cross section, so
-    that the outline of the lane is that of its borders.
+    Opposite points of both borders, up to :data:`APART`, become the ends of one cross section.
+    Therefore the outline of the lane equals its borders.
     """
     runs = run_of(left), run_of(right)
     shares = [run / run[-1] for run in runs]
@@ -555,7 +558,7 @@ def sections_between(left: Floats, right: Floats) -> Sections:
 
 
 def feet(places: Floats, lines: Sequence[Floats]) -> Feet:
-    """Nearest points on lines to places (n, 2); each line has two different points at least."""
+    """Return the nearest points on lines to places (n, 2); each line has at least two different points."""
     start = np.concatenate([line[:-1, :2] for line in lines])
     way = np.concatenate([line[1:, :2] for line in lines]) - start
     x, y = places.T
@@ -583,22 +586,23 @@ def feet(places: Floats, lines: Sequence[Floats]) -> Feet:
 
 
 def along_line(line: Floats, places: Floats) -> Floats:
-    """(n,): lengths of a line up to its points nearest to places (n, 2); m."""
+    """Return the lengths (n,) of a line up to its points nearest to places (n, 2); m."""
     return feet(places, [line]).along
 
 
 def cross_sections(
     centre: Floats, lefts: Sequence[Floats], rights: Sequence[Floats], half: float
 ) -> tuple[Sections, bool]:
-    """Cross sections of a lane, and whether its borders say how wide it is.
+    """Compute cross sections of a lane; the flag is True if its borders define the width.
 
     Parameters
     ----------
     centre : (n, 3) float64
-        Centre line, thinned; two points at least.
+        Centre line, thinned; at least two points.
     lefts, rights : sequence of (k, 3) float64
-        Borders to its left and right, thinned, as many pieces as there are, in any order. Where only one
-        side has any, the other lies as far away; where none has, both lie ``half`` away.
+        Thinned borders on its left and right, as any number of pieces in any order. If only one
+        side has a border, the other side has the same distance; without any border, both distances
+        are ``half``.
     half : float
         m.
     """
@@ -626,7 +630,7 @@ def cross_sections(
 
 
 def _cuts(run: Floats, more: Sequence[Floats]) -> Floats:
-    """Places along a line where it is cut: at its own points, and at others that are not too close to one."""
+    """Return cut places along a line: its own points, and others that are not too close to them."""
     inner = np.concatenate([run[1:-1], *more])
     own = np.arange(len(inner)) < len(run) - 2
     inside = (inner > APART) & (inner < run[-1] - APART)
@@ -649,7 +653,7 @@ class _Side:
 
 
 def _side(places: Floats, ahead: Floats, aside: Floats, borders: Sequence[Floats]) -> _Side | None:
-    """Ends of the cross sections through places on one side; ``None`` if no border is beside any of them."""
+    """Return the ends of the cross sections on one side, or ``None`` without a border on this side."""
     if not borders:
         return None
     found = feet(places, borders)
@@ -662,14 +666,14 @@ def _side(places: Floats, ahead: Floats, aside: Floats, borders: Sequence[Floats
     if not beside.any():
         return None
     rows: Ints = np.flatnonzero(beside)
-    # Where a border is missing the lane stays as wide as it is beside the next piece of it.
+    # A lane without a border keeps the width at the nearest piece of its border.
     away = np.where(beside, away, np.interp(np.arange(len(away)), rows, away[rows]))
     points = np.where(beside[:, None], nearest, places + aside * away[:, None])
     return _Side(points, away)
 
 
 def half_width(centre: Floats, others: Sequence[Floats]) -> float:
-    """Half the width of a lane without borders, from the centre lines of the lanes beside it; m."""
+    """Return half the width of a lane without borders, from the centre lines of its neighbours; m."""
     run = run_of(centre)
     places = np.linspace(0.0, run[-1], _LOOKS)
     middle = np.column_stack([np.interp(places, run, column) for column in centre[:, :2].T])
@@ -687,9 +691,9 @@ def half_width(centre: Floats, others: Sequence[Floats]) -> float:
 def way_between(
     start: tuple[Floats, float, float, float], end: tuple[Floats, float, float, float]
 ) -> Sections:
-    """A lane from one place to another: place (2,), heading, width and height at both ends.
+    """Return a lane between two places: position (2,), heading, width and height of both ends.
 
-    The cubic whose tangents are as long as they would be on a part of a circle of that turn.
+    Its centre line is a cubic; the lengths of its tangents are those of an arc with the same turn.
     """
     (p0, heading0, width0, z0), (p1, heading1, width1, z1) = start, end
     chord = float(np.hypot(*(p1 - p0)))
@@ -716,15 +720,15 @@ def way_between(
 # Lines painted across lanes ----------------------------------------------------------------------
 
 _ON_LANE: Final = 0.1
-"""How far a stop line may be from the centre line of a lane to lie on it; m."""
+"""Greatest distance between a stop line and the centre line of its lane; m."""
 _AT_START: Final = 0.5
-"""A line this close to the start of a lane belongs to the lane before, if it lies on it too; m."""
+"""A line this close to the start of a lane belongs to the previous lane, if it is on that lane too; m."""
 
 
 def painted_across(lanes: Sequence[PlainLane], lines: Sequence[Floats]) -> list[dict[int, float]]:
-    """The lanes of motor traffic on which each of some lines (n, 2 or 3) lies, and where along them; m.
+    """For each painted line (n, 2 or 3), find the lanes for motor traffic and the place along each; m.
 
-    Where one lane ends and the next begins a line lies on the first.
+    A line between two consecutive lanes belongs to the first.
     """
     found: list[dict[int, float]] = [{} for _ in lines]
     rows = [row for row, lane in enumerate(lanes) if lane.type in DRIVING]

@@ -1,4 +1,4 @@
-"""The loop over footprints and quadrangles of lanes, for numba; ``_footprints`` does the same in numpy."""
+"""Loop over footprints and quadrangles of lanes, for numba; ``_footprints`` has the same in numpy."""
 
 # ruff: noqa: PLR0913, PLR0917
 
@@ -27,19 +27,19 @@ def touching(
     turn: Floats,
     touch: float,
 ) -> tuple[Ints, Ints, Bools, Floats]:
-    """Footprints and quadrangles that touch: rows, quadrangles, whether the centre is inside, and numbers.
+    """Return pairs that touch: rows, quadrangles, mask of centres inside, and numbers.
 
     Parameters
     ----------
     rows : (R,) int64
-        Footprints asked about.
+        Footprints to look up.
     cells : tuple of (2, R) int64
-        First and last cells of the grid that they are in.
+        First and last cells of their grid rectangle.
     shapes : tuple of (N,) float64
         ``x, y, cos, sin, a, b`` of footprints.
     grid : tuple
-        Keys of cells, ascending, where their quadrangles begin, these quadrangles, cells in a column, and
-        (2, Q) the first cell of each quadrangle.
+        Keys of cells, ascending; start of the quadrangles of each cell; these quadrangles; cells
+        per column; and the first cell (2, Q) of each quadrangle.
     circles : tuple of (Q,) float64
         Around quadrangles.
     corners : (Q, 8) float64
@@ -89,7 +89,7 @@ def touching(
 
 @compiled
 def _counts(cell_x: int, cell_y: int, first: Ints, quad_first: Ints) -> bool:
-    """Return whether a quadrangle counts in a cell: all in a footprint's first, else those that begin there."""
+    """True if a quadrangle counts in a cell: in the first cell always, in others only if it begins there."""
     if cell_x > first[0] and quad_first[0] != cell_x:
         return False
     return cell_y == first[1] or quad_first[1] == cell_y
@@ -97,7 +97,7 @@ def _counts(cell_x: int, cell_y: int, first: Ints, quad_first: Ints) -> bool:
 
 @compiled
 def _doubled(found: Ints, inside: Bools, numbers: Floats) -> tuple[Ints, Bools, Floats]:
-    """The same with twice the room."""
+    """Copy the arrays into arrays of twice the size."""
     return (
         np.concatenate((found, np.empty_like(found))),
         np.concatenate((inside, np.empty_like(inside))),
@@ -107,7 +107,7 @@ def _doubled(found: Ints, inside: Bools, numbers: Floats) -> tuple[Ints, Bools, 
 
 @compiled
 def _place(corners: Floats, shapes: Shapes, row: int, at_x: Floats, at_y: Floats) -> None:
-    """Fill in the corners of a quadrangle in the axes of a footprint."""
+    """Write the corners of a quadrangle in the axes of a footprint."""
     x, y, cos, sin, _, _ = shapes
     for corner in range(4):
         dx, dy = corners[corner] - x[row], corners[4 + corner] - y[row]
@@ -119,7 +119,7 @@ def _place(corners: Floats, shapes: Shapes, row: int, at_x: Floats, at_y: Floats
 def _meets(
     x: Floats, y: Floats, size: tuple[float, float], turn: float, touch: float
 ) -> tuple[bool, bool]:
-    """Return whether no axis separates them, and whether the footprint's centre is in the quadrangle."""
+    """Return True if they touch, and True if the footprint's centre is in the quadrangle."""
     a, b = size[0] + touch, size[1] + touch
     if x.min() > a or x.max() < -a or y.min() > b or y.max() < -b:
         return False, False
@@ -136,7 +136,7 @@ def _meets(
 
 @compiled
 def _beside(x: Floats, y: Floats) -> tuple[float, float]:
-    """Place of the centre along the centre line, and squared distance."""
+    """Return the place of the centre along the centre line, and the squared distance."""
     from_x, from_y = (x[0] + x[3]) / 2, (y[0] + y[3]) / 2
     along_x, along_y = (x[1] + x[2]) / 2 - from_x, (y[1] + y[2]) / 2 - from_y
     share = -(from_x * along_x + from_y * along_y) / max(along_x**2 + along_y**2, 1e-18)
@@ -146,7 +146,7 @@ def _beside(x: Floats, y: Floats) -> tuple[float, float]:
 
 @compiled
 def _common_area(corner_x: Floats, corner_y: Floats, size: tuple[float, float]) -> float:
-    """Area of the footprint in the quadrangle."""
+    """Return the common area of footprint and quadrangle."""
     a, b = size
     area = 0.0
     for i in range(4):

@@ -39,23 +39,23 @@ if TYPE_CHECKING:
 # Distances along the lanes, over ``travelsTo`` ------------------------------------------------------
 
 FARTHEST: Final = 200.0
-"""How far along the lanes is looked from one entity to another; m. The view ``pairs`` has it too."""
+"""Greatest search distance along the lanes from one entity to another; m. The view ``pairs`` uses it too."""
 _CELL: Final = 32.0
-"""Side of the squares of a grid, which tells bodies that are far from all crosswalks; m."""
+"""Cell size of the grid that finds bodies far from all crosswalks; m."""
 _MOST_CELLS: Final = 1 << 16
 _PREPARED: Final = Lock()
-"""What is prepared of shapes is not made by two threads at once."""
+"""Only one thread at a time prepares shapes."""
 
 _MOST_AT_ONCE: Final = 1 << 22
-"""Pairs of lanes whose distances are held at a time."""
+"""Pairs of lanes whose distances are in memory at a time."""
 
 
 def _downstream(
     lengths: Floats, src: Ints, dst: Ints, limit: float
 ) -> Iterator[tuple[Ints, Ints, Floats]]:
-    """Lanes, those whose start lies within a limit of their end, and how far; some lanes at a time.
+    """Yield chunks of lane, lane within ``limit`` after its end, and the distance.
 
-    Traffic flows on from ``src`` to ``dst``. The fronts of all lanes advance together, lane by lane.
+    Traffic flows from ``src`` to ``dst``. The fronts of all lanes advance together, lane by lane.
     """
     order = np.lexsort((dst, src))
     onward, first = dst[order], np.searchsorted(src[order], np.arange(len(lengths) + 1))
@@ -89,37 +89,27 @@ def point_shapes(x: Floats, y: Floats) -> NDArray[np.object_]:
 
 
 def within(outline: Any, places: Floats) -> NDArray[np.bool_]:
-    """(N,) bool: which of (N, 2) places lie in a shapely polygon."""
+    """Return a mask (N,) of the places (N, 2) inside a shapely polygon."""
     return np.asarray(shapely.contains_xy(outline, *places.T), np.bool_)
 
 
 # The words for the turns of lanes, whatever a map was read from ---------------------------------
 
 STRAIGHT: Final = np.radians(30.0)
-"""A lane through a junction that turns by less goes straight on; rad."""
+"""A lane through a junction with a smaller turn goes straight on; rad."""
 
 
 def turn_words(turn: Floats) -> list[str]:
-    """``left``, ``right`` or ``straight`` for lanes that turn by so much, positive to the left; rad."""
+    """Return ``left``, ``right`` or ``straight`` for turn angles, positive to the left; rad."""
     words = np.where(turn > STRAIGHT, "left", np.where(turn < -STRAIGHT, "right", "straight"))
     return list(map(str, words))
 
 
-# RoadMap: lanes, roads, junctions, crosswalks and signals as arrays, with look-ups for many things at once
-# ------------------------------------------------------------------------------------------------
-# A map is read once (:mod:`sgstore.opendrive`), is never changed, and is asked in bulk: which lanes do
-# these thousand footprints touch, which parts of the map lie around these sixty egos. Every answer is a set,
-# because lanes overlap in junctions and storeys lie above one another.
-#
-# Nodes. Every part of a map that can be a node of a scene graph has a node id below zero: ``off_road`` is
-# -1, then come lanes, roads, junctions, roundabouts, crosswalks, signals and objects, in this order. ``nodes``
-# lists them all.
-
 OFF_ROAD: Final = -1
-"""Node id of the single node that stands for whatever is not a driving lane."""
+"""Node id of the single node for all places outside driving lanes."""
 
 STOREY: Final = 2.5
-"""Greatest difference of height at which a footprint can be in a lane; m."""
+"""Greatest difference of height between a footprint and its lane; m."""
 
 Geometries = NDArray[np.object_]
 """An array of shapely geometries."""
@@ -127,39 +117,39 @@ Geometries = NDArray[np.object_]
 _FIRST_LANE: Final = OFF_ROAD - 1
 _QUADRANT: Final = np.pi / 4
 _MOST_PRESENT: Final = 1 << 24
-"""Nodes times points that are looked at in one go."""
+"""Greatest number of (node, point) pairs processed at once."""
 _CORNERS: Final = 8
-"""Corners of a shape by which is told that it is near."""
+"""Corners of a shape for the quick test of nearness."""
 _TOUCH: Final = 1e-6
-"""What is no closer to a distance than this needs no exact answer; m."""
+"""Distances that differ by less need no exact test; m."""
 _MERGED: Final = " without sections"
-"""What the variant of a map ends in whose lanes are one node for all sections."""
+"""Suffix of the variant of a map with one node for all sections of a lane."""
 
 
 @dataclass(frozen=True, slots=True)
 class MapNodes:
-    """All nodes of a map, one row a node, in order of descending node id: row i has node id -1 - i.
+    """All nodes of a map, ordered by descending node id: row i has node id -1 - i.
 
     Attributes
     ----------
     kind : (K,) int8
         Codes of :data:`sgstore.vocabulary.KINDS`.
     name : tuple of str
-        ``road/section/lane`` of a lane, else the id that the map gives it; ``off_road``.
+        ``road/section/lane`` of a lane, else the id in the map; ``off_road``.
     x, y, z, heading : (K,) float64
-        A point on it and its direction there (a lane: the middle of its centre line, in the direction of
-        travel). NaN for ``off_road``, and where there is none.
+        A point on it and its direction there (a lane: the middle of its centre line, in the
+        direction of travel). NaN for ``off_road`` and for unknown places.
     lane_type : tuple of str
-        ``driving``, ``sidewalk``, … as OpenDRIVE has it; empty for what is no lane.
+        ``driving``, ``sidewalk``, … as in OpenDRIVE; empty for other nodes.
     road, junction, turn : tuple of str
-        Ids of the road and of the junction it belongs to; ``left``, ``right``, ``straight`` for a lane in a
-        junction; empty where there is none.
+        Ids of its road and junction; ``left``, ``right``, ``straight`` for a lane in a junction.
+        Empty if there is none.
     section, lane : (K,) int64
-        Section and lane number in the road; 0 for what is no lane.
+        Section and lane number in the road; 0 for other nodes.
     length, width, speed_limit : (K,) float64
-        m, mean m, m/s; NaN where there is none.
+        m, mean m, m/s; NaN if unknown.
     curvature : (K,) float64
-        Of the centre line at a waypoint, positive to the left; 1/m. NaN for what is none.
+        Curvature of the centre line at a waypoint, positive to the left; 1/m. NaN for other nodes.
     """
 
     kind: Codes
@@ -184,7 +174,10 @@ class MapNodes:
 
     @classmethod
     def of(cls, kind: str | Sequence[str], name: Sequence[str], **columns: Any) -> MapNodes:
-        """Nodes of one kind, or one each, from the columns at hand; others are missing (empty, 0, NaN)."""
+        """Make nodes from the available columns; missing columns are empty, 0 or NaN.
+
+        ``kind``: one, or one per node.
+        """
         n = len(name)
         kinds = [kind] * n if isinstance(kind, str) else kind
         missing: dict[str, Any] = {"section": np.zeros(n, np.int64), "lane": np.zeros(n, np.int64)}
@@ -199,7 +192,7 @@ class MapNodes:
         return cls(**(values | columns))
 
     def take(self, rows: Ints) -> MapNodes:
-        """Some of the nodes, in the order given."""
+        """Return these rows, in this order."""
         return taken(self, rows)
 
 
@@ -225,23 +218,23 @@ class MapEdges:
 
 @dataclass(frozen=True, slots=True)
 class LaneHits:
-    """Pairs of a footprint and a lane that it touches; one row a touch, ordered by footprint; shape (H,).
+    """Pairs of a footprint and a lane that touch, ordered by footprint; shape (H,).
 
     Attributes
     ----------
     row : int64
-        The footprint, as a row of the question.
+        Row of the footprint in the query.
     lane : int64
         Node id of the lane.
     overlap : float64
-        Share of the footprint's area that lies in the lane, 0 … 1.
+        Share of the footprint's area in the lane, 0 … 1.
     offset : float64
-        Lateral offset of the footprint's centre from the lane's centre line, positive to the left of the
-        direction of travel; m.
+        Lateral offset of the footprint's centre from the lane's centre line, positive to the left
+        of the direction of travel; m.
     heading_error : float64
         Heading of the footprint less the direction of travel there, in (-π, π]; rad.
     primary : bool
-        True for one hit of each footprint that has a hit: centre inside first, then the smaller heading
+        True for the best lane of each footprint: centre inside first, then the smaller heading
         error (by quadrants of 45°), then the larger overlap, then the lower lane.
     """
 
@@ -255,7 +248,7 @@ class LaneHits:
 
 @dataclass(frozen=True, slots=True)
 class LaneChanges:
-    """Stretches where traffic may change from one lane to the one beside it; one row each, shape (n,).
+    """Stretches where traffic may change to a neighbouring lane; shape (n,).
 
     Attributes
     ----------
@@ -275,13 +268,13 @@ class LaneChanges:
 
     @classmethod
     def none(cls) -> LaneChanges:
-        """No permission anywhere."""
+        """Return an empty table: no permitted lane changes."""
         no_lanes, nowhere = np.zeros(0, np.int64), np.zeros(0)
         return cls(no_lanes, no_lanes, nowhere, nowhere)
 
 
 class RoadMap:
-    """A road map. See the module for what it holds and how its nodes are numbered.
+    """A road map: nodes, edges and lane surfaces, with geometric look-ups.
 
     Parameters
     ----------
@@ -291,51 +284,53 @@ class RoadMap:
     ribbons : Ribbons
         The surface of the lanes, in the order of their nodes.
     shapes : (K,) object
-        Geometries of the nodes that are neither lanes nor made of lanes; ``None`` where there is none.
+        Geometries of the nodes, or ``None`` for lanes and for nodes that consist of lanes.
     lane_changes : LaneChanges, optional
     road_types, junction_types, controllers : mapping, optional
     warnings : iterable of str, optional
     stops : (m,) int64, int64 and float64, optional
-        Signals, as columns among the nodes, lanes that they apply to, counted from 0, and where along these; m.
+        Signals (columns of the nodes), lanes that they apply to (from 0), and the place along
+        these; m.
     stop_lines : (n,) int64, optional
         Columns of the signals that are painted stop lines.
     courses : LaneCourses, optional
     broad_lines : MapPlaces, optional
-        Broad markings beside lanes.
+        Broad markings at the sides of lanes.
     variant : str, optional
-        In what it differs from the map that the text alone describes.
+        Difference from the map that the text describes.
 
     Attributes
     ----------
     name : str
-        What people call it: the file's name, or the name in the map's header.
+        Its name for people: the file name, or the name in the map's header.
     text : str
-        The text it was read from.
+        The source text.
     digest : str
-        SHA-256 of the text and the variant, in hexadecimal digits: what identifies the map.
+        SHA-256 of text and variant, in hexadecimal digits: the identity of the map.
     nodes : MapNodes
     edges : MapEdges
         Static relations: ``isIn`` (lane → road, road → junction or roundabout), ``travelsTo``, ``opposes``,
         ``toLeftOf``, ``toRightOf``, ``laneChange``, ``conflictsWith`` among lanes, ``controlsTrafficOf``
         (signal → lane).
     ribbons : Ribbons
-        The surface of the lanes. Lane i of it, and wherever lanes are counted from 0, has node id -2 - i.
+        The surface of the lanes. Lane i (wherever lanes are counted from 0) has node id -2 - i.
     lane_changes : LaneChanges
-        Where along their lanes the ``laneChange`` edges hold.
+        Stretches of the ``laneChange`` edges along their lanes.
     courses : LaneCourses
-        Curvature and slope of the lanes, metre by metre. Of a map without sections there are none.
+        Curvature and slope of the lanes, metre by metre. Empty for a map without sections.
     road_types : mapping of str to tuple of (float, str)
-        Id of a road → what it is (``town``, ``motorway``, …) from which place along its reference line on; m.
+        Id of a road → its types (``town``, ``motorway``, …) and the start of each along its
+        reference line; m.
     junction_types : mapping of str to str
         Id of a junction → ``default``, ``direct``, ``virtual``, …
     controllers : mapping of str to tuple of str
-        Id of a controller → ids of the signals that it switches together.
+        Id of a controller → ids of the signals that it switches.
     warnings : tuple of str
-        Defects of the map that were passed over, each with its road.
+        Tolerated defects of the map, each with its road.
     """
 
     _ways: tuple[float, tuple[Ints, Ints, Floats]] | None = None
-    """A limit, and what :meth:`downstream` answered."""
+    """Limit and last result of :meth:`downstream`."""
 
     def __init__(  # noqa: PLR0913 (a map is all of this)
         self,
@@ -378,27 +373,28 @@ class RoadMap:
         self._lanes = len(ribbons.offsets) - 1
 
     def outlines(self) -> Geometries:
-        """(K,) shapely polygons, lines or points of the nodes; ``None`` for what has no extent of its own.
+        """Return shapely polygons, lines or points of the nodes, (K,); ``None`` for nodes without a shape.
 
-        Roads, junctions and ``off_road`` have none: a road is its lanes.
+        Roads, junctions and ``off_road`` have no shape: a road consists of its lanes.
         """
         return self._outlines.copy()
 
     def lanes_of(self, boxes: Floats, z: Floats) -> LaneHits:
-        """Lanes, of any type, that footprints touch on their storey.
+        """Return the lanes, of any type, that footprints touch on their storey.
 
         Parameters
         ----------
         boxes : (N, 5) float64
-            ``x, y, heading, length, width`` of each footprint; m, m, rad, m, m. A length or width that is 0 or
-            NaN makes it a point or a line. A NaN in ``x, y`` touches nothing.
+            ``x, y, heading, length, width`` of each footprint; m, m, rad, m, m. A footprint with
+            length or width 0 or NaN is a point or a line. A footprint with NaN in ``x, y`` touches
+            nothing.
         z : (N,) float64
             Height of the footprint's centre *on the ground* (the bottom of the box); m. NaN: any storey.
 
         Notes
         -----
-        What is within 1 mm of a lane touches it. On a lane the storey is that of the place beside the
-        footprint's centre. A heading error in a lane that bends is taken there, too.
+        A footprint within 1 mm of a lane touches it. Its height is compared with the lane at the
+        footprint's centre. The heading error in a bend is taken there, too.
         """
         touches = self._index.touches(np.asarray(boxes, np.float64), np.asarray(z, np.float64))
         quadrant = np.floor(np.abs(touches.heading_error) / _QUADRANT)
@@ -416,7 +412,7 @@ class RoadMap:
         )
 
     def crosswalks_of(self, boxes: Floats, z: Floats) -> tuple[Ints, Ints]:
-        """Rows of ``boxes`` and node ids of the crosswalks that they touch, ordered by row.
+        """Return rows of ``boxes`` and node ids of the crosswalks that they touch, ordered by row.
 
         Boxes and heights as in :meth:`lanes_of`.
         """
@@ -436,9 +432,10 @@ class RoadMap:
         return row[order], -1 - column[order]
 
     def near(self, x: Floats, y: Floats, radius: float) -> tuple[Ints, Ints]:
-        """Rows of the points and node ids of all parts of the map (but ``off_road``) within ``radius`` of them.
+        """Return rows of the points, and node ids of all parts (except ``off_road``) within ``radius``.
 
-        A road or a junction is near when one of its lanes is. Ordered by row, and from the first node on.
+        A road or junction is near if one of its lanes is near. Ordered by row and by descending
+        node id.
         """
         rows, columns = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
         places = np.column_stack((x, y))
@@ -451,12 +448,12 @@ class RoadMap:
         return np.concatenate(rows), -1 - np.concatenate(columns)
 
     def _present(self, places: Floats, radius: float) -> Bools:
-        """(N, K): which nodes lie within ``radius`` of which places (N, 2)."""
+        """Return a mask (N, K) of the nodes within ``radius`` of the places (N, 2)."""
         columns, tree = self._extents
         finite = np.flatnonzero(np.isfinite(places).all(axis=1))
         low, high = places[finite] - radius, places[finite] + radius
         row, place = tree.query(shapely.box(*low.T, *high.T))
-        # Most are told by their boxes, and by some of their corners; shapes are asked of the others only.
+        # Boxes and some corners decide most pairs; only the other pairs need exact shapes.
         box, corners = self._corners
         at = places[finite][row]
         aside = np.maximum(np.maximum(box[place, :2] - at, at - box[place, 2:]), 0)
@@ -477,18 +474,18 @@ class RoadMap:
         return present
 
     def near_shapes(self, corners: Floats, distance: float) -> tuple[Ints, Ints]:
-        """Rows of lines or polygons and node ids of the parts of the map within ``distance`` of them.
+        """Return rows of lines or polygons, and node ids of the parts within ``distance`` of them.
 
         Parameters
         ----------
         corners : (N, V, 2) float64
-            Ends of lines (V = 2), or corners of simple polygons, all around; m.
+            Ends of lines (V = 2), or corners of simple polygons; m.
         distance : float
             m.
 
         Notes
         -----
-        Roads, junctions and ``off_road`` have no shape of their own and are near nothing.
+        Roads, junctions and ``off_road`` have no shape and are never near.
         """
         make = shapely.linestrings if corners.shape[1] == 2 else shapely.polygons
         shapes: Any = make(corners)
@@ -498,9 +495,9 @@ class RoadMap:
         return row[order], -1 - columns[place][order]
 
     def lanes_of_signal(self, signal: str) -> Ints:
-        """Node ids of the driving lanes that an OpenDRIVE signal applies to; empty for an unknown id.
+        """Return node ids of the driving lanes that a signal applies to; empty for an unknown id.
 
-        The lanes of a signal that the map does not have may be told by :func:`lanes_ref` instead of its id.
+        For a signal that is missing in the map, :func:`lanes_ref` can replace its id.
         """
         if signal.startswith(_LANES_REF):
             names = _names_in(signal)
@@ -514,7 +511,7 @@ class RoadMap:
         return self._controlled.get(signal, np.zeros(0, np.int64))
 
     def waypoints(self, spacing: float) -> LanePoints:
-        """Points along the centre lines of all lanes, every ``spacing`` metres from each lane's start.
+        """Return points along the centre lines of all lanes, every ``spacing`` metres from each lane's start.
 
         Raises
         ------
@@ -525,11 +522,11 @@ class RoadMap:
 
     @cached_property
     def without_sections(self) -> RoadMap:
-        """The same map with one node for all lanes of a number in a road, whatever their section.
+        """Return the map with one node for all sections of a lane.
 
-        The node is that of the first of them, by the name ``road_number``. The nodes of the others stay, so
-        that node ids mean the same, without any edge. What is asked of the surface is still told by section.
-        It is another map: it has another digest.
+        The node is the one of the first section, with the name ``road_number``. The other nodes
+        stay, without edges; node ids keep their meaning. Surface queries still distinguish
+        sections. The result is another map with another digest.
         """
         nodes, same = self.nodes, first_sections(self.nodes)
         first = same == np.arange(len(nodes))
@@ -559,9 +556,9 @@ class RoadMap:
         )
 
     def downstream(self, limit: float) -> tuple[Ints, Ints, Floats]:
-        """Lanes whose start lies at most ``limit`` metres beyond the end of lanes, along ``travelsTo``.
+        """Return lanes that start at most ``limit`` metres after the end of a lane, along ``travelsTo``.
 
-        The last answer is kept: to ask again for the same limit costs nothing.
+        The last result is cached: a second call with the same limit is free.
 
         Returns
         -------
@@ -581,19 +578,21 @@ class RoadMap:
 
     @cached_property
     def reach(self) -> tuple[Ints, Ints, Floats]:
-        """Starts of lanes, measured along other lanes from whose start one can drive there, or back.
+        """Return the starts of lanes, measured along the lanes from which they can be reached.
 
         Returns
         -------
         lane, other : (n,) int64
-            Node ids. A lane stands beside itself too; two lanes come twice where one can drive either way.
+            Node ids. Each lane also occurs with itself; two lanes occur twice if both directions
+            are drivable.
         start : (n,) float64
-            Of ``other``, along the lanes from the start of ``lane``; negative where one drives from ``other``
-            to ``lane``; m. No more than :data:`FARTHEST` lies between the end of one and the start of the next.
+            Start of ``other``, along the lanes from the start of ``lane``; negative if the way
+            leads from ``other`` to ``lane``; m. At most :data:`FARTHEST` between the end of one and
+            the start of the next.
 
         Notes
         -----
-        Of a map without sections there is none: places along its lanes are told by section.
+        Empty for a map without sections: places along its lanes refer to sections.
         """
         if _MERGED in self._variant:
             return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
@@ -607,9 +606,9 @@ class RoadMap:
 
     @cached_property
     def places(self) -> MapPlaces:
-        """Places of junctions, roundabouts, zones, broad lines, crosswalks and signals along the lanes.
+        """Return places of junctions, roundabouts, zones, broad lines, crosswalks and signals along the lanes.
 
-        Of a map without sections there is none, as of :attr:`reach`.
+        Empty for a map without sections, as :attr:`reach`.
         """
         nodes, lanes = self.nodes, slice(1, 1 + self._lanes)
         if not self._lanes or _MERGED in self._variant:
@@ -636,7 +635,7 @@ class RoadMap:
         )
 
     def _on_roundabouts(self) -> MapPlaces:
-        """Roundabouts on the lanes of their roads, all along."""
+        """Return roundabouts as whole lanes of their roads."""
         (lane, road), (part, whole) = self._containment
         around = np.flatnonzero(self.nodes.kind[whole] == KIND_CODE["roundabout"])
         of_road: dict[int, list[int]] = {}
@@ -653,7 +652,7 @@ class RoadMap:
         )
 
     def _on_zones(self) -> MapPlaces:
-        """Merge and departure zones on the lanes that they are on."""
+        """Return merge and departure zones along their lanes."""
         lanes = slice(1, 1 + self._lanes)
         pairs = {
             name: (-2 - self.edges.src[on], -2 - self.edges.dst[on])
@@ -687,9 +686,9 @@ class RoadMap:
 
     @cached_property
     def _crosswalks(self) -> tuple[Ints, shapely.STRtree, Ints | None]:
-        """Columns of the crosswalks, their shapes, and the cells where a body up to a cell long may touch one.
+        """Return crosswalk columns, shapes, and the cells near a crosswalk for bodies up to a cell long.
 
-        ``None``: there are too many cells.
+        The cells are ``None`` if there are too many.
         """
         columns = np.flatnonzero(self.nodes.kind == KIND_CODE["crosswalk"])
         shapes = self._shapes[columns]
@@ -705,7 +704,7 @@ class RoadMap:
 
     @cached_property
     def _corners(self) -> tuple[Floats, Floats]:
-        """Boxes around the shapes of :attr:`_extents`, (M, 4), and some corners of each, (M, C, 2); m."""
+        """Return boxes (M, 4) around the shapes of :attr:`_extents`, and some corners (M, C, 2) of each; m."""
         _, tree = self._extents
         every, shape = shapely.get_coordinates(tree.geometries, return_index=True)
         count = np.bincount(shape, minlength=len(tree.geometries))
@@ -719,12 +718,12 @@ class RoadMap:
         outlines = self._outlines
         columns = np.flatnonzero(~shapely.is_missing(outlines))
         tree = shapely.STRtree(outlines[columns])
-        shapely.prepare(tree.geometries)  # then a distance does not go by all sides of an outline
+        shapely.prepare(tree.geometries)  # Prepared shapes make distances fast.
         return columns, tree
 
     @cached_property
     def _containment(self) -> tuple[tuple[Ints, Ints], ...]:
-        """Columns of what is in something, and of what it is in: lanes in roads, then roads in others."""
+        """Return columns of children and parents: lanes in roads, then roads in junctions or roundabouts."""
         inside = self.edges.relation == RELATION_CODE["isIn"]
         child, parent = -1 - self.edges.src[inside], -1 - self.edges.dst[inside]
         lane = self.nodes.kind[child] == KIND_CODE["lane"]
@@ -741,7 +740,7 @@ _LANES_REF: Final = "lanes:"
 
 
 def lanes_ref(names: Iterable[str]) -> str:
-    """Stand-in for the id of a signal that a map does not have, but of which the lanes are known by name."""
+    """Return a substitute for the id of a signal that is missing in the map, from lane names."""
     return _LANES_REF + json.dumps(list(names), ensure_ascii=False)
 
 
@@ -754,18 +753,18 @@ def _names_in(ref: str) -> set[str]:
 
 
 def first_sections(nodes: MapNodes) -> Ints:
-    """(K,): column of the first lane with the road and the number of each lane; of other nodes their own."""
+    """Map each lane to the first lane with its road and number, other nodes to themselves; (K,)."""
     same = np.arange(len(nodes))
     first: dict[tuple[str, int], int] = {}
     for column in np.flatnonzero(nodes.kind == KIND_CODE["lane"]).tolist():
         key = nodes.road[column], int(nodes.lane[column])
-        if key[1]:  # what is numbered in no section, as parking spaces are, stays as it is
+        if key[1]:  # lanes without a number in a section, such as parking spaces, stay
             same[column] = first.setdefault(key, column)
     return same
 
 
 def merged_edges(edges: MapEdges, same: Ints) -> MapEdges:
-    """Edges among the nodes that stand for others, each once; ``same`` as of :func:`first_sections`."""
+    """Return unique edges between the representative nodes of :func:`first_sections`."""
     src, dst = -1 - same[-1 - edges.src], -1 - same[-1 - edges.dst]
     table = np.column_stack([edges.relation.astype(np.int64), src, dst])[src != dst]
     relation, src, dst = np.unique(table, axis=0).reshape(-1, 3).T
@@ -773,7 +772,7 @@ def merged_edges(edges: MapEdges, same: Ints) -> MapEdges:
 
 
 def _cells(places: Floats) -> Ints:
-    """Numbers of the squares of a grid in which places (N, 2) lie."""
+    """Return the grid cell numbers of places (N, 2)."""
     return _numbered(_floor(places / _CELL))
 
 
@@ -782,12 +781,12 @@ def _floor(places: Floats) -> Ints:
 
 
 def _numbered(cells: Ints) -> Ints:
-    """One number for each square (N, 2); a few share one."""
+    """Return a number for each square (N, 2); a few squares may share a number."""
     return cells[:, 0] << 32 ^ cells[:, 1]
 
 
 def _rectangles(boxes: Floats) -> Geometries:
-    """Footprints as polygons; a side that is missing or 0 is made a tenth of a millimetre long."""
+    """Return footprints as polygons; a missing or zero side becomes 0.1 mm long."""
     half = np.maximum(np.nan_to_num(np.abs(boxes[:, 3:5])) / 2, 5e-5)
     heading = np.nan_to_num(boxes[:, 2])
     cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
@@ -804,7 +803,7 @@ def _rectangles(boxes: Floats) -> Geometries:
 
 @dataclass(frozen=True, slots=True)
 class MapCount:
-    """So many parts of a map, of one kind.
+    """Number of parts of a map, of one kind.
 
     Attributes
     ----------
@@ -814,7 +813,7 @@ class MapCount:
         Type of the lanes, roads or junctions; kind of the signals or objects; text of the warning.
     count : int
     length : float or None
-        Of all of them together; m.
+        Total length; m.
     """
 
     part: str
@@ -824,9 +823,9 @@ class MapCount:
 
 
 def summary(road_map: RoadMap) -> list[MapCount]:
-    """Contents of a road map: lanes by type, the most first, and so on; last what was passed over.
+    """Summarise a road map: lanes by type, most frequent first, other parts, and warnings last.
 
-    A road that is of several types one after another counts under each, with the length that it has of it.
+    A road with several types counts under each type, with its length of that type.
     """
     nodes = road_map.nodes
     kinds = [KINDS[int(code)] for code in nodes.kind]
@@ -854,7 +853,7 @@ def _of(kinds: list[str], kind: str) -> list[int]:
 
 
 def _measured(part: str, lengths: Iterable[tuple[str, float]]) -> list[MapCount]:
-    """Kinds with their lengths as parts, the kind that there is most of first."""
+    """Count the parts and add up their lengths per kind, longest kind first."""
     count: Counter[str] = Counter()
     total: defaultdict[str, float] = defaultdict(float)
     for kind, length in lengths:
@@ -865,7 +864,7 @@ def _measured(part: str, lengths: Iterable[tuple[str, float]]) -> list[MapCount]
 
 
 def _stretches(road_map: RoadMap, kinds: list[str]) -> Iterable[tuple[str, float]]:
-    """Types of roads and how long they hold; each type once a road, and the empty one where none is told."""
+    """Yield types of roads and their lengths, each type once per road; empty for an unknown type."""
     nodes = road_map.nodes
     for row in _of(kinds, "road"):
         length = float(nodes.length[row])

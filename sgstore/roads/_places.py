@@ -1,9 +1,9 @@
 """Places of junctions, crosswalks, signals and stop lines along the lanes of a map.
 
-A road or a junction lies on its lanes, all along, and so does a lane on itself. A crosswalk lies where it
-covers the centre line of a lane of its storey. A signal lies on the lanes that it applies to, in one place:
-in a junction at the start of the lane, for that is where one waits, whatever the place of the pole; else where
-the map has it, and where the map does not say it, at the end of the lane.
+A road or junction covers its lanes completely; a lane covers itself. A crosswalk covers the part of
+a lane of its storey where it crosses the centre line. A signal has one place on each of its lanes.
+In a junction it is the start of the lane, because traffic stops there, wherever the pole is.
+Elsewhere it is the place in the map, or else the end of the lane.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ if TYPE_CHECKING:
 
 
 STOP_LINE: Final = "stop_line"
-"""What a signal is called that is a line painted on the road."""
+"""Kind of a signal that is a line painted on the road."""
 
 
 BROAD_LINES: Final = ("broad_line_left", "broad_line_right")
-"""What a broad marking is called that bounds a lane to its left, and to its right, as its traffic sees it."""
+"""Kinds of broad markings to the left and to the right of a lane, seen in its direction of travel."""
 
 
 @dataclass(frozen=True, slots=True)
 class MapPlaces:
-    """Stretches of lanes on which parts of a map lie, ordered by part, lane and start; shape (n,).
+    """Stretches of lanes that parts of a map cover, ordered by part, lane and start; shape (n,).
 
     Attributes
     ----------
@@ -58,13 +58,13 @@ class MapPlaces:
         return len(self.part)
 
     def rows(self) -> Iterator[tuple[int, str, int, float, float]]:
-        """Node id, sort, node id of the lane, start and end of each."""
+        """Yield node id, kind, node id of the lane, start and end of each stretch."""
         ids = ((-1 - self.part).tolist(), self.what, (-2 - self.lane).tolist())
         return zip(*ids, self.start.tolist(), self.end.tolist(), strict=True)
 
     @classmethod
     def none(cls) -> MapPlaces:
-        """No part lies on any lane."""
+        """Return an empty table."""
         no_parts, nowhere = np.zeros(0, np.int64), np.zeros(0)
         return cls(no_parts, (), no_parts, nowhere, nowhere)
 
@@ -72,14 +72,14 @@ class MapPlaces:
     def of(
         cls, part: Ints, what: Sequence[str], lane: Ints, start: Floats, end: Floats
     ) -> MapPlaces:
-        """Stretches from columns in any order."""
+        """Sort columns into stretches."""
         order = np.lexsort((end, start, lane, part))
         told = tuple(what[int(row)] for row in order)
         return cls(part[order], told, lane[order], start[order], end[order])
 
 
 def broad_lines(rows: Sequence[tuple[int, bool, float, float]]) -> MapPlaces:
-    """Broad markings beside lanes: the lane, whether it is to its left, and from where to where along it; m."""
+    """Make stretches of broad markings from rows of lane, left side (bool), start and end; m."""
     lane = np.array([row[0] for row in rows], np.int64)
     start, end = (np.array([row[i] for row in rows], np.float64) for i in (2, 3))
     return MapPlaces.of(lane + 1, [BROAD_LINES[not row[1]] for row in rows], lane, start, end)
@@ -88,16 +88,16 @@ def broad_lines(rows: Sequence[tuple[int, bool, float, float]]) -> MapPlaces:
 def made_of_lanes(
     ribbons: Ribbons, what: str, names: Sequence[str], column: dict[str, int]
 ) -> MapPlaces:
-    """Lanes, roads or junctions on their lanes, all along.
+    """Return whole lanes as stretches of their lanes, roads or junctions.
 
     Parameters
     ----------
     ribbons : Ribbons
     what : str
     names : sequence of str
-        The one that each lane belongs to; empty: none.
+        Name of the part of each lane, or empty.
     column : dict of str to int
-        The column of each among the nodes.
+        Column of each part among the nodes.
     """
     found = [(column[name], lane) for lane, name in enumerate(names) if name in column]
     part, lane = np.array(found, np.int64).reshape(-1, 2).T
@@ -107,13 +107,13 @@ def made_of_lanes(
 def on_crosswalks(
     ribbons: Ribbons, columns: Ints, shapes: Any, z: Floats, storey: float
 ) -> MapPlaces:
-    """Crosswalks on the lanes that they cross, from the first place in them to the last.
+    """Return crosswalks on the lanes that they cross, from the first common place to the last.
 
     Parameters
     ----------
     ribbons : Ribbons
     columns : (n,) int64
-        Of the crosswalks among the nodes.
+        Columns of the crosswalks among the nodes.
     shapes : (n,) object
         Their geometries.
     z : (n,) float64
@@ -140,7 +140,7 @@ def on_crosswalks(
 
 
 def _by_length(ribbons: Ribbons, lane: Ints, at: Floats) -> Floats:
-    """Lengths of centre lines up to places that are told by the lengths of their polylines; m."""
+    """Convert lengths along polylines to lengths along centre lines; m."""
     x, y = (ribbons.left_x + ribbons.right_x) / 2, (ribbons.left_y + ribbons.right_y) / 2
     found = np.empty(len(lane))
     for one in np.unique(lane).tolist():
@@ -159,19 +159,19 @@ def of_signals(
     applies: tuple[Ints, Ints],
     stops: tuple[Ints, Ints, Floats],
 ) -> MapPlaces:
-    """Signals on the lanes that they apply to.
+    """Return signals on the lanes that they apply to.
 
     Parameters
     ----------
     ribbons : Ribbons
     junction : sequence of str
-        The junction of each lane; empty: none.
+        The junction of each lane, or empty.
     what : sequence of str
-        What each node is called.
+        Kind of each node.
     applies : (n,) int64 twice
         Signals, as columns among the nodes, and lanes that they apply to.
     stops : (m,) int64, int64 and float64
-        Signals, lanes, and where along these the map has them; m.
+        Signals, lanes, and the places along these from the map; m.
     """
     within = np.array([bool(name) for name in junction], np.bool_)
     told = {*zip(*(column.tolist() for column in stops[:2]), strict=True)}
@@ -186,6 +186,6 @@ def of_signals(
 
 
 def together(parts: Sequence[MapPlaces]) -> MapPlaces:
-    """Stretches of several, as one."""
+    """Join several tables of stretches."""
     one = chained(parts)
     return MapPlaces.of(one.part, one.what, one.lane, one.start, one.end)

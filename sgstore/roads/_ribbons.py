@@ -1,6 +1,6 @@
 """Lane surfaces, and lanes that cross or merge in junctions.
 
-Lanes as ribbons: what their surface is, whatever they were read from.
+Ribbons describe lane surfaces independent of the source format.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Ribbons:
-    """Cross sections of lanes in the direction of travel; lane i owns rows ``offsets[i]:offsets[i + 1]``.
+    """Cross sections of lanes in the direction of travel; lane i has rows ``offsets[i]:offsets[i + 1]``.
 
-    Between two cross sections a lane is the quadrangle of their four ends. A lane has two cross
-    sections at least; they may lie in one place. Where a lane jumps, so do its cross sections.
+    Between two cross sections a lane is the quadrangle of their four ends. A lane has at least two
+    cross sections; they may be in one place. Where a lane jumps, its cross sections jump too.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class Ribbons:
     heading : (S,) float64
         Direction of travel of the centre line; rad, not wrapped.
     s : (S,) float64
-        Where on the reference line of its road; m. Falls along lanes that run against it.
+        Place on the reference line of its road; m. Decreases along lanes that run against it.
     along : (S,) float64
         Length of the centre line from the lane's start; m.
     """
@@ -58,23 +58,23 @@ class Ribbons:
         return len(self.offsets) - 1
 
     def followed_by(self, more: Ribbons) -> Ribbons:
-        """The ribbons of these lanes, then of more."""
+        """Append the ribbons of more lanes."""
         offsets = np.concatenate((self.offsets, self.offsets[-1] + more.offsets[1:]))
         return replace(chained([self, more]), offsets=offsets)
 
     @property
     def lengths(self) -> Floats:
-        """(L,) float64: lengths of the centre lines; m."""
+        """Return the lengths of the centre lines, (L,); m."""
         return self.along[self.offsets[1:] - 1]
 
     @property
     def lane(self) -> Ints:
-        """(S,) int64: the lane that each cross section belongs to."""
+        """Return the lane of each cross section, (S,)."""
         return np.repeat(np.arange(len(self)), np.diff(self.offsets))
 
     @property
     def bends(self) -> Floats:
-        """(S,) float64: by how much the centre line turns up to the next cross section; rad.
+        """Return the turn of the centre line up to the next cross section, (S,); rad.
 
         0 where the lane jumps, and at its end.
         """
@@ -86,27 +86,27 @@ class Ribbons:
         return bend
 
     def between(self, lane: Ints, along: Floats, column: Floats) -> Floats:
-        """Values at places on lanes of what is known at the cross sections, in between in proportion.
+        """Interpolate values of cross sections at places on lanes.
 
-        ``lane`` and ``along`` as :meth:`at` takes them.
+        ``lane`` and ``along`` as in :meth:`at`.
         """
         before, share = self._place(self.along, np.ones(len(self)), lane, along)
         return column[before] + share * (column[before + 1] - column[before])
 
     def height(self, lane: Ints, along: Floats) -> Floats:
-        """Heights at places on lanes; m."""
+        """Return heights at places on lanes; m."""
         return self.between(lane, along, self.z)
 
     def at(self, lane: Ints, along: Floats) -> LanePoints:
-        """Points of centre lines.
+        """Return points of centre lines.
 
         Parameters
         ----------
         lane : (N,) int64
             Lanes, counted from 0.
         along : (N,) float64
-            Length of the centre line from the lane's start; m. What lies before it or beyond the end is
-            taken for the start or the end.
+            Length of the centre line from the lane's start; m. Places outside the lane are moved to
+            its start or end.
 
         Notes
         -----
@@ -135,7 +135,7 @@ class Ribbons:
         )
 
     def _turns(self, before: Ints) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
-        """Headings at cross sections and at those behind them less the direction between; the way there."""
+        """Return headings relative to the chord at both of its ends, and the vector along it."""
         after = before + 1
         x, y = (self.left_x + self.right_x) / 2, (self.left_y + self.right_y) / 2
         way = x[after] - x[before], y[after] - y[before]
@@ -144,7 +144,7 @@ class Ribbons:
         return first, last, way
 
     def along_at(self, lane: Ints, s: Floats) -> Floats:
-        """(N,) float64: lengths of the centre lines up to places ``s`` of their roads; m."""
+        """Return lengths of the centre lines up to places ``s`` of their roads, (N,); m."""
         sign = np.where(self.s[self.offsets[1:] - 1] < self.s[self.offsets[:-1]], -1.0, 1.0)
         before, share = self._place(self.s, sign, lane, s)
         return self.along[before] + share * (self.along[before + 1] - self.along[before])
@@ -152,9 +152,10 @@ class Ribbons:
     def _place(
         self, column: Floats, sign: Floats, lane: Ints, value: Floats
     ) -> tuple[Ints, Floats]:
-        """Cross sections before places, and the share of the way to the next; ``column`` rises along lanes.
+        """Find the cross sections before places, and the share of the way to the next.
 
-        Where ``sign`` is -1 it falls. All lanes are searched at once, laid end to end with gaps of 1 m.
+        ``column`` rises along lanes where ``sign`` is 1 and falls where it is -1. All lanes are
+        searched at once, laid end to end with gaps of 1 m.
         """
         of = self.lane
         run = (column - column[self.offsets[:-1]][of]) * sign[of]
@@ -176,14 +177,15 @@ class LanePoints:
     lane : int64
         Lane, counted from 0.
     along, s : float64
-        Length of the centre line from the lane's start, and where on the road's reference line; m.
+        Length of the centre line from the lane's start, and place on the road's reference line; m.
     x, y, z : float64
     heading : float64
         Direction of travel, in (-π, π]; rad.
     width : float64
-        Of the lane, across; m.
+        Width of the lane; m.
     curvature : float64
-        Of the centre line, positive to the left: the mean between the cross sections around it; 1/m.
+        Curvature of the centre line, positive to the left: the mean between the neighbouring cross
+        sections; 1/m.
     """
 
     lane: Ints
@@ -201,17 +203,17 @@ class LanePoints:
 
 
 def _is_smooth(first: Floats, last: Floats) -> Bools:
-    """Where a lane does not jump: its headings are about those of the way between two cross sections."""
+    """True for pieces without a jump: both headings are within 1 rad of the chord."""
     return (np.abs(first) < 1) & (np.abs(last) < 1)
 
 
 def wrapped(angle: Floats) -> Floats:
-    """The same angles in (-π, π]."""
+    """Wrap angles to (-π, π]."""
     return np.pi - (np.pi - angle) % (2 * np.pi)
 
 
 def waypoints(ribbons: Ribbons, spacing: float) -> LanePoints:
-    """Points along all centre lines, every ``spacing`` metres from the start of each lane.
+    """Return points along all centre lines, every ``spacing`` metres from the start of each lane.
 
     Raises
     ------
@@ -227,7 +229,7 @@ def waypoints(ribbons: Ribbons, spacing: float) -> LanePoints:
 
 
 def mean_widths(ribbons: Ribbons) -> Floats:
-    """(L,) float64: mean widths along the road; m."""
+    """Return mean widths along the road, (L,); m."""
     width = np.hypot(ribbons.left_x - ribbons.right_x, ribbons.left_y - ribbons.right_y)
     starts = ribbons.offsets[:-1]
     step = np.abs(np.diff(ribbons.s, append=0.0))
@@ -239,25 +241,25 @@ def mean_widths(ribbons: Ribbons) -> Floats:
 
 
 def turned(ribbons: Ribbons) -> Floats:
-    """(L,) float64: by how much lanes turn from start to end, positive to the left; rad, not wrapped."""
+    """Return the turn of lanes from start to end, positive to the left, (L,); rad, not wrapped."""
     bend = wrapped(np.diff(ribbons.heading, append=0.0))
     bend[ribbons.offsets[1:] - 1] = 0.0
     return np.add.reduceat(bend, ribbons.offsets[:-1])
 
 
 def centre_lines(ribbons: Ribbons) -> NDArray[Any]:
-    """(L,) shapely lines along the centres of lanes."""
+    """Return shapely lines along the centres of lanes, (L,)."""
     x, y = (ribbons.left_x + ribbons.right_x) / 2, (ribbons.left_y + ribbons.right_y) / 2
     lines: Any = shapely.linestrings(np.column_stack((x, y)), indices=ribbons.lane)
     return lines
 
 
 def lane_polygons(ribbons: Ribbons) -> NDArray[Any]:
-    """(L,) shapely polygons of lanes: along the right border and back along the left."""
+    """Return shapely polygons of lanes, (L,): along the right border and back along the left."""
     counts = np.diff(ribbons.offsets)
     lane = ribbons.lane
     number = np.arange(len(lane)) - ribbons.offsets[lane]
-    first = 2 * ribbons.offsets[lane] + lane  # each ring is closed by one point more
+    first = 2 * ribbons.offsets[lane] + lane  # each closed ring has one point more
     points = np.empty((2 * len(lane) + len(counts), 2))
     points[first + number] = np.column_stack((ribbons.right_x, ribbons.right_y))
     back = first + 2 * counts[lane] - 1 - number
@@ -274,27 +276,27 @@ def lane_polygons(ribbons: Ribbons) -> NDArray[Any]:
 SAME_PLACE: Final = 0.5
 """Ends of lanes this close, in about the same direction, are one place; m."""
 MOST_PAIRS: Final = 2_000_000
-"""Pairs of lanes that are looked at: a junction of 200 lanes has 20,000."""
+"""Greatest number of compared pairs of lanes: a junction of 200 lanes has 20,000."""
 
 
 def conflicts(
     ribbons: Ribbons, lanes: Ints, junction: Sequence[str], flow: tuple[Ints, Ints], storey: float
 ) -> tuple[Ints, Ints]:
-    """Pairs of lanes of a junction that cross or merge, each once, the lower lane first.
+    """Return pairs of lanes of a junction that cross or merge, each once, the lower lane first.
 
-    Lanes cross where the insides of their centre lines meet; they merge where both flow into one lane or end in
-    one place. Lanes that part from one place do not conflict, however long they keep together, nor do lanes
-    on different storeys.
+    Lanes cross if the interiors of their centre lines meet. They merge if both flow into one lane
+    or end in one place. Lanes that start in one place do not conflict, however long they overlap.
+    Lanes on different storeys do not conflict either.
 
     Parameters
     ----------
     ribbons : Ribbons
     lanes : (n,) int64
-        The lanes in question: those of traffic, in junctions.
+        Lanes of traffic in junctions.
     junction : sequence of str
         The junction of every lane of the map.
     flow : (m,) int64 twice
-        From which lanes traffic flows on to which.
+        Pairs of lanes (from, to) of the traffic flow.
     storey : float
         Least difference of height between lanes on different storeys; m.
 
@@ -315,7 +317,7 @@ def conflicts(
 
 
 def _pairs(lanes: Ints, junction: Sequence[str]) -> tuple[Ints, Ints]:
-    """All pairs of lanes of one junction, the lower lane first."""
+    """Return all pairs of lanes of one junction, the lower lane first."""
     names: dict[str, int] = {}
     for name in junction:
         names.setdefault(name, len(names))
@@ -332,7 +334,7 @@ def _pairs(lanes: Ints, junction: Sequence[str]) -> tuple[Ints, Ints]:
 
 
 def _share(src: Ints, dst: Ints, one: Ints, other: Ints) -> Bools:
-    """Mask of the pairs of lanes that have a common neighbour along ``src → dst``."""
+    """Return a mask of the pairs of lanes that have a common neighbour along ``src → dst``."""
     after: dict[int, set[int]] = {}
     for lane, onward in zip(src.tolist(), dst.tolist(), strict=True):
         after.setdefault(lane, set()).add(onward)
@@ -356,7 +358,7 @@ def _together(ribbons: Ribbons, one: Ints, other: Ints, *, at_end: bool) -> Bool
 
 
 def _heights(ribbons: Ribbons, lines: Any, one: Ints, other: Ints) -> Floats:
-    """By how much the first lane of a pair lies above the second where they come closest."""
+    """Return the height of the first lane of a pair above the second, where they are closest."""
     shortest: Any = shapely.shortest_line(lines[one], lines[other])
     heights: list[Floats] = []
     for lanes, end in ((one, 0), (other, -1)):

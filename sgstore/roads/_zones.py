@@ -1,15 +1,16 @@
-"""Merge and departure zones along the lanes of a map: where lanes come in, and where they go off.
+"""Merge and departure zones along the lanes of a map.
 
-ISO 34502 has three kinds of road geometry: the road alone, the merge zone and the departure zone, of which it
-tells no length. Here a merge zone is
+ISO 34502 has three kinds of road geometry: the road, the merge zone and the departure zone. It does
+not define their lengths. Here a merge zone is
 
-* a lane that leads onto a road by its type (``entry``, ``onRamp``, ``mwyEntry``), and the lanes beside it;
-* the last :data:`LONG` before a lane ends while one beside it goes on;
-* the last :data:`LONG` before two roads or more become one, where none of them leads anywhere else: so no
-  crossing is a merge zone, whatever the map calls it.
+* a lane whose type leads onto a road (``entry``, ``onRamp``, ``mwyEntry``), and its neighbours;
+* the last :data:`LONG` before a lane ends while a neighbour continues;
+* the last :data:`LONG` before two or more roads become one, if these roads lead nowhere else.
+  Therefore a crossing is never a merge zone.
 
-A departure zone is the same against the direction of travel: ``exit``, ``offRamp``, ``mwyExit``; the first
-:data:`LONG` after a lane began, or one road became several. Lanes beside one another are of one direction.
+A departure zone is the same against the direction of travel: ``exit``, ``offRamp``, ``mwyExit``;
+the first :data:`LONG` after a lane began, or after one road became several. Only neighbours in the
+same direction count.
 """
 
 from __future__ import annotations
@@ -28,9 +29,11 @@ if TYPE_CHECKING:
     from sgstore.world import Floats, Ints
 
 LONG: Final = 250.0
-"""Length of a zone that no type of lanes tells: of acceleration lanes of German motorways (RAA 2008); m."""
+"""Length of a zone that does not follow from lane types: acceleration lanes of German motorways
+(RAA 2008); m."""
 _MOST: Final = 1_000
-"""Lanes of a junction that are looked at from one that leads into it: a map of strangers may be of any size."""
+"""Greatest number of searched lanes of a junction per entering lane: maps from other sources can
+have any size."""
 MERGE_ZONE: Final = "merge_zone"
 DEPARTURE_ZONE: Final = "departure_zone"
 _LEADING: Final[Mapping[str, frozenset[str]]] = {
@@ -46,18 +49,18 @@ def zones(
     flow: tuple[Ints, Ints],
     beside: tuple[Ints, Ints],
 ) -> MapPlaces:
-    """Zones on the lanes of a map.
+    """Return the zones on the lanes of a map.
 
     Parameters
     ----------
     types, within : sequence of str
-        Of each lane its type, and its junction; empty: none.
+        Type of each lane; junction of each lane, or empty.
     lengths : (L,) float64
         m.
     flow : (n,) int64 twice
-        Lanes, and lanes that their traffic goes on to.
+        Lanes, and the next lanes of their traffic.
     beside : (m,) int64 twice
-        Lanes side by side of one direction.
+        Neighbouring lanes of the same direction.
     """
     traffic = [of in DRIVING for of in types]
     lanes = _Lanes(
@@ -80,7 +83,7 @@ def zones(
 
 @dataclass(frozen=True, slots=True)
 class _Lanes:
-    """Lanes for motor traffic with their lengths, those that follow and come before, and who is beside whom."""
+    """Lanes for motor traffic with lengths, successors, predecessors and groups of neighbours."""
 
     types: Sequence[str]
     inside: Sequence[bool]
@@ -90,11 +93,11 @@ class _Lanes:
     group: Sequence[int]
 
     def turned(self) -> _Lanes:
-        """The same against the direction of travel."""
+        """Return the lanes against the direction of travel."""
         return replace(self, after=self.before, before=self.after)
 
     def reaches(self, leading: frozenset[str]) -> dict[int, float]:
-        """Lanes that are in a zone, and how far that reaches back from their ends; m."""
+        """Return lanes in a zone, and the length of the zone before the lane's end; m."""
         groups: dict[int, list[int]] = {}
         for lane, of in enumerate(self.group):
             if self.types[lane] in DRIVING:
@@ -114,7 +117,7 @@ class _Lanes:
         return found
 
     def _joining(self) -> Iterable[int]:
-        """Lanes right before the place where the roads that they are of become one."""
+        """Yield the lanes directly before the place where several roads become one."""
         reached: dict[int, set[int]] = {}
         coming: dict[int, set[int]] = {}
         last: dict[int, set[int]] = {}
@@ -130,7 +133,7 @@ class _Lanes:
                 yield from last[target]
 
     def _onto(self, lane: int) -> Iterable[tuple[int, int]]:
-        """Groups of lanes outside of junctions that a lane leads to, with the lane right before each."""
+        """Yield a lane, and the group of lanes outside junctions that it leads to."""
         queue, seen = [lane], {lane}
         while queue and len(seen) < _MOST:
             at = queue.pop()
@@ -144,7 +147,7 @@ class _Lanes:
     def _walk_back(
         self, lane: int, groups: Mapping[int, Sequence[int]], found: dict[int, float]
     ) -> None:
-        """Put into a zone a lane and what is beside it, up to :data:`LONG` behind its end or to a junction."""
+        """Add a lane and its neighbours to a zone, back to :data:`LONG` before its end or to a junction."""
         queue = [(lane, LONG)]
         while queue:
             at, left = queue.pop()
@@ -159,7 +162,7 @@ class _Lanes:
 
 
 def _related(count: int, pairs: tuple[Ints, Ints], traffic: Sequence[bool]) -> list[list[int]]:
-    """For each lane those that it is related to; of those for motor traffic alone."""
+    """Return the related lanes of each lane; only lanes for motor traffic."""
     found: list[list[int]] = [[] for _ in range(count)]
     for one, other in zip(*(column.tolist() for column in pairs), strict=True):
         if traffic[one] and traffic[other]:
@@ -168,7 +171,7 @@ def _related(count: int, pairs: tuple[Ints, Ints], traffic: Sequence[bool]) -> l
 
 
 def _groups(beside: Sequence[Sequence[int]]) -> list[int]:
-    """For each lane the number of the first one that is beside it, whether next to it or further off."""
+    """Return for each lane the number of the first lane in its group of neighbours."""
     group = [-1] * len(beside)
     for first in range(len(beside)):
         queue = [first] if group[first] < 0 else []
