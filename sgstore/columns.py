@@ -1,4 +1,4 @@
-"""Tables as dataclasses, a column in each field: some of the rows, several tables as one; and their order.
+"""Tables as dataclasses with one field per column: row selection, concatenation and sorting.
 
 A column is an array or a tuple. What is neither is the same for all rows, and is that of the first table.
 """
@@ -20,7 +20,7 @@ Table = TypeVar("Table")
 
 
 def taken(table: Table, rows: NDArray[Any]) -> Table:
-    """Some of the rows of a table, in the order given: indices, or a mask of arrays."""
+    """Return rows of a table in the given order. ``rows`` is an index array or a mask."""
     columns = (getattr(table, name) for name in _names(table))
     return type(table)(*(_taken(column, rows) for column in columns))
 
@@ -36,7 +36,7 @@ def _taken(column: Any, rows: NDArray[Any]) -> Any:
 
 
 def chained(tables: Sequence[Table]) -> Table:
-    """The rows of tables of one type, one table after another."""
+    """Concatenate tables of one type."""
     columns = ([getattr(one, name) for one in tables] for name in _names(tables[0]))
     return type(tables[0])(*map(_chained, columns))
 
@@ -48,7 +48,7 @@ def _chained(parts: list[Any]) -> Any:
 
 
 def ascending(numbers: NDArray[np.int64]) -> NDArray[np.intp]:
-    """The stable order of numbers that are not below zero, by 16 bits at a time, which numpy sorts by radix."""
+    """Return the stable sort order of non-negative integers, by a radix sort of 16 bits per pass."""
     order = np.argsort(numbers.astype(np.uint16), kind="stable")
     for shift in range(16, int(numbers.max(initial=0)).bit_length(), 16):
         digits = (numbers[order] >> shift).astype(np.uint16)

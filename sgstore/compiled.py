@@ -1,4 +1,4 @@
-"""Loops that numba compiles, where it is installed: the extra ``[fast]``.
+"""Loops compiled by numba, if it is installed: the extra ``[fast]``.
 
 Without it numpy does the same, and the answers are equal: loops add, multiply, divide, take roots and compare,
 with the roundings of numpy, and leave to it whatever needs an angle. Numba takes 0.5 s to start, and loops save
@@ -25,17 +25,17 @@ _seen: dict[str, float] = {"pairs": 0, "enough": WORTH}
 
 
 def count(pairs: int) -> None:
-    """Note that graphs of bodies that are so many ordered pairs are made."""
+    """Add to the number of processed pairs of bodies."""
     _seen["pairs"] += pairs
 
 
 def worth() -> bool:
-    """Return whether loops are to be used: after many pairs of bodies, and where numba is."""
+    """True if compiled loops are worthwhile: after many pairs of bodies, and with numba installed."""
     return _seen["pairs"] >= _seen["enough"] and _numba() is not None
 
 
 def use_loops(after: float = WORTH) -> bool:
-    """Use loops after so many pairs from now on; return whether there is anything to compile them."""
+    """Use compiled loops after this number of pairs. True if numba is installed."""
     _seen.update(pairs=0, enough=after)
     return _numba() is not None
 
@@ -49,7 +49,7 @@ def _numba() -> Any:
 
 
 def compiled(loop: Loop) -> Loop:
-    """A function of numbers and arrays, as numba compiles it when it is first called; itself without numba."""
+    """Compile a function with numba on its first call. Without numba, return the function unchanged."""
     numba = _numba()
     if numba is None:
         return loop

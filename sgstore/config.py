@@ -67,7 +67,7 @@ T = TypeVar("T")
 
 
 def setting(default: T, comment: str) -> T:
-    """A field of a table: its default, and what it means."""
+    """Return a dataclass field for a setting, with its default and its comment."""
     plain: Any = default
     metadata = {COMMENT: comment}
     if isinstance(default, dict):
@@ -77,7 +77,7 @@ def setting(default: T, comment: str) -> T:
 
 @dataclass(frozen=True, slots=True)
 class RangeSettings:
-    """Part of the world that is in the graph of an ego."""
+    """Settings of the area around the ego that the graph covers."""
 
     radius: float = setting(50.0, "shape 'radius': how far from the ego's centre; m")
     shape: str = setting(
@@ -144,18 +144,18 @@ class RangeSettings:
             check_polygon("range.polygon", self.polygon)
 
     def beyond(self) -> RangeSettings | None:
-        """The range of what is known beyond graphs: a circle; ``None`` where nothing is."""
+        """Circle of the known data outside the graphs. ``None`` means no such data."""
         return replace(self, shape="radius", radius=self.world) if self.world else None
 
     @property
     def boundless(self) -> bool:
-        """Return whether all of the recording is known."""
+        """True if the known data cover the whole recording."""
         return self.world >= MOST_LENGTH
 
 
 @dataclass(frozen=True, slots=True)
 class LaneSettings:
-    """Parts of a road map that are in a graph, and the relations of its lanes."""
+    """Settings of the map elements in a graph, and of the relations between lanes."""
 
     ahead: float = setting(
         100.0,
@@ -191,7 +191,7 @@ class LaneSettings:
 
 @dataclass(frozen=True, slots=True)
 class Proximity:
-    """Distance relations: the first whose upper bound is not exceeded holds, so exactly one or none."""
+    """Distance relations. The first one with an upper bound at or above the distance holds."""
 
     names: tuple[str, ...] = setting(
         PROXIMITY,
@@ -217,7 +217,10 @@ class Proximity:
 
 @dataclass(frozen=True, slots=True)
 class Direction:
-    """Angular relations: the first whose upper bound the absolute bearing does not exceed; else the last."""
+    """Angular relations.
+
+    The first one with an upper bound at or above the absolute bearing holds; else the last.
+    """
 
     names: tuple[str, ...] = setting(
         DIRECTIONS, "relations from ahead to behind, by these names or others; empty: none"
@@ -252,7 +255,7 @@ class Direction:
 
 @dataclass(frozen=True, slots=True)
 class PairSettings:
-    """Pairs of entities that are related to one another."""
+    """Settings of the pairs of entities that can have relations."""
 
     within: float = setting(
         25.0, "all entities that move, up to this distance from one another; m. 0: none"
@@ -279,7 +282,7 @@ class PairSettings:
 
 @dataclass(frozen=True, slots=True)
 class Payloads:
-    """Join of sensor messages to frames."""
+    """Settings of the join of sensor messages to frames."""
 
     join: str = setting("nearest", "'nearest' in log time, or 'latest' at or before the frame")
     tolerance: float = setting(
@@ -296,7 +299,7 @@ class Payloads:
 
 @dataclass(frozen=True, slots=True)
 class Signs:
-    """Settings of the reading of a road map's signals."""
+    """Settings for reading the signals of a road map."""
 
     kinds: tuple[tuple[str, str], ...] = ()
     """Type codes of signals, in lower case, and the kinds that the client says they are."""
@@ -396,13 +399,13 @@ class Config:
 
     @property
     def signs(self) -> Signs:
-        """Settings of the reading of signals of road maps, for :func:`sgstore.opendrive.read_map`."""
+        """Settings for reading the signals of a road map with :func:`sgstore.opendrive.read_map`."""
         kinds = tuple((name, of.kind) for name, of in self.types.items() if of.kind in SIGNALS)
         return Signs(kinds, self.orientation)
 
     @property
     def notes(self) -> list[str]:
-        """Names of the client's own that are all but those of this package: slips, perhaps."""
+        """Return notes on user-defined relation names that resemble a built-in name, perhaps by mistake."""
         return [
             f"setting '{table}.names': {name!r} is a relation of your own; did you mean {like!r}?"
             for table, known in (("proximity", PROXIMITY), ("direction", DIRECTIONS))
@@ -411,11 +414,11 @@ class Config:
         ]
 
     def unknown_of(self, types: Mapping[str, int]) -> dict[str, int]:
-        """Those of the type names that no mapping knows whose meaning the client does not tell either."""
+        """Return the counts of the type names without a mapping."""
         return {name: n for name, n in types.items() if name.lower() not in self.types}
 
     def __repr__(self) -> str:
-        """The settings that are not as by default: ``Config(range.radius=30.0)``."""
+        """Return the settings that differ from the defaults: ``Config(range.radius=30.0)``."""
         told = list[str]()
         for name, default in Config().as_dict().items():
             value = self.as_dict()[name]
@@ -426,12 +429,12 @@ class Config:
         return f"Config({', '.join(told)})"
 
     def as_dict(self) -> dict[str, Any]:
-        """The settings as plain values, as they stand in TOML and JSON."""
+        """Return the settings as plain values, as in TOML and JSON."""
         return asdict(self)
 
 
 def check(holds: bool, name: str, value: object, right: str) -> None:  # noqa: FBT001
-    """Refuse a setting that does not hold.
+    """Raise an error with the expected value if a setting is invalid.
 
     Raises
     ------
@@ -443,7 +446,7 @@ def check(holds: bool, name: str, value: object, right: str) -> None:  # noqa: F
 
 
 def one_of(words: Iterable[str]) -> str:
-    """``'a', 'b' or 'c'``."""
+    """Format words as ``'a', 'b' or 'c'``."""
     *most, last = (f"'{word}'" for word in words)
     return f"{', '.join(most)} or {last}"
 
@@ -458,7 +461,7 @@ def _make_known(name: str, add: Callable[[str], int], new: str) -> None:
 def check_steps(
     name: str, names: tuple[str, ...], upper: tuple[float, ...], known: tuple[str, ...], bounds: int
 ) -> None:
-    """Refuse a ladder of relations whose names are taken or doubled, or whose bounds do not rise.
+    """Reject relation names that are reserved or repeated, and bounds that do not ascend.
 
     Names that are new become known in this process.
     """
@@ -473,7 +476,7 @@ def check_steps(
 
 
 def check_labels(name: str, given: Iterable[str], *, ego: bool) -> None:
-    """Refuse labels that no kind has; ``Ego`` is one where it is allowed."""
+    """Reject labels that no kind has. ``Ego`` is valid if ``ego`` is true."""
     known = [label for label in labels() if ego or label != "Ego"]
     for label in given:
         if not (kinds_labelled(label) or (ego and normalize_name(label) == "ego")):
@@ -481,14 +484,14 @@ def check_labels(name: str, given: Iterable[str], *, ego: bool) -> None:
 
 
 def check_pairs(name: str, pairs: tuple[tuple[str, ...], ...]) -> None:
-    """Refuse what is no list of pairs of labels."""
+    """Reject a list with anything but pairs of valid labels."""
     for i, pair in enumerate(pairs):
         check(len(pair) == 2, f"{name}[{i}]", pair, "two labels")
         check_labels(f"{name}[{i}]", pair, ego=True)
 
 
 def check_polygon(name: str, corners: tuple[tuple[float, ...], ...]) -> None:
-    """Refuse what is no simple polygon."""
+    """Reject corners that do not form a simple polygon."""
     pairs = all(len(corner) == 2 and all(map(math.isfinite, corner)) for corner in corners)
     right = f"3 to {MOST_CORNERS} corners [ahead, to the left], in metres"
     check(pairs and 3 <= len(corners) <= MOST_CORNERS, name, corners, right)
@@ -505,7 +508,7 @@ def _check_length(holds: bool, name: str, value: float, right: str) -> None:  # 
 
 
 def _check_name(setting: str, name: str, known: Iterable[str], more: str = "") -> None:
-    """Refuse a name that is not among those known, with the one that is most like it."""
+    """Reject an unknown name, and suggest the most similar known name."""
     known = list(known)
     if name not in known:
         alias = relation_named(name)
@@ -530,7 +533,7 @@ def _checked_types(types: Mapping[str, TypeMeaning]) -> dict[str, TypeMeaning]:
 
 
 def _checked_relations(given: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """The settings of relations, with the defaults of those that are not given."""
+    """Return the settings of relations, with defaults for missing values."""
     registry, checked = plugins.RELATIONS, dict[str, dict[str, Any]]()
     others = registry.others() if given else {}
     for name, values in sorted(given.items()):
@@ -554,7 +557,7 @@ def _checked_relations(given: Mapping[str, Mapping[str, Any]]) -> dict[str, dict
 
 @dataclass(frozen=True, slots=True)
 class Preset:
-    """A config with a name.
+    """Named config.
 
     Attributes
     ----------
@@ -660,7 +663,7 @@ PRESETS: Final[Mapping[str, Preset]] = {
 
 
 def preset(name: str) -> Config:
-    """The config of a preset.
+    """Return the config of a preset.
 
     Raises
     ------
@@ -680,7 +683,7 @@ MAX_CONFIG_BYTES: Final = 1 << 20
 
 
 def load(path: str | Path) -> Config:
-    """The config in a TOML file; what the file does not name keeps its default, or what its preset says.
+    """Read a config from a TOML file. Missing settings come from its preset, or keep their defaults.
 
     Raises
     ------
@@ -703,7 +706,7 @@ def load(path: str | Path) -> Config:
 
 
 def from_dict(values: Mapping[str, Any]) -> Config:
-    """The config that plain values describe.
+    """Return the config described by plain values.
 
     Parameters
     ----------
@@ -723,7 +726,7 @@ def from_dict(values: Mapping[str, Any]) -> Config:
 
 
 def configured(**settings: Any) -> Config:
-    """The config that keyword arguments describe: tables as values of their classes or as mappings.
+    """Return the config described by keyword arguments. Tables are mappings or settings objects.
 
     ::
 
@@ -738,7 +741,7 @@ def configured(**settings: Any) -> Config:
 
 
 def _changed(config: Any, values: Mapping[str, Any], prefix: str) -> Any:
-    """A table of settings with other values for some of them."""
+    """Return a copy of a settings table with some values changed."""
     hints = get_type_hints(type(config))
     known = {f.name for f in fields(config)}
     for name in values:
@@ -764,7 +767,7 @@ _PLAIN: Final[dict[object, str]] = {str: "a text", bool: "true or false", int: "
 
 
 def _value(hint: Any, value: Any, name: str, default: Any = None) -> Any:
-    """A value of the type that a setting has."""
+    """Convert a plain value to the type of a setting."""
     if is_dataclass(hint):
         return _table(hint, value, name, default)
     if get_origin(hint) is Mapping:
@@ -794,7 +797,7 @@ def _table(cls: Any, value: Any, name: str, default: Any) -> Any:
 
 
 def _built(cls: Any, values: Mapping[str, Any], prefix: str) -> Any:
-    """A record all of whose parts that have no default are named."""
+    """Build a record from plain values. Fields without a default are required."""
     hints = get_type_hints(cls)
     for name in values:
         if name not in hints:
@@ -812,7 +815,7 @@ WIDTH: Final = 98
 
 
 def as_toml(config: Config) -> str:
-    """The whole config as TOML, each setting with its comment; reading it gives the config again."""
+    """Return the whole config as TOML, each setting with its comment. :func:`load` restores the config."""
     lines = ["# Settings of sgstore. Lengths are metres, angles degrees, times seconds.", ""]
     tables: list[str] = []
     for one in fields(config):
@@ -903,7 +906,7 @@ What a file does not name keeps its default, or the value of the preset that it 
 
 
 def as_markdown(presets: Mapping[str, Preset]) -> str:
-    """The page ``docs/parameters.md``: all settings with their defaults, and the presets."""
+    """Return the page ``docs/parameters.md``: all settings with their defaults, and the presets."""
     parts = [_preset_text(name, one) for name, one in presets.items()]
     return PAGE.format(settings=as_toml(Config()), presets="\n".join(parts))
 

@@ -21,7 +21,7 @@ _CELL: Final = "text-align:{align};padding:0.15em 0.8em;white-space:pre-wrap"
 
 
 def cell(value: Any, longest: int = LONGEST) -> str:
-    """A value on one line, no longer than so many characters."""
+    """Format a value as one line with at most this number of characters."""
     if value is None:
         return ""
     if isinstance(value, bool):
@@ -36,7 +36,7 @@ def cell(value: Any, longest: int = LONGEST) -> str:
 def html_table(
     columns: Sequence[str], rows: Iterable[Sequence[Any]], caption: str = "", below: str = ""
 ) -> str:
-    """A table of HTML, with a text above it and one below.
+    """Return an HTML table with a caption above and a text below.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def _html_cell(tag: str, value: Any) -> str:
 
 
 def html_media(data: bytes, kind: str, text: str = "") -> str:
-    """A picture or a video that the page holds itself, with a text below.
+    """Return HTML with an embedded picture or video, and a text below.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Every error that sgstore raises on purpose.
+"""Errors of sgstore.
 
 ::
 
@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 
 
 class SgstoreError(Exception):
-    """Base class of the errors of sgstore. The message has the fault and the remedy."""
+    """Base class of the errors of sgstore. The message names the fault and the remedy."""
 
     def as_dict(self) -> dict[str, object]:
-        """Return the error as data: ``error`` (name of its class), ``reason``, and the place if it is known."""
+        """Return the error as data: ``error`` (class name), ``reason``, and the place if known."""
         reason = getattr(self, "reason", str(self))
         about: dict[str, object] = {"error": type(self).__name__, "reason": reason}
         for name in ("path", "channel", "time_ns", "offset", "road", "element", "extra"):
@@ -50,17 +50,17 @@ _URL: Final = re.compile(r"(s3a?|gs|az|abfs|https?):/+(?=[^/])")
 
 
 def place_named(path: str | Path) -> str:
-    """The place of a recording or a collection as people write it: a path, or a URL with both its strokes."""
+    """Return the text form of a path or URL. A URL keeps both slashes, which ``Path`` merges."""
     return _URL.sub(r"\1://", str(path), count=1) if _URL.match(str(path)) else str(path)
 
 
 def url_named(path: str | Path) -> str | None:
-    """Return the URL in a path, or ``None`` for a path on this machine."""
+    """Return the URL in a path, or ``None`` for a local path."""
     return place_named(path) if _URL.match(str(path)) else None
 
 
 class TraceError(SgstoreError):
-    """A recording cannot be read, in whole or in part.
+    """A recording is not readable, in whole or in part.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ INTERRUPTIONS: Final = ("Query interrupted", "KeyboardInterrupt", "INTERRUPT Err
 
 
 def is_interruption(error: BaseException | None) -> bool:
-    """Return true if an error is due to the end of the run."""
+    """True if the error was caused by an interruption, such as Ctrl-C."""
     while error is not None:
         of_database = isinstance(error, RuntimeError) or "duckdb" in type(error).__module__
         if of_database and any(words in str(error) for words in INTERRUPTIONS):
@@ -120,7 +120,7 @@ def is_interruption(error: BaseException | None) -> bool:
 
 
 def failure(error: Exception, path: str | Path) -> SgstoreError:
-    """The error for which one recording of a batch fails.
+    """Return the error to report for a failed recording of a batch.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def failure(error: Exception, path: str | Path) -> SgstoreError:
 
 
 class MapError(SgstoreError):
-    """A road map cannot be read, in whole or in part.
+    """A road map is not readable, in whole or in part.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ class StoreError(SgstoreError):
 
 
 def one_store_needed(collection: str | Path, why: str = "this asks one store") -> StoreError:
-    """The error of a collection that is named where one store is needed."""
+    """Return the error for a collection in a place that needs a single store."""
     place = place_named(collection)
     return StoreError(
         f"{place}: a collection, and {why}: 'sgstore collection unpack {place} all.sgstore' makes one of it"
@@ -181,7 +181,7 @@ def one_store_needed(collection: str | Path, why: str = "this asks one store") -
 
 
 class SqlError(StoreError):
-    """A statement of the user's that the database refuses."""
+    """The database rejects a user's SQL statement."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +199,7 @@ class TextSpan:
 
 
 class QueryError(SgstoreError):
-    """A query text that cannot be answered.
+    """The query text has an error.
 
     Parameters
     ----------
@@ -228,7 +228,7 @@ class QueryError(SgstoreError):
         super().__init__(_with_carets(reason, text, span, hint))
 
     def as_dict(self) -> dict[str, object]:
-        """The error as data: ``error``, ``reason``, ``hint``, ``start``, ``end``, ``line``, ``column``."""
+        """Return the error as data: ``error``, ``reason``, ``hint``, ``start``, ``end``, ``line``, ``column``."""
         line, column = position(self.text, self.span.start) if self.span else (None, None)
         return {
             "error": type(self).__name__,
@@ -242,19 +242,19 @@ class QueryError(SgstoreError):
 
 
 class QuerySyntaxError(QueryError):
-    """The text is not a sentence of the language."""
+    """The query text has a syntax error."""
 
 
 class QueryNameError(QueryError):
-    """A name that the catalogue does not know, or a variable that is not bound."""
+    """The query has an unknown name or an unbound variable."""
 
 
 class AbstractionError(SgstoreError):
-    """An abstraction or a derived set of relations is missing, or cannot be made."""
+    """An abstraction or a derived set of relations is missing, or its computation failed."""
 
 
 class ExportError(SgstoreError):
-    """A clip or a file that cannot be written."""
+    """A clip or another output file is not writable."""
 
 
 class MissingExtraError(SgstoreError):
@@ -276,7 +276,7 @@ class MissingExtraError(SgstoreError):
 
 
 def position(text: str, offset: int) -> tuple[int, int]:
-    """Line and column of an offset, both counted from 1."""
+    """Return line and column of a text offset, both counted from 1."""
     before = text[:offset]
     return before.count("\n") + 1, offset - (before.rfind("\n") + 1) + 1
 
@@ -296,7 +296,7 @@ EXCERPT: Final = 160
 
 
 def _excerpt(line: str, start: int, length: int) -> tuple[str, str]:
-    """The line around a part of it, and carets below; invisible characters are dots or blanks."""
+    """Return the text around an error, and a line of carets under it. Control characters become dots."""
     first = max(0, min(start - EXCERPT // 2, len(line) - EXCERPT))
     shown = line[first : first + EXCERPT]
     shown = "".join(c if c.isprintable() else " " if c.isspace() else "·" for c in shown)
@@ -307,7 +307,6 @@ def _excerpt(line: str, start: int, length: int) -> tuple[str, str]:
 
 
 def _columns(text: str) -> int:
-    """Width of a text in a terminal."""
     wide = sum(unicodedata.east_asian_width(character) in "WF" for character in text)
     return len(text) + wide - sum(map(bool, map(unicodedata.combining, text)))
 
@@ -321,7 +320,7 @@ _ERRORS: Final = {
 
 
 def plain_error(error: SgstoreError) -> dict[str, Any]:
-    """Return an error as plain values, from which :func:`error_of` makes it again in another process."""
+    """Convert an error to plain values, for another process. :func:`error_of` restores the error."""
     if isinstance(error, QueryError):
         span = (error.span.start, error.span.end) if error.span else None
         about = {"kind": type(error).__name__, "query": error.text, "reason": error.reason}
@@ -331,7 +330,7 @@ def plain_error(error: SgstoreError) -> dict[str, Any]:
 
 
 def error_of(told: Mapping[str, Any]) -> SgstoreError:
-    """Return the error from the values of :func:`plain_error`."""
+    """Restore an error from the values of :func:`plain_error`."""
     if "query" in told:
         span = TextSpan(*told["span"]) if told["span"] else None
         kind = _QUERY_ERRORS.get(told["kind"], QueryError)

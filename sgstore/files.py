@@ -1,4 +1,4 @@
-"""Files and folders that appear complete or not at all.
+"""Atomic output: files and folders appear complete or not at all.
 
 Folders for what is on its way, which live no longer than their owner.
 
@@ -44,7 +44,7 @@ _FLAGS: Final = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_NOF
 
 
 class HeldFolder:
-    """A new folder that is locked for as long as its process lives.
+    """New folder with a lock that its process holds until exit.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ class HeldFolder:
             raise
 
     def _locked(self) -> bool:
-        """Lock the folder, unless someone took it for a dead one before it was locked."""
+        """Lock the folder. False if another process removed it before the lock."""
         if fcntl is None:
             return True
         try:
@@ -111,7 +111,7 @@ class HeldFolder:
         self.remove()
 
     def remove(self) -> None:
-        """Remove it with all that is in it; a process that was forked from the owner leaves it alone."""
+        """Remove the folder and its content. A forked child process does nothing."""
         if os.getpid() != self._owner:
             return
         shutil.rmtree(self.path, ignore_errors=True)
@@ -125,7 +125,7 @@ class HeldFolder:
 
 
 def sweep(parent: Path, prefix: str, undo: Callable[[Path], None] | None = None) -> None:
-    """Remove the folders of :class:`HeldFolder` whose processes are gone, each after it was undone."""
+    """Remove the folders of :class:`HeldFolder` without a living process. Call ``undo`` before each removal."""
     if fcntl is None:
         return
     names: list[str] = []
@@ -155,7 +155,7 @@ _mine: dict[tuple[int, Path], Path] = {}
 
 
 def temporary_folder() -> Path:
-    """The folder of this process for what does not fit into memory; it is removed when the process ends.
+    """Return this process's folder for data that exceed memory. It is removed at exit.
 
     If it cannot be made it does not exist: who writes there is told so then.
     """
@@ -172,13 +172,13 @@ def temporary_folder() -> Path:
 
 
 def new_place(name: str) -> Path:
-    """A place in the folder of this process where nothing is yet."""
+    """Return an unused path in the temporary folder of this process."""
     return temporary_folder() / f"{name}-{secrets.token_hex(4)}"
 
 
 @contextmanager
 def working_folder(name: str) -> Generator[Path]:
-    """A folder in that of this process, for as long as the block lasts.
+    """Create a temporary folder. It is removed at the end of the block.
 
     Raises
     ------
@@ -218,7 +218,7 @@ _CONTROLS: Final = {
 
 
 def without_controls(text: str) -> str:
-    r"""A text in which characters that a terminal may take for orders are escapes: ``\x1b``.
+    r"""Replace terminal control characters by escapes such as ``\x1b``.
 
     Line feeds and tabs are no danger.
     """
@@ -226,11 +226,11 @@ def without_controls(text: str) -> str:
 
 
 class ReaderGoneError(ExportError):
-    """Whoever read what is written has gone away, as ``head`` does: there is no reason to go on."""
+    """The reader closed the output pipe, as ``head`` does. The work can stop."""
 
 
 class Stream(io.RawIOBase):
-    """A descriptor that is written to; what goes wrong is an :class:`ExportError` that names it.
+    """Writable stream on a file descriptor. Errors are raised as :class:`ExportError` with the file name.
 
     Parameters
     ----------
@@ -258,11 +258,11 @@ class Stream(io.RawIOBase):
         self.lost = False
 
     def writable(self) -> bool:
-        """It is."""
+        """Return true."""
         return True
 
     def seekable(self) -> bool:
-        """Return whether the stream has positions."""
+        """True if the stream supports seeking."""
         try:
             os.lseek(self._descriptor, 0, os.SEEK_CUR)
         except OSError:
@@ -270,19 +270,19 @@ class Stream(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
-        """Go to a place; bytes from the beginning."""
+        """Move to an offset in bytes, and return the new position."""
         return os.lseek(self._descriptor, offset, whence)
 
     def fileno(self) -> int:
-        """The descriptor."""
+        """Return the file descriptor."""
         return self._descriptor
 
     def isatty(self) -> bool:
-        """Return whether the stream is a terminal."""
+        """True if the stream is a terminal."""
         return os.isatty(self._descriptor)
 
     def write(self, data: Any, /) -> int:
-        """Write bytes, all of them; how many."""
+        """Write all bytes, and return their number."""
         left = memoryview(data).cast("B")
         size = len(left)
         while left and not self.lost:
@@ -295,7 +295,7 @@ class Stream(io.RawIOBase):
         return size
 
     def close(self) -> None:
-        """Close it; a network's file system may say only now that a disk is full."""
+        """Close the stream. A network file system may report a full disk only now."""
         if self.closed:
             return
         super().close()
@@ -316,7 +316,7 @@ class Stream(io.RawIOBase):
 
 
 class OutputFile:
-    """A file on its way.
+    """Output file that appears in its place only when complete.
 
     Parameters
     ----------
@@ -350,14 +350,14 @@ class OutputFile:
             return self._stack.enter_context(working_folder("output"))
 
     def path(self) -> Path:
-        """Path at which a file is made, until :meth:`keep` puts it in its place."""
+        """Return the temporary path of the file. :meth:`keep` moves the file to its final place."""
         if self._path is None:
             with _told(self._to):
                 self._path = self._stack.enter_context(working_folder("output")) / "output"
         return self._path
 
     def stream(self) -> BinaryIO:
-        """A stream for its bytes, instead of :meth:`path`; it is closed with the output."""
+        """Return a byte stream for the content, instead of :meth:`path`. It closes with the output."""
         with _told(self._to):
             if self._path is None:
                 descriptor = _descriptor(self._to)
@@ -367,7 +367,7 @@ class OutputFile:
         return self._stream
 
     def keep(self) -> None:
-        """It is complete: put it where it belongs.
+        """Complete the output, and move it to its final place.
 
         Raises
         ------
@@ -398,7 +398,7 @@ class OutputFile:
             _copy(place, target, str(self._to))
 
     def discard(self) -> None:
-        """Forget it; what was there before is still there."""
+        """Discard the output. The previous file does not change."""
         if self._stream is not None and not self._stream.closed:
             raw = self._stream.raw
             if isinstance(raw, Stream):
@@ -409,7 +409,7 @@ class OutputFile:
 
 @contextmanager
 def _complete(to: str | Path) -> Generator[OutputFile]:
-    """An output that is kept when the block ends, and discarded if it raises."""
+    """Yield an output. It is kept at the end of the block, or discarded after an exception."""
     output = OutputFile(to)
     try:
         yield output
@@ -420,7 +420,7 @@ def _complete(to: str | Path) -> Generator[OutputFile]:
 
 @contextmanager
 def written(to: str | Path) -> Generator[BinaryIO]:
-    """A stream of bytes that is in its file when the block ends, all of it or nothing.
+    """Yield a byte stream. The file appears complete at the end of the block, or not at all.
 
     Raises
     ------
@@ -433,7 +433,7 @@ def written(to: str | Path) -> Generator[BinaryIO]:
 
 @contextmanager
 def written_text(to: str | Path) -> Generator[TextIO]:
-    """The same for text in UTF-8, line ends as they are given; what has no code is written as an escape."""
+    """Yield a UTF-8 text stream, as :func:`written` does. Line ends stay; invalid characters become escapes."""
     with written(to) as stream:
         text = io.TextIOWrapper(stream, "utf-8", errors="backslashreplace", newline="")
         yield text
@@ -442,7 +442,7 @@ def written_text(to: str | Path) -> Generator[TextIO]:
 
 @contextmanager
 def written_at(to: str | Path) -> Generator[Path]:
-    """A place where a file is to be made, which is in its own place when the block ends.
+    """Yield a temporary path for a new file. The file moves to its final place at the end of the block.
 
     Raises
     ------
@@ -454,7 +454,7 @@ def written_at(to: str | Path) -> Generator[Path]:
 
 
 def write_bytes(to: str | Path, data: bytes) -> None:
-    """Write a file as a whole.
+    """Write a whole file atomically.
 
     Raises
     ------
@@ -476,7 +476,7 @@ def _told(to: Path) -> Generator[None]:
 
 
 def _target(to: Path) -> Path | None:
-    """The file that is to be replaced, behind all links; ``None``: what is there can only be written into."""
+    """Return the file to replace, with links resolved. ``None`` means a pipe, a device or an open stream."""
     try:
         about = to.stat()
     except FileNotFoundError:
@@ -491,7 +491,7 @@ def _target(to: Path) -> Path | None:
 
 
 def _open_here(to: Path, about: os.stat_result) -> int | None:
-    """The descriptor of this process that a name means: of ``/dev/stdout``, say, wherever that goes."""
+    """Return the open descriptor for a name such as ``/dev/stdout``, or ``None``."""
     named = _DESCRIPTOR.fullmatch(str(to))
     if named:
         return int(named[1] or named[2])
@@ -503,7 +503,7 @@ def _open_here(to: Path, about: os.stat_result) -> int | None:
 
 
 def _descriptor(to: Path) -> int:
-    """A descriptor to write into what is there."""
+    """Open a descriptor to write into an existing pipe, device or stream."""
     mine = _open_here(to, to.stat())
     if mine is None:
         return os.open(to, os.O_WRONLY)
@@ -514,7 +514,7 @@ def _descriptor(to: Path) -> int:
 
 
 def _copy(place: Path, to: Path, name: str) -> None:
-    """Write what is in a file into another that cannot be replaced."""
+    """Copy a file into an existing file or stream that is not replaceable."""
     about = to.stat()
     plain = stat.S_ISREG(about.st_mode) and _open_here(to, about) is None
     descriptor = os.open(to, os.O_WRONLY | os.O_TRUNC) if plain else _descriptor(to)
@@ -523,7 +523,7 @@ def _copy(place: Path, to: Path, name: str) -> None:
 
 
 def _as_before(place: Path, target: Path) -> None:
-    """Give a new file the rights of the one that it replaces, and bring it to the disk before that is gone."""
+    """Give the new file the owner and mode of the old one, and flush it to disk."""
     about = target.stat()
     with suppress(OSError):
         os.chown(place, about.st_uid, about.st_gid)

@@ -633,7 +633,7 @@ class SceneGraph:
         return self.reach.between(*ends)
 
     def to_next(self, node: int, what: str) -> float | None:
-        """Distance from an entity along the lanes to the next part of the map of one sort, 0 on it; m.
+        """Return the distance along the lanes to the next map element of one kind, 0 on the element; m.
 
         ``what`` is ``junction``, ``roundabout``, ``crosswalk``, ``stop_line``, ``traffic_light``, …; ``None``
         if there is none within 200 m.

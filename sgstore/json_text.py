@@ -1,4 +1,4 @@
-"""Values as JSON, which has no word for infinite or missing numbers, and the shortest text of numbers."""
+"""JSON text of values, with replacements for infinite numbers and NaN, and the shortest text of numbers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def json_text(value: object, word: Callable[[float], str | None] = lambda _: None) -> str:
-    """A value as compact JSON; numbers that are not finite as :func:`finite` tells them."""
+    """Return a value as compact JSON. Infinite numbers and NaN are replaced as in :func:`finite`."""
     try:
         return json.dumps(value, allow_nan=False, separators=(",", ":"), ensure_ascii=False)
     except (TypeError, ValueError):
@@ -21,7 +21,7 @@ def json_text(value: object, word: Callable[[float], str | None] = lambda _: Non
 
 
 def finite(value: Any, word: Callable[[float], str | None] = lambda _: None) -> Any:
-    """A value as JSON holds it.
+    """Return a value in JSON types, with infinite numbers and NaN replaced by ``word(number)``.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def finite(value: Any, word: Callable[[float], str | None] = lambda _: None) -> 
 
 
 def float32(number: float) -> float | None:
-    """Round a number to 32 bits; ``None`` if it is too large for them."""
+    """Round a number to float32. ``None`` means that it is too large."""
     try:
         return float(struct.unpack("<f", struct.pack("<f", number))[0])
     except OverflowError:
@@ -50,7 +50,7 @@ def float32(number: float) -> float | None:
 
 
 def shortest(number: float | None) -> float | None:
-    """Return the number of 64 bits whose text is the shortest one of a number of 32 bits."""
+    """Return the float64 with the shortest text that rounds to the same float32."""
     if number is None or not math.isfinite(number):
         return number
     texts = (f"{number:.{digits}g}" for digits in range(6, 10))

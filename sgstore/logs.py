@@ -1,4 +1,4 @@
-"""What the library does, for Python's logging: loggers under ``sgstore``, at no cost where nobody listens.
+"""Loggers named ``sgstore.*`` for Python's logging. They cost nothing without a listener.
 
 A program listens as to any other library: ``logging.basicConfig(level="DEBUG")``, or a level and a handler for
 ``logging.getLogger("sgstore")``, as ``--verbose`` of the command line has them. There is a handler that does
@@ -14,9 +14,9 @@ __all__ = ["logger"]
 
 
 class _Logger:
-    """Logger of a room, made when it says something and somebody may listen.
+    """Logger of one topic. It is created at the first message, if logging is in use.
 
-    Whoever listens has imported ``logging``. Where nobody has, it is not imported for us alone.
+    A program that listens has imported ``logging``. Otherwise sgstore does not import it.
     """
 
     def __init__(self, room: str) -> None:
@@ -24,11 +24,11 @@ class _Logger:
         self._logger: Any = None
 
     def debug(self, text: str, *values: object) -> None:
-        """Tell a step of the work: for whoever wants to know what takes long, or what was meant."""
+        """Log one step of the work, for the analysis of slow runs and wrong results."""
         self._tell("debug", text, values)
 
     def info(self, text: str, *values: object) -> None:
-        """Tell what has been done."""
+        """Log a completed task."""
         self._tell("info", text, values)
 
     def _tell(self, level: str, text: str, values: tuple[object, ...]) -> None:
@@ -44,5 +44,5 @@ class _Logger:
 
 
 def logger(room: str) -> _Logger:
-    """The logger of a room: ``sgstore.store`` for ``store``."""
+    """Return the logger of a topic: ``sgstore.store`` for ``store``."""
     return _Logger(room)

@@ -1,4 +1,4 @@
-"""XML of strangers, element by element, in bounded time and memory.
+"""Safe parser of untrusted XML, element by element, with bounds on time and memory.
 
 The parser is the standard library's expat, without a tree. Document type declarations, and with them entities,
 are refused, so that nothing can expand; depth, and the numbers of elements and attributes, are bounded.
@@ -17,7 +17,7 @@ MAX_ATTRIBUTES: Final = 64
 
 
 class MarkupError(ValueError):
-    """A text is no XML, or more than is read; ``element`` is the tag at which a bound was passed."""
+    """Invalid XML, or XML beyond a size limit; ``element`` is the tag that exceeded the limit."""
 
     def __init__(self, reason: str, element: str = "") -> None:
         self.element = element
@@ -25,7 +25,7 @@ class MarkupError(ValueError):
 
 
 class MarkupParser:
-    """XML that is fed in pieces; starts and ends of elements are told as they come.
+    """Incremental XML parser. It calls back at the start and end of each element.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class MarkupParser:
             self._parser.CharacterDataHandler = text
 
     def feed(self, data: str | bytes, *, last: bool = False) -> None:
-        """Take the next piece of the text.
+        """Parse the next piece of the text.
 
         Raises
         ------

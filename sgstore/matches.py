@@ -858,7 +858,7 @@ class Windows:
 def intervals_for_people(
     intervals: Iterable[Interval],
 ) -> tuple[tuple[str, ...], Iterator[tuple[Any, ...]]]:
-    """Columns and rows of intervals, shorter: the first frame as ``trace#seq``, a variable as its name.
+    """Return readable columns and rows of intervals: first frame as ``trace#seq``, variables as their names.
 
     Returns
     -------

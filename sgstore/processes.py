@@ -1,4 +1,4 @@
-"""Python processes of our own, which run what this one runs and nothing that lies around.
+"""Commands for isolated Python child processes with the packages of this process.
 
 A child that is started as usual looks for modules in the current folder and wherever ``PYTHONPATH`` points:
 a ``duckdb.py`` beside somebody's recordings would be run. Here a child is isolated (``python -I``), and is told
@@ -26,7 +26,7 @@ _START: Final = (
 
 
 def command(module: str) -> list[str]:
-    """Command that runs a module as a process: isolated, with the packages of this process.
+    """Return the command that runs a module in an isolated process with the packages of this process.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def command(module: str) -> list[str]:
 
 
 def folders() -> list[str]:
-    """The folders of :data:`NEEDED`: those that were imported from, and for the rest those that are searched.
+    """Return the package folders of :data:`NEEDED`: of imported packages, or else found on ``sys.path``.
 
     The current folder is one of them only if a package was imported from it.
     """
@@ -54,7 +54,6 @@ def folders() -> list[str]:
 
 
 def _imported_from(package: str) -> Path | None:
-    """The folder in which a package lies that is imported already."""
     module = sys.modules.get(package.replace("/", "."))
     file = getattr(module, "__file__", None)
     return Path(file).absolute().parents[package.count("/") + 1] if file else None

@@ -446,7 +446,7 @@ class Store:
         limit: int = 10,
         each_trace: bool = False,
     ) -> list[SimilarFrames]:
-        """Frames like one that is given: first those of the same class, then the most like, in runs.
+        """Return runs of frames similar to an example: first frames of its class, then the most similar.
 
         Two frames are compared by their graphs in an abstraction, as multisets of nodes by label and of edges
         by the labels of edge and ends, with the weighted Jaccard index. Each answer says what is shared, and

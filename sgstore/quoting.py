@@ -1,4 +1,4 @@
-"""Names and texts as they stand in SQL, and what is SQL."""
+"""Quoting of SQL names and texts, and detection of SQL statements."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ _STATEMENT: Final = re.compile(
 
 
 def is_statement(text: str) -> bool:
-    """Tell a statement of SQL from a query, by the first word behind comments."""
+    """True if the text is a SQL statement rather than a query, judged by its first word after comments."""
     return _STATEMENT.match(text) is not None
 
 
 def quoted(name: str) -> str:
-    """An identifier."""
+    """Return a name as a quoted SQL identifier."""
     return '"' + name.replace('"', '""') + '"'
 
 
 def literal(text: str) -> str:
-    """A text between its quotation marks."""
+    """Return a text as a quoted SQL literal."""
     return "'" + text.replace("'", "''") + "'"

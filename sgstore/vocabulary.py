@@ -1,4 +1,4 @@
-"""Kinds, relations and the states of lights: the catalogue of names.
+"""Catalogue of names: kinds, relations and light states.
 
 A *kind* is what an entity or a part of the map is; a *relation* is the name of an edge. Readers, settings,
 imports and stores add kinds of entities, relations and states of lights of their own (:func:`add_kind`,
@@ -151,7 +151,7 @@ LIGHT_STATE_CODE: Final[Mapping[str, int]] = _light_state_code
 
 
 def normalize_name(name: str) -> str:
-    """A name without case and underscores, as names are compared."""
+    """Return a name in lower case without underscores, for comparison."""
     return name.replace("_", "").lower()
 
 
@@ -203,7 +203,7 @@ _asked: Final[ContextVar[Mapping[str, Sequence[str]] | None]] = ContextVar("aske
 
 
 def learn(enum: str, name: str) -> int:
-    """Return the code of a name that a store has, whatever names of other stores look like it.
+    """Return the code of a name from a store, even if another store has a similar name.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ def learn(enum: str, name: str) -> int:
 
 
 def add_relation(name: str) -> int:
-    """Make a relation known to everybody in this process, and return its code.
+    """Register a relation in this process, and return its code.
 
     Raises
     ------
@@ -246,7 +246,7 @@ def add_relation(name: str) -> int:
 
 
 def add_kind(name: str) -> int:
-    """Make a kind of entities known to everybody in this process, and return its code.
+    """Register a kind of entity in this process, and return its code.
 
     Parameters
     ----------
@@ -263,7 +263,7 @@ def add_kind(name: str) -> int:
 
 
 def add_light_state(name: str) -> int:
-    """Make a state of traffic lights known to everybody in this process, and return its code.
+    """Register a traffic light state in this process, and return its code.
 
     Raises
     ------
@@ -282,7 +282,7 @@ def _made(enum: str, name: str) -> int:
 
 
 def _refuse_like_own(enum: str, name: str) -> None:
-    """Refuse a new name that would be taken for one of this package."""
+    """Reject a new name that equals a built-in name, except for case and underscores."""
     folded, like = normalize_name(name), ""
     if enum == "light_state" and folded in _OWN_FOLDED[enum]:
         like = f"the state {_OWN_FOLDED[enum][folded]!r}"
@@ -296,7 +296,7 @@ def _refuse_like_own(enum: str, name: str) -> None:
 
 @contextmanager
 def asking(names: Mapping[str, Sequence[str]] | None) -> Generator[None]:
-    """Let only the names of one store count, beside those that are for everybody.
+    """Limit name lookup inside the block to one store's names, built-in names and registered names.
 
     Parameters
     ----------
@@ -312,12 +312,12 @@ def asking(names: Mapping[str, Sequence[str]] | None) -> Generator[None]:
 
 
 def known_names(enum: str) -> tuple[str, ...]:
-    """Return all names of an enumeration that count here, those of this package first."""
+    """Return all names of an enumeration that are valid here, built-in names first."""
     return (*_OWN[enum], *_others(enum))
 
 
 def _others(enum: str) -> Sequence[str]:
-    """Names that count and are not of this package, those of the store that is asked first."""
+    """Return the valid names that are not built in, names of the queried store first."""
     asked = _asked.get()
     if asked is None:
         return NAMES[enum][len(_OWN[enum]) :]
@@ -326,7 +326,7 @@ def _others(enum: str) -> Sequence[str]:
 
 
 def _meant(enum: str, word: str) -> str | None:
-    """The name that a word means: the same one, else one of this package, else another that is like it."""
+    """Return the known name for a user's word: an exact match, a built-in name, or a similar name."""
     others, folded = _others(enum), normalize_name(word)
     if word in others:
         return word
@@ -341,7 +341,7 @@ def _camel(name: str) -> str:
 
 
 def entity_kinds() -> frozenset[str]:
-    """Return all kinds of entities that are known now."""
+    """Return all currently known kinds of entities."""
     return frozenset(_entity_kinds)
 
 
@@ -349,7 +349,7 @@ _MAPPED: Final = range(len(OWN_ENTITY_KINDS), len(OWN_KINDS))
 
 
 def are_entities(codes: NDArray[np.int8]) -> NDArray[np.bool_]:
-    """Tell which codes of kinds are those of entities; the others are of parts of the map."""
+    """Return a mask of the kind codes of entities. Other codes are map elements."""
     return (codes < _MAPPED.start) | (codes >= _MAPPED.stop)
 
 
@@ -361,7 +361,7 @@ def _add_plugins() -> None:
 
 
 def relation_named(name: str) -> str | None:
-    """The relation that a user's name means, or ``None``."""
+    """Return the relation for a user's word, or ``None`` if unknown."""
     found = _meant("relation", name)
     if found is None:
         _add_plugins()  # looking for them takes a while
@@ -370,7 +370,7 @@ def relation_named(name: str) -> str | None:
 
 
 def kinds_labelled(label: str) -> tuple[str, ...] | None:
-    """The kinds that a label stands for, or ``None``. ``Ego`` is a mark, not a label of kinds."""
+    """Return the kinds with a label, or ``None`` for an unknown label. ``Ego`` is not a label of kinds."""
     own = _OWN_LABELS_FOLDED.get(normalize_name(label))
     if own is not None and label not in _others("kind"):
         return tuple(own)
@@ -379,7 +379,7 @@ def kinds_labelled(label: str) -> tuple[str, ...] | None:
 
 
 def kind_named(word: str) -> str | None:
-    """The one kind that a word names: a kind, or another word for one; ``None`` if it is none or several.
+    """Return the kind for a word or its synonym. ``None`` means no kind, or several kinds.
 
     ``vehicle`` is the kind of that name here, although the label stands for every vehicle.
     """
@@ -391,7 +391,7 @@ def kind_named(word: str) -> str | None:
 
 
 def vague_kind(type_name: str) -> str:
-    """The kind of what bears a type name that no table has: ``vehicle`` if the name says that much.
+    """Return the fallback kind of an unknown type name: ``vehicle`` if the name contains it, else ``unknown``.
 
     ``TYPE_VEHICLE`` is OSI's word for it; CARLA's and nuScenes' names begin with ``vehicle.``.
     """
@@ -401,13 +401,13 @@ def vague_kind(type_name: str) -> str:
 
 
 def labels() -> tuple[str, ...]:
-    """Every label that a pattern may use, in CamelCase, ``Ego`` first."""
+    """Return all labels for patterns in CamelCase, ``Ego`` first."""
     names = dict.fromkeys((*known_names("kind"), *SUPER_KINDS, *LABEL_ALIASES))
     return ("Ego", *map(_camel, names))
 
 
 def natural(name: str) -> tuple[tuple[tuple[int, str], ...], str]:
-    """Sort key for names of traces: as people count, so ``run2`` comes before ``run10``.
+    """Return a sort key for trace names in natural order: ``run2`` before ``run10``.
 
     Digits count as the numbers that they are, letters without regard to case; what is the same then is told
     apart by its characters.
@@ -419,7 +419,10 @@ def natural(name: str) -> tuple[tuple[tuple[int, str], ...], str]:
 
 
 def suggestion(name: str, known: Iterable[str], alike: float = 0.6) -> str | None:
-    """The known name that is most like ``name``, or ``None`` if none is alike by that much, from 0 to 1."""
+    """Return the known name most similar to ``name``.
+
+    ``None`` means no similarity of at least ``alike`` (0 to 1).
+    """
     by_folded = {normalize_name(candidate): candidate for candidate in known}
     close = difflib.get_close_matches(normalize_name(name), by_folded, n=1, cutoff=alike)
     return by_folded[close[0]] if close else None
@@ -427,7 +430,7 @@ def suggestion(name: str, known: Iterable[str], alike: float = 0.6) -> str | Non
 
 @dataclass(frozen=True, slots=True)
 class TypeMeaning:
-    """Meaning of a simulator's type name.
+    """Meaning of a simulator type name.
 
     Attributes
     ----------
@@ -446,7 +449,7 @@ class TypeMeaning:
 
 @cache
 def type_meanings() -> Mapping[str, TypeMeaning]:
-    """The shipped table: type name in lower case → its meaning."""
+    """Return the built-in mapping of simulator types: type name in lower case → meaning."""
     text = resources.files("sgstore").joinpath("vocabulary.toml").read_text(encoding="utf-8")
     return {
         name.lower(): TypeMeaning(**meaning)

@@ -761,7 +761,7 @@ class Origin:
 
 
 def origin_of(frames: FrameBlock) -> Origin | None:
-    """The middle of all that has a place in the first frame that has any, in whole metres.
+    """Return the median position in the first frame with positions, in whole metres.
 
     It is the same for any ego. Where nothing that moves has a place, that of the scenery; ``None`` while
     nothing has one.
