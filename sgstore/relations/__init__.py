@@ -1,9 +1,9 @@
-"""Relations of scene graphs: each is one object, computed by a pure array function over many frames.
+"""Relations of scene graphs: one object each, computed by a pure array function over many frames.
 
-A relation stands in one file of this package and in one line of :mod:`sgstore.plugins`, or in a file of another
-package and in one entry point. Being listed enrols it in the vocabulary, in the generator, in the table of
-``docs/relations.md``, in pictures, and in the law tests: no self edge, symmetric relations symmetric, the same
-when the world is moved and turned, the same frame by frame.
+A relation has one file in this package and one line in :mod:`sgstore.plugins`, or one file in
+another package and one entry point. The registration adds it to the vocabulary, the generator, the
+table of ``docs/relations.md``, pictures, and the law tests: no self edges; symmetric relations are
+symmetric; the result does not change when the world is moved or turned, or frame by frame.
 """
 
 import lazy_loader

@@ -1,14 +1,14 @@
-"""Direction of a related body as another sees it: ahead, behind, to the left, to the right.
+"""Direction of a body relative to another one: ahead, behind, left or right.
 
-An edge goes from what is seen to who sees: *b is in direct front of a* is b → a, by the bearing of b's
-centre in a's axes. Where a's heading is missing there is no edge.
+An edge leads from the seen body to the viewer: *b is in direct front of a* is b → a, by the bearing
+of b's centre in a's axes. Without a heading of a there is no edge.
 
-Bounds and noise. A bound belongs to the sector nearer to dead ahead (45° is still direct front), and dead
-ahead and dead behind are neither left nor right, unless the settings say otherwise. Poses come through
-quaternions, degrees and the rotation of axes, and are kept as float32, so what is exactly on a bound in the
-world arrives up to some 1e-7 rad and a tenth of a millimetre beside it. Otherwise what is dead ahead would
-flicker between left and right: a bearing within :data:`NOISE` of a bound counts as on it, and what is less than
-:data:`BESIDE` off the axis as on it.
+Bounds and noise. A bound belongs to the sector nearer to straight ahead (45° is still direct
+front). Straight ahead and straight behind are neither left nor right, unless the settings differ.
+Poses pass through quaternions, degrees and rotated axes, and are stored as float32. Therefore a
+body exactly on a bound arrives up to 1e-7 rad and a tenth of a millimetre off, and would flicker
+between left and right. So a bearing within :data:`NOISE` of a bound counts as on it, and an offset
+below :data:`BESIDE` counts as on the axis.
 """
 
 from __future__ import annotations
@@ -40,25 +40,25 @@ if TYPE_CHECKING:
 
 
 NOISE: Final = 1e-6
-"""Differences of bearing that mean nothing: a millimetre at a kilometre; rad."""
+"""Bearings that differ by less count as equal: a millimetre at a kilometre; rad."""
 
 BESIDE: Final = 1e-3
-"""What is not farther off the axis is neither left nor right; m."""
+"""A body closer to the axis is neither left nor right; m."""
 
 
 TINY: Final = np.float32(1e-30)
-"""Distances that numbers of 32 bits no longer tell; m."""
+"""Distances below this underflow in 32 bits; m."""
 
 DOUBT: Final = 4e-6
-"""Directions this close to a bound are computed as bearings: more than :data:`NOISE` counts for; rad."""
+"""Directions this close to a bound are computed as bearings; greater than :data:`NOISE`; rad."""
 
 
-# Sectors and sides are told by products of vectors, which are quick. Where these are within their rounding of a
-# bound, or something is missing, the bearing itself is computed: the definition.
+# Vector products decide sectors and sides quickly. If a product is within rounding of a bound, or a
+# value is missing, the bearing itself decides.
 
 
 def _wanted(scene: BlockScene) -> Bools | None:
-    """Mask of the pairs that the settings tell directions of; None: all."""
+    """Return a mask of the pairs that get directions; ``None`` means all pairs."""
     settings, pairs = scene.config.direction, scene.pairs
     wanted: Bools | None = None
     if settings.within > 0:
@@ -90,13 +90,13 @@ def _direction_edges(scene: BlockScene) -> Edges:
 
 
 def _in_loops(scene: BlockScene) -> bool:
-    """Return whether loops tell directions; they know nothing of limits to them."""
+    """True if the numba loops can compute directions: they support no limit by distance or kind."""
     settings = scene.config.direction
     return scene.pairs.in_loops and not settings.kinds and not settings.within > 0
 
 
 def _looking(scene: BlockScene, rows: Rows, codes: Codes) -> Edges:
-    """Edges of some pairs, from what is seen to who sees."""
+    """Return edges of some pairs, from the seen body to the viewer."""
     a, b = scene.pairs.some(rows)
     return edges_between(scene, codes, b, a)
 
@@ -104,7 +104,7 @@ def _looking(scene: BlockScene, rows: Rows, codes: Codes) -> Edges:
 def _sectors(
     scene: BlockScene, bounds: tuple[Floats, Floats], names: Codes
 ) -> tuple[Columns, int, Rows]:
-    """Edges of directions, how many, and the pairs that need the bearing."""
+    """Return edges of directions, their number, and the pairs that need the exact bearing."""
     pairs = scene.pairs
     codes, holds = np.empty(len(pairs), np.int8), np.empty(len(pairs), np.bool_)
     ahead, left = pairs.offsets
@@ -128,7 +128,7 @@ def _sectors(
 
 
 def _by_bearing(settings: Direction, pairs: BodyPairs, rows: Rows) -> tuple[Rows, Rows]:
-    """Of some pairs, rows and sectors, by the bearings; two of what is on a bound, if the settings say so."""
+    """Return rows and sectors of some pairs by bearing; a pair on a bound can have two sectors."""
     bearing = pairs.bearings(rows)
     known = ~np.isnan(bearing)
     rows, bearing = rows[known], bearing[known]
@@ -144,10 +144,10 @@ def _by_bearing(settings: Direction, pairs: BodyPairs, rows: Rows) -> tuple[Rows
 
 
 def _behind(bearing: Floats) -> Bools:
-    """Mask of bearings that CARLASGG, at a bound, takes for the sector behind: from abeam right backwards.
+    """Return a mask of bearings that CARLASGG puts into the rear sector at a bound.
 
-    It looks through its sectors in the order direct front, side front, direct rear, side rear, all of which
-    hold both their bounds. Abeam to the left is 180° in its count; abeam to the right is 360°, not 0°.
+    CARLASGG tests its sectors in the order direct front, side front, direct rear, side rear; all of
+    them include both bounds. Straight left is 180° in its count; straight right is 360°, not 0°.
     """
     aside = np.abs(bearing) - np.pi / 2
     return (aside > NOISE) | ((aside >= -NOISE) & (bearing < 0))
@@ -172,14 +172,14 @@ def _side_edges(scene: BlockScene) -> Edges:
     a, b = pairs.some(doubtful)
     dx, dy = (of[b] - of[a] for of in (scene.bodies.x, scene.bodies.y))
     off_axis = np.sqrt(dx * dx + dy * dy) * np.abs(np.sin(bearing))
-    # Closed: to the last bit, as CARLASGG has it.
+    # Closed bounds, exact to the last bit, as in CARLASGG.
     holds = off_axis > BESIDE if is_open else ~np.isnan(bearing)
     codes = names[np.where(bearing[holds] >= 0, 0, 1)]
     return scene.room.filled(columns, many, _looking(scene, doubtful[holds], codes))
 
 
 def _sides(scene: BlockScene, names: Codes, *, is_open: bool) -> tuple[Columns, int, Rows]:
-    """Edges of sides, how many, and the pairs that need the bearing."""
+    """Return edges of sides, their number, and the pairs that need the exact bearing."""
     pairs = scene.pairs
     ahead, left = pairs.offsets
     codes, beside = np.empty(len(pairs), np.int8), np.float32(BESIDE)
@@ -198,7 +198,7 @@ def _sides(scene: BlockScene, names: Codes, *, is_open: bool) -> tuple[Columns, 
 
 
 def sector(name: str, legend: str = "") -> Relation:
-    """The relation of a sector, by its name."""
+    """Return the relation of a sector by its name."""
 
     def asked(config: Config) -> bool:
         return name in config.direction.names

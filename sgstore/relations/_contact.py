@@ -1,13 +1,13 @@
-"""Pairs of bodies that touch or overlap: a collision, in a simulator.
+"""Pairs of bodies that touch or overlap: collisions, in a simulator.
 
-Footprints meet where their gap is 0, and boxes meet where they do so in height too: a car under a bridge
-touches nothing. Where a height is missing, what counts is the storey (:data:`sgstore.pair_numbers.STOREY`), and
-where the place in height is missing, nothing but the footprints. What has no footprint, or a height of 0 (paint
-on the road), touches nothing, nor does what is pulled or carried touch its carrier. One of the two moves at
-least, and neither is a signal: signals hang over the road as boxes that mean no body.
+Footprints touch if their gap is 0. Boxes must also touch in height: a car under a bridge touches
+nothing. If a height is missing, both must be on one storey (:data:`sgstore.pair_numbers.STOREY`).
+If the vertical position is missing, only the footprints count. A body without a footprint or with
+height 0 (paint on the road) touches nothing. A carried body does not touch its carrier. At least
+one of the two must move, and neither may be a signal, because the boxes of signals hang over the
+road.
 
-It does not depend on how far apart related pairs may be, only on whether pairs that are no ego's are related
-at all.
+The greatest distance of related pairs has no effect here; the setting for pairs without an ego has.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ if TYPE_CHECKING:
 
 
 SURE: Final = 1e-4
-"""Separations this far from a bound need no gap; m."""
+"""Separations farther from a bound need no exact gap; m."""
 
 PLAIN: Final = 1e8
-"""Places and headings below this are exact enough for that; m, rad."""
+"""Positions and headings below this are exact enough for the quick test; m, rad."""
 
 
 def contacts(bodies: Bodies, unwanted: Bools) -> Iterator[tuple[Rows, Rows]]:
-    """Each unordered pair of bodies of a frame that touch.
+    """Yield each unordered pair of bodies of a frame that touch.
 
     Parameters
     ----------
     bodies : Bodies
     unwanted : (F,) bool
-        Frames of which no pairs are wanted; it may change between one chunk and the next.
+        Frames to skip; the caller may change it between chunks.
 
     Yields
     ------
@@ -75,7 +75,7 @@ def contacts(bodies: Bodies, unwanted: Bools) -> Iterator[tuple[Rows, Rows]]:
 
 
 def contacts_of(bodies: Bodies, ego: Rows, frames: Bools) -> tuple[Rows, Rows]:
-    """The bodies that the ego, which is these rows, touches in some of the frames."""
+    """Return the bodies that the ego touches in some of the frames; ``ego`` holds its rows."""
     mine = ego[bodies.frame]
     near = frames[bodies.frame] & (mine >= 0) & (mine != np.arange(len(bodies)))
     others = np.flatnonzero(near & ~IS_SIGNAL[bodies.kind])
@@ -83,7 +83,7 @@ def contacts_of(bodies: Bodies, ego: Rows, frames: Bools) -> tuple[Rows, Rows]:
 
 
 def _touching(bodies: Bodies, a: Rows, b: Rows) -> tuple[Rows, Rows]:
-    """The pairs that touch, in height as far as it is known."""
+    """Return the pairs that touch, compared in height if it is known."""
     close = bodies.moves[a] | bodies.moves[b]
     a, b = a[close], b[close]
     level = solid_pairs(bodies, a, b) & heights_meet(bodies, a, b)
@@ -96,9 +96,9 @@ def _touching(bodies: Bodies, a: Rows, b: Rows) -> tuple[Rows, Rows]:
 
 
 def _separation(bodies: Bodies, a: Rows, b: Rows) -> Floats:
-    """Distance by which the sides of one or the other keep two footprints apart; below 0 where they overlap; m.
+    """Return the distance that one side separates two footprints by; negative if they overlap; m.
 
-    The gap is as large at least. NaN where rounding, or a size that is none, leaves it to the gap.
+    The gap is at least as large. NaN if rounding or a missing size requires the exact gap.
     """
     dx, dy = bodies.x[b] - bodies.x[a], bodies.y[b] - bodies.y[a]
     heading, length, width = bodies.heading, bodies.length / 2, bodies.width / 2

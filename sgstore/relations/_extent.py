@@ -1,9 +1,9 @@
 """Part of the world in the graphs: the range of an ego, as areas of the plane and a band of heights.
 
-An area is a disc, the inside of a polygon in the ego's axes, or a strip along lines (the lanes ahead). An
-entity is in it when its footprint meets it, or its centre lies in it, as the settings say; a part of a map when
-its shape meets it. What is on the edge is in. *Frames without an ego*, or with one whose position (or heading,
-where the area needs one) is missing, have no range: everything is in it.
+An area is a disc, the inside of a polygon in the ego's axes, or a strip along lines (the lanes
+ahead). An entity is in the area if its footprint touches it, or if its centre is in it, depending
+on the settings; a part of a map if its shape touches it. The edge belongs to the area. *Frames
+without an ego*, or without its position (or a needed heading), have no range: everything is in it.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ if TYPE_CHECKING:
 
 
 TOUCH: Final = 1e-9
-"""What is no farther from the edge of an area touches it: rounding; m."""
+"""Tolerance for touching the edge of an area: rounding; m."""
 
 HANG: Final = 6.0
-"""How high above the ground of their storey signals may hang; m. (Clearance over roads is 4.5 to 5.5 m.)"""
+"""Greatest height of signals above the ground of their storey; m. (Clearance over roads is 4.5 to 5.5 m.)"""
 
 STEP: Final = 2.0
-"""From point to point of a lane whose height is looked at; m."""
+"""Distance between the points of a lane for its height; m."""
 MOST_POINTS: Final = 1_000_000
-"""Such points of a map: on 2,000 km of lanes and more they stand farther apart."""
+"""Greatest number of these points per map; above 2,000 km of lanes their distance grows."""
 
 CHUNK: Final = 1 << 18
-"""Footprints times lines that are looked at together: bounds the memory of a crowd."""
+"""Footprints times lines that are processed together: bounds the memory."""
 
 
 @dataclass(frozen=True, slots=True)
 class EgoPoses:
-    """Poses of the egos of some frames; shape (F,). NaN where there is none.
+    """Poses of the egos of some frames; shape (F,). NaN for a missing ego.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class EgoPoses:
 
 @dataclass(frozen=True, slots=True)
 class LaneHeights:
-    """Points along the centre lines of all lanes, and how low and how high each lane lies.
+    """Points along the centre lines of all lanes, with the lowest and highest point of each lane.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class LaneHeights:
 
     @classmethod
     def of(cls, road_map: RoadMap) -> LaneHeights:
-        """The heights of the lanes of a map."""
+        """Compute the heights of the lanes of a map."""
         whole = float(road_map.ribbons.lengths.sum())
         points = road_map.waypoints(max(STEP, whole / MOST_POINTS))
         first = np.searchsorted(points.lane, np.arange(len(road_map.ribbons) + 1))
@@ -97,13 +97,13 @@ class LaneHeights:
 
 
 class Extent:
-    """The range of egos, as settings describe it.
+    """Range of egos, defined by the settings.
 
     Parameters
     ----------
     settings : RangeSettings
     road_map : RoadMap or None
-        Where a corridor runs. Without one it runs straight ahead.
+        The map for corridors along lanes. Without a map a corridor is straight.
     """
 
     def __init__(self, settings: RangeSettings, road_map: RoadMap | None) -> None:
@@ -117,7 +117,7 @@ class Extent:
             self._driving = np.array([t in DRIVING for t in road_map.nodes.lane_type], np.bool_)
 
     def areas(self, egos: EgoPoses) -> Areas:
-        """The areas around egos."""
+        """Return the areas around egos."""
         areas = self._areas(egos)
         areas.heights = self._heights
         return areas
@@ -135,7 +135,7 @@ class Extent:
         return Outlines(settings, egos, np.array(corners))
 
     def _lines(self, egos: EgoPoses) -> tuple[Rows, Floats]:
-        """Pieces of the lines of corridors: frames, and (S, 2, 2) ends."""
+        """Return pieces of corridor lines: frames, and ends (S, 2, 2)."""
         length = self.settings.length
         there = np.flatnonzero(_exist(egos, turned=True))
         none = np.zeros(0, np.intp), np.zeros((0, 2, 2))
@@ -147,7 +147,7 @@ class Extent:
         return np.concatenate([owner, lost]), np.concatenate([ends, straight])
 
     def _lane_lines(self, road_map: RoadMap, egos: EgoPoses, there: Rows) -> tuple[Rows, Floats]:
-        """Centre lines of the lanes that egos are in, in their direction, and of those that follow."""
+        """Return centre lines of the lanes of egos, in their direction, and of the following lanes."""
         points = np.column_stack([egos.x[there], egos.y[there], np.zeros((len(there), 3))])
         points[:, 2] = egos.heading[there]
         hits = road_map.lanes_of(points, egos.ground[there])
@@ -172,23 +172,23 @@ class Extent:
 
 
 class Areas:
-    """The areas of some frames.
+    """Areas of some frames.
 
     Parameters
     ----------
     settings : RangeSettings
     egos : EgoPoses
     reach : float
-        No point of an area is farther from its ego's centre; m.
+        Greatest distance of a point of an area from its ego's centre; m.
     turned : bool
-        Whether the areas follow the ego's heading.
+        True if the areas follow the ego's heading.
 
     Attributes
     ----------
     exist : (F,) bool
-        Whether a frame has an area; in those that have none everything is in range.
+        False for a frame without an area; everything is in range there.
     heights : LaneHeights or None
-        Of the lanes of the map, where storeys matter.
+        Heights of the lanes of the map, if storeys matter.
     """
 
     heights: LaneHeights | None = None
@@ -202,12 +202,12 @@ class Areas:
         self.exist = _exist(egos, turned=turned)
 
     def near(self, x: Floats, y: Floats, extent: Floats) -> tuple[Rows, Rows]:
-        """Frames and rows of things that may be in range in them: a generous cut, by circles.
+        """Return frames and rows of objects that may be in range: a generous filter by circles.
 
         Parameters
         ----------
         x, y, extent : (N,) float64
-            Centres, and greatest distances of a point of each thing from its centre; m.
+            Centres, and greatest distance of a point of each object from its centre; m.
         """
         reach = (self.reach + np.nan_to_num(extent)) * (1 + 1e-9) + TOUCH
         far = np.subtract.outer(self.egos.x, x) ** 2 + np.subtract.outer(self.egos.y, y) ** 2
@@ -223,20 +223,20 @@ class Areas:
         static: bool = False,
         hung: Bools | None = None,
     ) -> Bools:
-        """Mask of the footprints that are in range.
+        """Return a mask of the footprints in range.
 
         Parameters
         ----------
         frame : (N,) int64
         boxes : (N, 5) float64
-            ``x, y, heading, length, width``; m, m, rad, m, m. A footprint without extent or heading is a point;
-            one without position is in no range.
+            ``x, y, heading, length, width``; m, m, rad, m, m. A footprint without extent or heading
+            is a point; a footprint without position is never in range.
         ground : (N,) float64
-            Height of the lower side of each box; m. NaN: any.
+            Height of the lower side of each box; m. NaN means any height.
         static : bool
-            Whether they are entities that never move.
+            True for entities that never move.
         hung : (N,) bool, optional
-            Which may hang above the ground (:data:`HANG`).
+            Mask of the entities that may hang above the ground (:data:`HANG`).
         """
         boxes = boxes.copy()
         by = self.settings.static_by if static else self.settings.by
@@ -252,9 +252,10 @@ class Areas:
         return inside
 
     def parts(self, road_map: RoadMap) -> Bools:
-        """(F, K): which nodes of a map, its column i node -1 - i, are in range of themselves.
+        """Return a mask (F, K) of the map nodes that are in range; column i is node -1 - i.
 
-        Roads and junctions have no shape: they are in range where a lane of theirs is. ``off_road`` never is.
+        Roads and junctions have no shape: they are in range if one of their lanes is. ``off_road``
+        never is.
         """
         inside = np.ones((len(self.egos), len(road_map.nodes)), np.bool_)
         there = np.flatnonzero(self.exist)
@@ -263,7 +264,8 @@ class Areas:
         inside[rows, -1 - nodes] = True
         if self.heights is not None:
             self._keep_storey(road_map, self.heights, inside)
-        # Let roads be in range where one of their lanes is, and what roads are in where one of these is.
+        # A road is in range if one of its lanes is; a parent of roads is in range if one of them
+        # is.
         kind, edges = road_map.nodes.kind, road_map.edges
         within = edges.relation == RELATION_CODE["isIn"]
         child, parent = -1 - edges.src[within], -1 - edges.dst[within]
@@ -276,26 +278,27 @@ class Areas:
         return inside
 
     def _meet(self, frame: Ints, boxes: Floats) -> Bools:
-        """Mask of the boxes that meet the areas of their frames."""
+        """Return a mask of the boxes that touch the areas of their frames."""
         raise NotImplementedError
 
     def _meet_map(self, road_map: RoadMap) -> tuple[Rows, Ints]:
-        """Frames, and nodes of the map that meet their areas."""
+        """Return frames, and nodes of the map that touch their areas."""
         raise NotImplementedError
 
     def _level(self, frame: Ints, away: Floats, height: Floats, hung: Bools | None = None) -> Bools:
-        """Mask of the heights, at these distances, that are on the storey of an ego."""
+        """Return a mask of the heights, at these distances, that are on the storey of an ego."""
         rise = height - self.egos.ground[frame]
         lowest, highest = self.settings.height
-        if hung is not None:  # as low as it may have to be
+        if hung is not None:  # the lowest possible height
             rise = np.where(hung, np.clip(highest, rise - HANG, rise), rise)
-        off = (rise < lowest) | (rise > highest)  # what is missing is not off
+        off = (rise < lowest) | (rise > highest)  # missing values stay in range
         return ~off | (np.abs(rise) < self.settings.grade * away) | ~self.exist[frame]
 
     def _keep_storey(self, road_map: RoadMap, heights: LaneHeights, inside: Bools) -> None:
-        """Take out what is on other storeys: lanes by points of their centre lines, else by the node's height.
+        """Remove map nodes on other storeys: lanes by their points, other nodes by their height.
 
-        A lane is on the storey when one of its points within reach is; if none is in reach, its nearest counts.
+        A lane is on the storey if one of its points within reach is. If no point is within reach,
+        the nearest point counts.
         """
         nodes, lanes = road_map.nodes, len(heights.low)
         frame, column = np.nonzero(inside & self.exist[:, None])
@@ -307,7 +310,7 @@ class Areas:
         inside[at[off], place[off]] = False
 
         frame, lane = frame[is_lane], column[is_lane] - 1
-        # Of most lanes all points are on the storey; only of the others they are looked at one by one.
+        # Most lanes are completely on the storey; only the other lanes need a test of their points.
         level = self._level(frame, np.zeros(len(frame)), heights.low[lane])
         level &= self._level(frame, np.zeros(len(frame)), heights.high[lane])
         frame, lane = frame[~level], lane[~level]
@@ -315,7 +318,7 @@ class Areas:
         inside[frame[~kept], 1 + lane[~kept]] = False
 
     def _touch_storey(self, heights: LaneHeights, frame: Ints, lane: Ints) -> Bools:
-        """Mask of the lanes that have a point on the storey of the ego of a frame."""
+        """Return a mask of the lanes with a point on the storey of the ego of a frame."""
         points, count = heights.points, np.diff(heights.first)[lane]
         owner, point = spread(heights.first[lane], count)
         at = frame[owner]
@@ -328,7 +331,7 @@ class Areas:
 
 
 class Discs(Areas):
-    """All within a distance of the ego's centre."""
+    """Discs around the ego's centre."""
 
     def __init__(self, settings: RangeSettings, egos: EgoPoses, radius: float) -> None:
         super().__init__(settings, egos, radius, turned=False)
@@ -343,7 +346,7 @@ class Discs(Areas):
 
 
 class Outlines(Areas):
-    """The inside of a polygon in the ego's axes.
+    """Polygons in the ego's axes.
 
     Parameters
     ----------
@@ -376,7 +379,7 @@ class Outlines(Areas):
         return inside
 
     def _inside(self, frame: Ints, x: Floats, y: Floats) -> Bools:
-        """Mask of the points that lie inside: a ray from them to the left crosses an odd number of sides."""
+        """Return a mask of the points inside: a ray to the left crosses an odd number of sides."""
         odd = np.zeros(len(x), np.bool_)
         ends = np.roll(self._corners, -1, axis=1)
         for side in range(self._corners.shape[1]):
@@ -394,16 +397,16 @@ class Outlines(Areas):
 
 
 class Strips(Areas):
-    """All within half a width of lines.
+    """Strips around lines, with half a width on each side.
 
     Parameters
     ----------
     settings : RangeSettings
     egos : EgoPoses
     frame : (S,) intp
-        The frame that each line belongs to.
+        Frame of each line.
     ends : (S, 2, 2) float64
-        Both its ends; m.
+        Both ends; m.
     """
 
     def __init__(self, settings: RangeSettings, egos: EgoPoses, frame: Rows, ends: Floats) -> None:
@@ -434,7 +437,7 @@ class Strips(Areas):
         return inside
 
     def _meet_map(self, road_map: RoadMap) -> tuple[Rows, Ints]:
-        # An ego that drives on leaves most pieces of its lanes as they are: each is asked about once.
+        # Consecutive frames share most pieces of lanes: each distinct piece is tested once.
         ends, same = np.unique(self._ends.reshape(-1, 4), axis=0, return_inverse=True)
         rows, nodes = road_map.near_shapes(ends.reshape(-1, 2, 2), self.settings.width / 2)
         line, index = joined(rows, same.ravel())
@@ -447,14 +450,14 @@ def _exist(egos: EgoPoses, *, turned: bool) -> Bools:
 
 
 def _as_boxes(ends: Floats) -> Floats:
-    """(S, 5): lines (S, 2, 2) as boxes without width."""
+    """Return lines (S, 2, 2) as boxes without width, (S, 5)."""
     x, y = (ends[:, 0] + ends[:, 1]).T / 2
     dx, dy = (ends[:, 1] - ends[:, 0]).T
     return np.stack([x, y, np.arctan2(dy, dx), np.hypot(dx, dy), np.zeros(len(ends))], axis=1)
 
 
 def _along(road_map: RoadMap, lane: Ints, x: Floats, y: Floats) -> Floats:
-    """Length of each lane's centre line up to the place that is nearest to its point; m."""
+    """Return the length of each lane's centre line up to the place nearest to its point; m."""
     ribbons = road_map.ribbons
     first, count = ribbons.offsets[lane], np.diff(ribbons.offsets)[lane] - 1
     owner, row = spread(first, count)
@@ -472,7 +475,7 @@ def _along(road_map: RoadMap, lane: Ints, x: Floats, y: Floats) -> Floats:
 
 
 def _pieces(road_map: RoadMap, lane: Ints, begin: Floats, end: Floats) -> tuple[Rows, Floats]:
-    """Centre lines from one length to another, cut at their cross sections: owners, and (S, 2, 2) ends."""
+    """Return pieces of centre lines between two lengths: owners, and ends (S, 2, 2)."""
     ribbons = road_map.ribbons
     owner, row = spread(ribbons.offsets[lane], np.diff(ribbons.offsets)[lane] - 1)
     here = (ribbons.along[row] < end[owner]) & (ribbons.along[row + 1] > begin[owner])

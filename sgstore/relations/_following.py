@@ -1,25 +1,25 @@
-"""The relations ``leads`` and ``follows``, and parked vehicles.
+"""Relations ``leads`` and ``follows``, and parked vehicles.
 
-Who drives behind whom along the lanes: ``leads``, from the next one ahead, and ``follows``, to it.
+``leads`` is from the next vehicle ahead along the lanes, ``follows`` is to it.
 
-What takes part are vehicles, parked ones too, on lanes for traffic, which face along their lane (by less than
-a right angle: who comes towards one leads nobody). Who never moves follows nobody, and a trailer does not
-follow what pulls it.
+Vehicles take part, also parked ones, on lanes for traffic that they face along (by less than a
+right angle). A vehicle that never moves follows no other. A trailer does not follow its tractor.
 
-*Its own lanes* are the primary lane of an entity and, in a junction, where lanes lie on one another, every
-other lane of the same junction that its centre is in and, if it is a vehicle, that runs its way
-(:data:`SAME_WAY`): a vehicle at the mouth of a junction is on all the ways that begin there. They are kept,
-because how far it is along the lanes from any entity to any other is told by them (``lane_dist``).
+*Own lanes* are the primary lane of an entity and some other lanes of its junction, where lanes
+overlap: those that contain its centre and, for a vehicle, have its direction (:data:`SAME_WAY`).
+Therefore a vehicle at the entry of a junction is on all ways that begin there. They are stored,
+because the distance along the lanes (``lane_dist``) depends on them.
 
-*The next one ahead* is the one that comes first from the vehicle's centre on along the lane and, where nobody
-is before it on its lane, along the lanes that ``travelsTo`` leads to, through junctions too. Where the way
-forks, each branch has a next one: what the vehicle will do is not known, so all of them lead it, and the gap
-tells them apart. Where ways join, vehicles on several of them may have the same next one. Of two whose centres
-are equally far the one with the lower node id counts as the nearer. Lane changes are no ways on, and what is
-farther away along the lanes than the settings look leads nobody.
+*The next one ahead* is the first vehicle after the vehicle's centre along the lane. If there is
+none on this lane, the search continues along ``travelsTo``, also through junctions. At a fork each
+branch has a next one: the future way is unknown, so all of them lead the vehicle, with different
+gaps. Where ways join, vehicles on several ways can have the same next one. At equal distance the
+lower node id counts as nearer. Lane changes are not followed. A vehicle farther along the lanes
+than the settings allow leads no other.
 
-*The gap* is the distance of the centres along the centre lines less half of both lengths: from bumper to
-bumper, 0 where they overlap, and missing where a length is. Of several ways the shortest counts.
+*The gap* is the distance of the centres along the centre lines minus half of both lengths: from
+bumper to bumper, 0 for an overlap, missing for an unknown length. Of several ways the shortest
+counts.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 
 
 class LaneNet:
-    """The lanes of a map as a net of ways, counted from 0.
+    """Graph of the lanes of a map; lanes are counted from 0.
 
     Parameters
     ----------
@@ -69,9 +69,9 @@ class LaneNet:
     lengths, widths : (L,) float64
         Lengths and mean widths; m.
     traffic : (L,) bool
-        Whether they are made for vehicles of any kind.
+        True for lanes for vehicles of any kind.
     junction : (L,) int64
-        Number of the junction; -1 where there is none.
+        Number of the junction, or -1.
     """
 
     def __init__(self, road_map: RoadMap) -> None:
@@ -84,7 +84,7 @@ class LaneNet:
         numbers = [names[name] if name else -1 for name in nodes.junction[lanes]]
         self.junction = np.array(numbers, np.int64)
         flow = (edges.relation == RELATION_CODE["travelsTo"]) & (edges.src >= -1 - count)
-        src, dst = -2 - edges.src[flow], -2 - edges.dst[flow]  # waypoints have ways of their own
+        src, dst = -2 - edges.src[flow], -2 - edges.dst[flow]  # waypoints have their own edges
         order = np.lexsort((dst, src))
         self._next = dst[order]
         self._first = np.searchsorted(src[order], np.arange(count + 1))
@@ -93,13 +93,13 @@ class LaneNet:
         self._from = np.searchsorted(dst[order], np.arange(count + 1))
 
     def onward(self, lane: Ints) -> tuple[Rows, Ints]:
-        """For each lane in turn the lanes that follow: rows of the question, and lanes."""
+        """Return the next lanes of each lane: rows of the query, and lanes."""
         first = self._first[lane]
         owner, index = spread(first, self._first[lane + 1] - first)
         return owner, self._next[index]
 
     def upstream(self, lane: int, along: float, limit: float) -> Ints:
-        """Lanes from which a place lies ahead: its own, and those that end up to ``limit`` m before it."""
+        """Return the lane of a place and the lanes that end up to ``limit`` m before it."""
         nearest: dict[int, float] = {lane: 0.0}
         queue, settled = [(along, lane)], set[int]()
         while queue:
@@ -118,16 +118,16 @@ class LaneNet:
 
 
 RUN: Final = 8
-"""Pieces of a centre line that are passed over together where none of them can be the nearest."""
+"""Number of pieces of a centre line that are skipped together if none of them can be the nearest."""
 
 
 class Centrelines:
-    """The centre lines of all lanes, to be asked for places along them.
+    """Centre lines of all lanes, for look-ups of places along them.
 
     Parameters
     ----------
     ribbons : Ribbons
-        Of which the straight lines between the middles of cross sections are taken.
+        The straight lines between the middles of their cross sections are used.
     """
 
     def __init__(self, ribbons: Ribbons) -> None:
@@ -138,7 +138,8 @@ class Centrelines:
         self._run_x, self._run_y = np.diff(x), np.diff(y)
         squared = self._run_x**2 + self._run_y**2
         self._squared = np.where(squared > 0, squared, 1.0)
-        # Runs of pieces: of each lane the first and the number, of each run its pieces and a circle around it.
+        # Runs of pieces: the first run and the number of runs of each lane; the pieces and a circle
+        # of each run.
         self._runs = -(-self._count // RUN)
         self._first_run = np.cumsum(self._runs) - self._runs
         lane, number = spread(np.zeros(len(self._runs), np.int64), self._runs)
@@ -151,7 +152,7 @@ class Centrelines:
         np.maximum.at(self._radius, run, far)
 
     def along(self, lane: Ints, x: Floats, y: Floats) -> Floats:
-        """Length of the centre line from the lane's start up to the foot of the perpendicular from a place.
+        """Return the length of the centre line from the lane's start to the foot of a place.
 
         Parameters
         ----------
@@ -163,8 +164,8 @@ class Centrelines:
         Returns
         -------
         (N,) float64
-            m. The foot is the nearest point, of several the first; where that is an end of the lane, it is
-            where the lane would be if it went straight on: below 0, or above its length.
+            m. The foot is the nearest point, the first of several. At an end of the lane it
+            continues along the straight extension: below 0, or above the lane's length.
         """
         if worth():
             from sgstore.relations import _loops
@@ -185,7 +186,7 @@ class Centrelines:
         onward = (away_x * run_x + away_y * run_y) / self._squared[piece]
         share = np.minimum(np.maximum(onward, 0.0), 1.0)
         squared = (away_x - share * run_x) ** 2 + (away_y - share * run_y) ** 2
-        # Every lane has a piece at least, so each owner has a first that is the nearest.
+        # Every lane has at least one piece, so each owner has a nearest piece.
         starts = np.flatnonzero(np.diff(owner, prepend=-1))
         least = np.minimum.reduceat(squared, starts)
         nearest = np.flatnonzero(squared == least[owner])
@@ -198,7 +199,7 @@ class Centrelines:
         return before + np.where(out, onward, share[at]) * (after - before)
 
     def _near(self, lane: Ints, x: Floats, y: Floats) -> tuple[Rows, Rows]:
-        """Places, and pieces of their lanes among which the nearest are, by circles around runs of pieces."""
+        """Return places, and the pieces of their lanes that may be nearest, by circles around runs."""
         first, count = self._first_run[lane], self._runs[lane]
         owner, run = spread(first, count)
         away = np.hypot(
@@ -216,10 +217,10 @@ class Centrelines:
 
 
 class SignalReach:
-    """The lanes upstream of the signals of a map, looked up when first asked.
+    """Lanes upstream of the signals of a map, computed on first use.
 
-    A signal stands on each lane that it controls, where the map has it, at the foot of the perpendicular. It
-    may affect this lane, and those that end at most the given distance before it along the lanes.
+    A signal is on each lane that it controls, at the foot of its place. It may affect this lane,
+    and the lanes that end at most the given distance before it.
 
     Parameters
     ----------
@@ -227,7 +228,7 @@ class SignalReach:
     net : LaneNet
     lines : Centrelines
     ahead : float
-        The distance; m. 0: nothing is affected.
+        The distance; m. With 0, signals affect no lanes.
     """
 
     def __init__(self, road_map: RoadMap, net: LaneNet, lines: Centrelines, ahead: float) -> None:
@@ -242,14 +243,14 @@ class SignalReach:
         self._known: dict[int, Ints] = {}
 
     def of(self, signal: str, place: tuple[float, float]) -> Ints:
-        """Node ids of the lanes that a signal may affect; none for one whose lanes nobody knows.
+        """Return node ids of the lanes that a signal may affect; empty if its lanes are unknown.
 
         Parameters
         ----------
         signal : str
-            Its id in the map, or what :func:`sgstore.roads.lanes_ref` makes of its lanes.
+            Its id in the map, or the result of :func:`sgstore.roads.lanes_ref`.
         place : (float, float)
-            Where it stands, if the map does not have it; m, NaN if unknown.
+            Its position, if the map does not have the signal; m, NaN if unknown.
         """
         column = self._of.get(signal)
         if column is not None:
@@ -259,12 +260,12 @@ class SignalReach:
         return self._upstream(-2 - self._map.lanes_of_signal(signal), *place)
 
     def of_map(self, present: Bools) -> tuple[Ints, Ints]:
-        """Node ids of the signals of the map that are present in any frame, and of lanes that they may affect.
+        """Return node ids of map signals that are present in any frame, and of lanes that they may affect.
 
         Parameters
         ----------
         present : (F, K) bool
-            Which nodes of the map are in which graph.
+            Mask of the map nodes in each graph.
         """
         here = self._columns[present[:, self._columns].any(axis=0)].tolist()
         lanes = [np.zeros(0, np.int64), *(self._lanes(column) for column in here)]
@@ -281,7 +282,7 @@ class SignalReach:
         return self._known[column]
 
     def _upstream(self, controlled: Ints, x: float, y: float) -> Ints:
-        """Node ids of lanes, and of those before them; both given as rows of the lanes."""
+        """Return node ids of these lanes and the lanes before them."""
         places = np.zeros(len(controlled))
         if np.isfinite(x) and np.isfinite(y):
             here = np.ones(len(controlled))
@@ -298,7 +299,7 @@ class SignalReach:
 # The relations ``leads`` and ``follows``, and parked vehicles -----------------------------------
 
 SAME_WAY: Final = np.pi / 4
-"""Greatest difference of heading from a lane of a junction that a vehicle takes; rad."""
+"""Greatest difference of heading between a vehicle and its lane in a junction; rad."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -323,7 +324,7 @@ class OwnLanes:
     along: Floats
 
     def first_in(self, key: Ints, but: Rows) -> tuple[Rows, Rows]:
-        """The first vehicle in each lane of a frame where there is any but this one: rows asked, and found."""
+        """Find the first other vehicle in each lane of a frame; return rows of query and vehicles."""
         place = np.searchsorted(self.key, key)
         last = max(len(self.key) - 1, 0)
         itself = (self.row[np.minimum(place, last)] == but) & (place <= last)
@@ -333,7 +334,7 @@ class OwnLanes:
 
 
 def own_hits(net: LaneNet, bodies: Bodies, hits: LaneHits) -> Bools:
-    """Of each lane that a body touches whether it is one of its own."""
+    """Return a mask of the hits on a body's own lanes."""
     lane = -2 - hits.lane
     junction = np.full(len(bodies), -1)
     junction[hits.row[hits.primary]] = net.junction[lane[hits.primary]]
@@ -344,7 +345,7 @@ def own_hits(net: LaneNet, bodies: Bodies, hits: LaneHits) -> Bools:
 
 
 def own_lanes(net: LaneNet, bodies: Bodies, standing: Standing) -> OwnLanes:
-    """The vehicles that take part, on the lanes that are their own and that they face along."""
+    """Return the vehicles on their own lanes that they face along."""
     hits = standing.hits
     lane = -2 - hits.lane
     own = standing.own & (np.abs(hits.heading_error) < np.pi / 2)
@@ -358,14 +359,14 @@ def own_lanes(net: LaneNet, bodies: Bodies, standing: Standing) -> OwnLanes:
 
 
 def next_ahead(net: LaneNet, bodies: Bodies, standing: Standing, limit: float) -> Column:
-    """Pairs of a body and the next one ahead on its way, as rows of bodies, and the gap; each pair once.
+    """Return pairs of a body and the next one ahead, as rows of bodies, and the gap; each pair once.
 
     Parameters
     ----------
     net : LaneNet
     bodies : Bodies
     standing : Standing
-        What they stand on.
+        Map parts under the bodies.
     limit : float
         Greatest distance of the centres along the lanes; m.
     """
@@ -388,13 +389,13 @@ def next_ahead(net: LaneNet, bodies: Bodies, standing: Standing, limit: float) -
 
 
 def _beyond(net: LaneNet, own: OwnLanes, limit: float) -> list[Column]:
-    """The next ones of those who are the last on their lane, searched lane after lane."""
+    """Find the next vehicles ahead of the last vehicle on each lane, lane after lane."""
     source = np.flatnonzero(np.append(own.key[1:] != own.key[:-1], True)[: len(own.key)])
     at, base = own.lane[source], own.key[source] - own.lane[source]
     distance = net.lengths[at] - own.along[source]
     parts: list[Column] = []
     best: Best = (np.zeros(0, np.int64), np.zeros(0))
-    # A shortest way comes to no lane twice.
+    # A shortest way never visits a lane twice.
     for _ in range(len(net.lengths)):
         fork, at = net.onward(at)
         source, base, distance = source[fork], base[fork], distance[fork]
@@ -415,7 +416,7 @@ def _beyond(net: LaneNet, own: OwnLanes, limit: float) -> list[Column]:
 
 
 def _nearer(key: Ints, distance: Floats, best: Best) -> tuple[Rows, Best]:
-    """Rows of the fronts that are where none was as near before, the nearest of each; and the best so far."""
+    """Return rows of the fronts that improve the best distance, and the updated best distances."""
     known, least = best
     place = np.minimum(np.searchsorted(known, key), max(len(known) - 1, 0))
     again = known[place] == key if len(known) else np.zeros(len(key), np.bool_)
@@ -431,7 +432,7 @@ def _nearer(key: Ints, distance: Floats, best: Best) -> tuple[Rows, Best]:
 
 
 def gaps(bodies: Bodies, ground: MapContext | None) -> LaneGaps:
-    """Pairs of a follower and the one it follows, by node ids, and the gaps."""
+    """Return pairs of a follower and its leader, by node ids, and the gaps."""
     none = np.zeros(0, np.intp)
     a, b, gap = (none, none, np.zeros(0)) if ground is None else ground.following
     return LaneGaps(bodies.frame[a], bodies.node[a], bodies.node[b], gap)
@@ -463,28 +464,28 @@ LEADS, FOLLOWS = (
 # Which vehicles are parked: what can be told only when all of a trace has been seen -------------
 
 MOVED: Final = 0.3
-"""What has not come farther than this from where it was first seen has not moved: poses tremble; m."""
+"""An entity that stays within this distance of its first position has not moved: poses tremble; m."""
 
 
 class Parking:
-    """Record of a trace's vehicles so far, to tell parked ones; it grows with their number, not with time.
+    """Record of a trace's vehicles that finds parked ones; memory grows with vehicles, not with time.
 
-    A vehicle is parked if the simulator has it as static; or if it does not move in the whole trace and never
-    stands on a lane for driving above all others (its primary lane). Without a map nothing is known of those
-    that do not move, nor of those that were never in range; whatever moves is not parked.
+    A vehicle is parked if the simulator marks it as static. It is also parked if it does not move
+    in the whole trace and a lane for driving is never its primary lane. Without a map, or without
+    time in range, the state of an unmoved vehicle is unknown. A moving vehicle is never parked.
     """
 
     def __init__(self) -> None:
         self._vehicle: Bools = np.zeros(0, np.bool_)
         self._static: Bools = np.zeros(0, np.bool_)
         self._moved: Bools = np.zeros(0, np.bool_)
-        # In graphs, and in all that is known.
+        # Row 0: in graphs; row 1: in all known states.
         self._stood: Bools = np.zeros((2, 0), np.bool_)
         self._drove: Bools = np.zeros((2, 0), np.bool_)
         self._place: Floats = np.zeros((0, 2))
 
     def learn(self, entities: Entities) -> None:
-        """Take note of entities that appear for the first time."""
+        """Register entities on their first appearance."""
         no: Bools = np.zeros(len(entities), np.bool_)
         self._vehicle = np.append(self._vehicle, IS_VEHICLE[entities.kind])
         self._static = np.append(self._static, entities.static)
@@ -496,7 +497,7 @@ class Parking:
         self._place = np.concatenate([self._place, np.full((len(entities), 2), np.nan)])
 
     def see(self, states: States) -> None:
-        """Take note of where things are, in the order of frames."""
+        """Register positions, in the order of frames."""
         place = np.column_stack([states.x, states.y])
         node = states.node
         known = np.flatnonzero(np.isfinite(place).all(axis=1))
@@ -509,9 +510,9 @@ class Parking:
     def stand(
         self, bodies: Bodies, standing: Standing, driving: Bools, *, beyond: bool = False
     ) -> None:
-        """Take note of what things stand on; ``driving``: which nodes of the map are lanes for driving.
+        """Register the map parts under bodies; ``driving`` is the mask of driving lanes among the map nodes.
 
-        ``beyond``: they are all that is known, not only those in graphs.
+        ``beyond``: the bodies are all known ones, not only those in graphs.
         """
         hits = standing.hits
         primary = hits.primary & driving[-1 - hits.lane]
@@ -520,12 +521,12 @@ class Parking:
 
     @property
     def parked(self) -> Codes:
-        """(n,): 1: parked, 0: not, -1: not known, or no vehicle; as graphs tell."""
+        """Return 1 for parked, 0 for not parked, -1 for unknown or other kinds, (n,); within graphs."""
         return self._parked(0)
 
     @property
     def world_parked(self) -> Codes:
-        """(n,): the same, as all that is known tells."""
+        """Return the same codes as :meth:`parked`, from all known states, (n,)."""
         return self._parked(1)
 
     def _parked(self, row: int) -> Codes:

@@ -1,14 +1,13 @@
-"""What pulls or carries what: trailers and riders, and the relation ``tows``.
+"""Trailers and riders with their carriers, and the relation ``tows``.
 
-A trailer and its tractor touch for ever, and so do a rider and the bicycle: that is no collision, and neither
-follows the other. So they are no pair: no other relation holds between them but those of direction and sight,
-and the numbers of the pair are unknown.
+A trailer and its tractor touch all the time, as a rider and the bicycle do. This is not a
+collision, and neither follows the other. Therefore they are not a pair: only relations of direction
+and sight hold between them, and the numbers of the pair are unknown.
 
-*Who is carried* is said by the recording (:attr:`sgstore.world.Entities.trailer`), whatever the kind of what is
-pulled, or seen: a trailer that
-touches a vehicle ahead of it, or a person whose centre is within the footprint of a two-wheeler and who faces
-its way, in the first frame that has both. What touches later has come there. A pair ends for good where the
-two are farther apart than :data:`APART`.
+*The carrier* comes from the recording (:attr:`sgstore.world.Entities.trailer`), for any kind of
+carried entity, or from geometry: a trailer that touches a vehicle ahead of it, or a person with the
+centre in the footprint of a two-wheeler and the same heading, in the first frame that has both.
+Later contacts do not count. A pair ends for good when the distance exceeds :data:`APART`.
 """
 
 from __future__ import annotations
@@ -44,10 +43,10 @@ if TYPE_CHECKING:
 
 
 APART: Final = 5.0
-"""Gap from which on a trailer is no longer hitched; m."""
+"""Greatest gap of a hitched trailer; m."""
 
 _FACES: Final = 0.7
-"""Cosine of the angle to which a rider faces along the bicycle."""
+"""Least cosine of the angle between rider and bicycle."""
 
 _TRAILER: Final = KIND_CODE["trailer"]
 _PERSON: Final = KIND_CODE["person"]
@@ -55,7 +54,7 @@ _IS_TWO_WHEELER: Final = kinds_mask(tuple(SUPER_KINDS["two_wheeler"]))
 
 
 class Hitches:
-    """Record of what is carried in a trace so far; it grows with the number of entities, not with time."""
+    """Record of the carriers in a trace; memory grows with entities, not with time."""
 
     def __init__(self) -> None:
         self._kind: Codes = np.zeros(0, np.int8)
@@ -65,7 +64,7 @@ class Hitches:
         self._said: dict[str, int] = {}
 
     def learn(self, entities: Entities) -> None:
-        """Take note of entities that appear for the first time."""
+        """Register entities on their first appearance."""
         count = len(entities)
         self._kind = np.append(self._kind, entities.kind)
         self._seen = np.append(self._seen, np.zeros(count, np.bool_))
@@ -79,13 +78,13 @@ class Hitches:
             self._carrier[self._vehicles[trailer]] = self._said.pop(trailer)
 
     def see(self, frames: FrameBlock, bodies: Callable[[Rows], Bodies]) -> Ints:
-        """Carrier of each state of the next block: node id, or -1.
+        """Return the carrier of each state of the next block: node id, or -1.
 
         Parameters
         ----------
         frames : FrameBlock
         bodies : function
-            Some of the states as bodies.
+            Function from rows of states to bodies.
         """
         states = frames.states
         carrier = states.carrier
@@ -120,7 +119,7 @@ class Hitches:
             self._carrier[of.node[one[order]]] = of.node[other[order]]
 
     def _fits(self, of: Bodies, one: Rows, other: Rows) -> Bools:
-        """Mask of pairs of which one can be carried by the other."""
+        """Return a mask of pairs where the second body can carry the first."""
         dx, dy = of.x[other] - of.x[one], of.y[other] - of.y[one]
         ahead, _ = offsets(dx, dy, of.heading[one])
         pulled = (of.kind[one] == _TRAILER) & IS_VEHICLE[of.kind[other]] & (ahead > 0)
@@ -134,7 +133,7 @@ class Hitches:
     def _parted(
         self, bodies: Callable[[Rows], Bodies], frames: FrameBlock, rows: Rows, carrier: Ints
     ) -> Ints:
-        """The carriers of a block, without those that are left behind in it."""
+        """Return the carriers of a block, without pairs that end in it."""
         states, frame = frames.states, frames.frame_of
         count = len(self._seen)
         key = frame * count + states.node
@@ -151,7 +150,7 @@ class Hitches:
 
 
 def new_frames(frames: FrameBlock, new: Bools) -> Bools:
-    """Mask of the states in frames in which something is seen for the first time."""
+    """Return a mask of the states in frames with a new entity."""
     first = _first(frames.states.node[new], frames.frame_of[new], int(frames.states.node.max()) + 1)
     wanted = np.zeros(len(frames), np.bool_)
     wanted[first[first >= 0]] = True
@@ -159,7 +158,7 @@ def new_frames(frames: FrameBlock, new: Bools) -> Bools:
 
 
 def _first(node: Ints, frame: Ints, count: int) -> Ints:
-    """(count,): the first frame of each node; -1 of those that are in none."""
+    """Return the first frame of each node, or -1, (count,)."""
     first = np.full(count, -1)
     order = np.lexsort((-frame, node))
     first[node[order]] = frame[order]

@@ -1,11 +1,11 @@
-"""The relation ``isIn``, and lanes that signals control.
+"""Relation ``isIn``, and the lanes that signals control.
 
-What bodies stand on: lanes of any type, waypoints, crosswalks, or nothing that is made for driving.
+Bodies are on lanes of any type, waypoints, crosswalks, or off the road.
 
-A footprint is in every lane that it meets on its storey; how far, and which of them is the one above all, are
-attributes that go beside the edges (:class:`sgstore.graph.LaneStates`). What stands on no driving lane is in
-``off_road``, whether or not it is in a lane of another type too: whatever moves, and of the scenery vehicles,
-persons, animals and props. Signals hang over roads rather than stand on them, and are in nothing.
+A footprint is in every lane that it touches on its storey. The overlap and the primary lane are
+attributes (:class:`sgstore.graph.LaneStates`). A body without a driving lane is in ``off_road``,
+even if it is in a lane of another type. This holds for moving entities, and for static vehicles,
+persons, animals and props. Signals hang over roads and are in nothing.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ IS_IN = Relation(
 )
 
 
-# Which lanes signals apply to, and which lie upstream of them, as far as those lanes are in range ----
-# A signal of the trace ``controlsTrafficOf`` the lanes that the map says of the signal that it is; for signals
-# of the map that is the map's own relation. A signal ``mayAffect`` these lanes and all from which it lies ahead
-# along the lanes, up to the distance that the settings look.
+# Lanes that signals apply to, and lanes upstream of them, if these lanes are in range. A signal of
+# the trace ``controlsTrafficOf`` the lanes of its signal in the map; for signals of the map the
+# relation comes from the map. A signal ``mayAffect`` these lanes and all lanes that lead to it, up
+# to the distance in the settings.
 
 
 def _signal_edges(scene: BlockScene) -> Edges:

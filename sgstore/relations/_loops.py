@@ -1,7 +1,8 @@
-"""Loops over bodies, for numba: near pairs, the edges of pairs, and what the ego sees.
+"""Loops over bodies, for numba: near pairs, edges of pairs, and sight of the ego.
 
-``_pairs``, ``_proximity``, ``_bearing`` and ``_sight`` do the same in numpy, and say what it means. Arrays
-come in tuples: places ``x, y, z``, turns ``cos, sin`` of headings, sizes ``length, width, height``.
+``_pairs``, ``_proximity``, ``_bearing`` and ``_sight`` have the same in numpy, with explanations.
+Arrays come in tuples: positions ``x, y, z``, turns ``cos, sin`` of headings, sizes ``length, width,
+height``.
 """
 
 # ruff: noqa: PLR0913, PLR0917
@@ -33,10 +34,10 @@ def near_pairs(
     limit: float,
     found: tuple[Ints, Ints],
 ) -> tuple[int, int]:
-    """Fill in pairs of rows whose squared distance is within a limit, from one place in the order on.
+    """Fill in pairs of rows within a squared distance, starting at ``first``.
 
-    ``order`` has the rows by frame and ``x``, ``end`` of each place in it where its frame ends. Returns how
-    many were found, and the place from which there may not have been room for more.
+    ``order`` has the rows by frame and ``x``, ``end`` has the end of its frame for each place.
+    Returns the number of pairs, and the place where the room may have run out.
     """
     x, y, z = place
     a, b = found
@@ -68,9 +69,9 @@ def rungs(
     codes: Codes,
     columns: Columns,
 ) -> int:
-    """Fill in the edges of pairs whose squared distance is within a bound, both ways; return how many.
+    """Fill in both edges of pairs within a squared bound; return their number.
 
-    ``wanted``: of which pairs; empty: of all.
+    ``wanted``: mask of pairs; empty means all pairs.
     """
     x, y, z = place
     frame, node = ends
@@ -109,7 +110,7 @@ def sectors(
     columns: Columns,
     doubtful: Ints,
 ) -> tuple[int, int]:
-    """Fill in the edges of directions, and the pairs that need the bearing; return how many of both.
+    """Fill in edges of directions, and pairs that need the exact bearing; return both numbers.
 
     ``bounds`` are sines and cosines. Pairs from ``len(a)`` on are mirror images.
     """
@@ -156,7 +157,7 @@ def sides(
     columns: Columns,
     doubtful: Ints,
 ) -> tuple[int, int]:
-    """Do the same for sides: of what is farther ``beside`` the axis; if that is negative, of all."""
+    """Fill in edges of sides for bodies off the axis by more than a bound; negative means all bodies."""
     x, y, _ = place
     cos, sin = turn
     frame, node = ends
@@ -189,7 +190,7 @@ def along(
     pieces: Ints,
     line: tuple[Floats, Floats, Floats, Floats, Floats, Floats],
 ) -> Floats:
-    """Lengths of lanes up to the feet of places on their centre lines; see ``_following.Centrelines``."""
+    """Return lengths of lanes up to the feet of places; see ``_following.Centrelines``."""
     at_x, at_y, run_x, run_y, squared, length = line
     found = np.empty(len(lane))
     for i in range(len(lane)):
@@ -219,7 +220,7 @@ def sight(
     signal: Bools,
     graze: float,
 ) -> Bools:
-    """Mask of the bodies that the ego of their frame sees; ``order`` has rows by frame, ``starts`` where."""
+    """Return a mask of the bodies that the ego of their frame sees; ``order`` and ``starts`` group rows."""
     seen = np.zeros(len(place[0]), np.bool_)
     for f in range(len(starts) - 1):
         rows = order[starts[f] : starts[f + 1]]
@@ -251,7 +252,7 @@ def _seen_from(
         for cover in by_place:
             if near[cover] > far:
                 break
-            # What is not within both radii of the line to the target hides none of its points.
+            # A body outside both radii of the line to the target hides none of its points.
             reach = (radius[cover] + radius[target]) * away[target] * (1 + 1e-9) + 1e-9
             across = abs(x[cover, 0] * y[target, 0] - y[cover, 0] * x[target, 0])
             if cover == target or not hides[cover] or across > reach:
@@ -282,9 +283,10 @@ def _views(
     signal: Bools,
     graze: float,
 ) -> tuple[Ints, Floats, Floats, Floats, Bools]:
-    """Bodies with the eye as the origin: rows, points, boxes, and which can hide anything.
+    """Return bodies relative to the eye: rows, points, boxes, and a mask of opaque bodies.
 
-    A box is ``cos, sin``, half of length and width, heights of points, lower and upper side, and a radius.
+    A box is ``cos, sin``, half of length and width, height of points, lower and upper side, and a
+    radius.
     """
     length, width, height = size
     row = np.empty(len(rows), np.int64)
@@ -323,7 +325,7 @@ def _views(
 
 @compiled
 def _blocked(x: float, y: float, box: Floats, to_x: float, to_y: float, height: float) -> bool:
-    """Return whether a box at ``x, y`` blocks the line to a point, as ``_sight._blocked`` does."""
+    """True if a box at ``x, y`` blocks the line to a point; see ``_sight._blocked``."""
     cos, sin = box[0], box[1]
     enters, leaves = 0.0, 1.0
     start_x, run_x = -x * cos - y * sin, to_x * cos + to_y * sin
@@ -338,4 +340,4 @@ def _blocked(x: float, y: float, box: Floats, to_x: float, to_y: float, height: 
     low, high = enters * height, leaves * height
     if high < low:
         low, high = high, low
-    return not (low >= box[6] or high <= box[5])  # never where one is missing
+    return not (low >= box[6] or high <= box[5])  # False if a height is missing

@@ -1,6 +1,6 @@
 """Relations among lanes that come with a road map; :mod:`sgstore.roads` reads or derives them.
 
-Those that are declared in this file cannot be left out: :data:`sgstore.vocabulary.MAP_ONLY`.
+The relations of this file cannot be omitted: :data:`sgstore.vocabulary.MAP_ONLY`.
 """
 
 from __future__ import annotations

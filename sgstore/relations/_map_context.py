@@ -1,7 +1,7 @@
-"""A road map as a generator asks it: what bodies stand on, and which parts of it are in their graphs.
+"""Road map queries of a generator: map parts under bodies, and map parts in their graphs.
 
-To ask what a footprint meets is the dearest question of all, so it is put once for each footprint that has
-moved: traffic waits, parks and queues much of the time, and scenery never moves.
+The look-up of lanes under a footprint is the most expensive query. Therefore it runs only for
+footprints that have moved: traffic often waits, parks or queues, and scenery never moves.
 """
 
 from __future__ import annotations
@@ -43,23 +43,23 @@ FIRST_LANE: Final = 1
 """Column of the first lane among the nodes of a map."""
 
 MOST: Final = 500_000
-"""Waypoints of a map: whether each is in a graph is told frame by frame."""
+"""Greatest number of waypoints of a map: each frame stores the presence of each."""
 
 
 class Waypoints:
-    """The waypoints of a map.
+    """Waypoints of a map.
 
     Parameters
     ----------
     road_map : RoadMap
     lanes : LaneSettings
-        Their spacing, and the types of lanes that are kept.
+        Their spacing, and the types of lanes to use.
 
     Attributes
     ----------
     road_map : RoadMap
-        The map with its waypoints: nodes that come after all others, and their edges. It is another map, with
-        another digest.
+        The map with its waypoints (nodes after all other nodes) and their edges. It is another map
+        with another digest.
 
     Raises
     ------
@@ -136,11 +136,11 @@ class Waypoints:
         )
 
     def _inside(self, points: LanePoints) -> tuple[Ints, Ints]:
-        """Columns of waypoints and of their lanes."""
+        """Return columns of waypoints and of their lanes."""
         return self._first[0] + np.arange(len(points.lane)), FIRST_LANE + points.lane
 
     def _onward(self, edges: MapEdges) -> tuple[Ints, Ints]:
-        """Columns of waypoints and of those that follow."""
+        """Return columns of waypoints and of the next waypoints."""
         total = int(self._counts.sum())
         begin = int(self._first[0]) if len(self._first) else 0
         column = begin + np.arange(total)
@@ -155,14 +155,14 @@ class Waypoints:
         )
 
     def of(self, hits: LaneHits, along: Floats, bodies: Bodies) -> tuple[Ints, Ints]:
-        """Rows of bodies, ascending, and node ids of the waypoints that they are at.
+        """Return rows of bodies, ascending, and node ids of their waypoints.
 
         Parameters
         ----------
         hits : LaneHits
             Lanes that bodies touch.
         along : (H,) float64
-            Place of the body's centre along each, beyond its ends too; m.
+            Place of the body's centre along each lane, also beyond its ends; m.
         bodies : Bodies
         """
         lane, row = -1 - FIRST_LANE - hits.lane, hits.row
@@ -182,7 +182,7 @@ _KNOWN: WeakKeyDictionary[RoadMap, tuple[LaneSettings, Waypoints]] = WeakKeyDict
 
 
 def waypoints_of(road_map: RoadMap | None, lanes: LaneSettings) -> Waypoints | None:
-    """The waypoints of a map, if the settings ask for any; the last answer for each map is kept."""
+    """Return the waypoints of a map if the settings request them; cached per map."""
     if road_map is None or lanes.granularity != "waypoint":
         return None
     known = _KNOWN.get(road_map)
@@ -195,35 +195,35 @@ def waypoints_of(road_map: RoadMap | None, lanes: LaneSettings) -> Waypoints | N
 # Bodies on a map, and the parts of it that are in their graphs ------------------------------------
 
 ON_OR_OFF: Final = kinds_mask((*VEHICLES, "person", "animal", "prop"))
-"""Kinds of which it means something to be off the road even if they never move; a tree always is."""
+"""Kinds that can be off the road even if they never move, unlike trees."""
 
 SAME_PLACE: Final = 1.0
-"""How far an entity may stand from the one of several alike objects of the map that it is; m."""
+"""Greatest distance between an entity and its object in the map, if several are alike; m."""
 
 DEPTH: Final = 3
-"""Steps of ``isIn`` within a map: lane, road, junction."""
+"""Levels of ``isIn`` within a map: lane, road, junction."""
 
 
 class LaneContact:
-    """The answers of a road map for one trace, block after block.
+    """Road map queries for one trace, block after block.
 
     Parameters
     ----------
     road_map : RoadMap
     ahead : float
-        How far along the lanes is looked; m.
+        Search distance along the lanes; m.
     waypoints : Waypoints, optional
-        Those of the map, where it has any.
+        Waypoints of the map, if it has any.
 
     Attributes
     ----------
     driving : (K,) bool
-        Which nodes of the map are lanes for motor traffic.
+        Mask of the map nodes that are lanes for motor traffic.
 
     Notes
     -----
-    It remembers which entities stand for signals and objects of the map, and the last footprint of what was in
-    the last block: its memory grows with the number of distinct entities, not with time.
+    It remembers the entities that represent signals and objects of the map, and the last footprints
+    of the previous block: its memory grows with the number of distinct entities, not with time.
     """
 
     def __init__(self, road_map: RoadMap, ahead: float, waypoints: Waypoints | None = None) -> None:
@@ -235,7 +235,7 @@ class LaneContact:
         self._reach = SignalReach(road_map, self._net, lines, ahead)
         self._footing = _Footing(road_map, lines)
         self.driving = np.array([kind in DRIVING for kind in nodes.lane_type], np.bool_)
-        # (K,): column of the node that each node of the map is in, -1 where there is none.
+        # (K,): column of the parent of each map node, or -1.
         edges = road_map.edges
         inside = edges.relation == RELATION_CODE["isIn"]
         parent = np.full(len(road_map.nodes), -1)
@@ -252,7 +252,7 @@ class LaneContact:
         self._affects: tuple[Ints, Ints] = (none, none)
 
     def learn(self, entities: Entities, scenery: States) -> None:
-        """Take note of entities, in order of node id, that appear for the first time, and of their poses."""
+        """Register new entities and their poses, in order of node id."""
         places = dict(
             zip(scenery.node.tolist(), zip(scenery.x, scenery.y, strict=True), strict=True)
         )
@@ -275,7 +275,7 @@ class LaneContact:
         self._affects = _appended(self._affects, affects)
 
     def _column(self, key: tuple[bool, str], place: tuple[float, float]) -> int | None:
-        """The signal or object of the map that a reference means; of repeated ones the one at that place."""
+        """Return the column of a referenced map signal or object; the place selects one of several."""
         columns = self._columns.get(key, [])
         if len(columns) < 2:
             return columns[0] if columns else None
@@ -285,7 +285,7 @@ class LaneContact:
         return columns[at] if apart[at] <= SAME_PLACE else None
 
     def standing(self, bodies: Bodies) -> Standing:
-        """Parts of the map that the bodies of a block stand on; asked once for each block."""
+        """Return the map parts under the bodies of a block; call once per block."""
         hits, along, parts = self._footing.of(bodies)
         if self._waypoints is not None:
             rows, nodes = self._waypoints.of(hits, along, bodies)
@@ -302,17 +302,17 @@ class LaneContact:
         return Standing(hits, along, own, parts, off_road)
 
     def ground(self, bodies: Bodies, standing: Standing, areas: Areas, kept: Bools) -> MapContext:
-        """The map under bodies, and around the egos.
+        """Return the map under bodies, and around the egos.
 
         Parameters
         ----------
         bodies : Bodies
         standing : Standing
-            What they stand on.
+            Map parts under the bodies.
         areas : Areas
-            What is in range of the ego; where there is none the whole map is.
+            Range of the egos; without one the whole map is in range.
         kept : (K,) bool
-            Which nodes of the map the client wants.
+            Mask of the map nodes that the caller keeps.
 
         Returns
         -------
@@ -329,11 +329,11 @@ class LaneContact:
         )
 
     def present(self, bodies: Bodies, standing: Standing, areas: Areas, kept: Bools) -> Bools:
-        """(F, K): which nodes of the map are in which graph; see :meth:`ground`.
+        """Return a mask (F, K) of the map nodes in each graph; see :meth:`ground`.
 
-        A lane or crosswalk that a body is in is present even if it begins just out of range, and so are the
-        road and the junction it belongs to. ``off_road`` is present where a body is in it. A signal or object
-        of the map is not present where an entity of the trace that stands for it is.
+        A lane or crosswalk under a body is present even if it begins just out of range; so are its
+        road and junction. ``off_road`` is present if a body is in it. A signal or object of the map
+        is absent if an entity of the trace represents it.
         """
         present: Bools = areas.parts(self._map)
         present[:, -1 - OFF_ROAD] = False
@@ -360,7 +360,7 @@ Table = tuple["NDArray[Any]", ...]
 
 
 class _Footing:
-    """Lanes and crosswalks under footprints; one that has not moved since it was seen is not asked again."""
+    """Lanes and crosswalks under footprints; results are reused until a footprint moves."""
 
     def __init__(self, road_map: RoadMap, lines: Centrelines) -> None:
         self._map = road_map
@@ -370,7 +370,7 @@ class _Footing:
         self._lanes, self._crosswalks = self._ask(np.zeros(0, np.intp), self._box)
 
     def of(self, bodies: Bodies) -> tuple[LaneHits, Floats, tuple[Ints, Ints]]:
-        """Lanes that bodies touch, with places along them, and crosswalks, by rows; signals touch none."""
+        """Return lanes that bodies touch, places along them, and crosswalks, by rows; none for signals."""
         rows = np.flatnonzero(~IS_SIGNAL[bodies.kind])
         known = len(self._node)
         node = np.concatenate([self._node, bodies.node[rows]])
@@ -405,9 +405,12 @@ class _Footing:
 
 
 def _runs(node: Ints, frame: Ints, box: Floats) -> tuple[Rows, Rows]:
-    """For each row the first of the run of rows in which its node keeps its box; and each node's last row."""
+    """Return the first row of each run with an unchanged box, and the last row of each node."""
     order = np.lexsort((frame, node))
-    node, bits = node[order], box[order].view(np.int64)  # as bits: NaN is like itself
+    node, bits = (
+        node[order],
+        box[order].view(np.int64),
+    )  # compared as bits, because NaN is unequal to itself
     other = np.ones(len(node) + 1, np.bool_)
     other[1:-1] = node[1:] != node[:-1]
     begins = other[:-1].copy()
@@ -419,6 +422,6 @@ def _runs(node: Ints, frame: Ints, box: Floats) -> tuple[Rows, Rows]:
 
 
 def _looked_up(table: Table, wanted: Rows) -> Table:
-    """The table's lines for each of the rows wanted, which are numbered anew."""
+    """Return the lines of a table for the wanted rows, with new row numbers."""
     owner, index = joined(table[0], wanted)
     return (owner, *(column[index] for column in table[1:]))

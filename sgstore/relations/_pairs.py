@@ -1,6 +1,6 @@
-"""Related pairs of bodies and their numbers, bounded in memory.
+"""Related pairs of bodies and their numbers, with bounded memory.
 
-Which bodies are related, and the numbers of those pairs that the families need.
+This module finds related bodies, and computes the numbers that the relations need.
 """
 
 from __future__ import annotations
@@ -40,24 +40,24 @@ if TYPE_CHECKING:
 
 
 CELLS: Final = 8
-"""Strips of the plane to the distance within which bodies are related: more of them cut a little sharper."""
+"""Strips of the plane per search distance; more strips reduce the candidates a little."""
 
 FAR_STRIP: Final = 1 << 40
-"""Strips from the origin beyond which positions share a strip: keys fit into 64 bits whatever a trace holds."""
+"""Positions beyond this strip share a strip, so that keys fit into 64 bits."""
 
 
 NO_PAIRS: Final[Halves] = (np.zeros(0, np.intp), np.zeros(0, np.intp))
 
 
 def near_pairs(bodies: Bodies, config: Config, unwanted: Bools) -> Iterator[Halves]:
-    """Each unordered pair of bodies that move, signals excepted, and are near enough to one another.
+    """Yield each unordered pair of moving bodies that are near each other, without signals.
 
     Parameters
     ----------
     bodies : Bodies
     config : Config
     unwanted : (F,) bool
-        Frames of which no pairs are wanted; it may change between one chunk and the next.
+        Frames to skip; the caller may change it between chunks.
 
     Yields
     ------
@@ -69,7 +69,7 @@ def near_pairs(bodies: Bodies, config: Config, unwanted: Bools) -> Iterator[Halv
 
 
 def pairs_among(bodies: Bodies, rows: Rows, config: Config, unwanted: Bools) -> Iterator[Halves]:
-    """The same of some rows, whatever they are."""
+    """Yield near pairs among these rows, moving or not."""
     within, between = config.pairs.within, config.proximity.between
     if within > 0 and between != "footprints" and worth():
         yield from _near_in_loops(bodies, rows, within, between, unwanted)
@@ -78,19 +78,20 @@ def pairs_among(bodies: Bodies, rows: Rows, config: Config, unwanted: Bools) -> 
 
 
 def related_pairs(bodies: Bodies, ego: Rows, near: Halves, config: Config) -> BodyPairs:
-    """All pairs that the settings relate: the ego with every body, and moving bodies near one another.
+    """Return all related pairs: the ego with every body, and moving bodies near each other.
 
     Parameters
     ----------
     bodies : Bodies
     ego : (F,) intp
-        Row of the ego of each frame, -1 where there is none.
+        Row of the ego of each frame, or -1.
     near : tuple of intp arrays
-        Other pairs: bodies that are near one another.
+        Other pairs: bodies that are near each other.
     config : Config
-        Signals and scenery are related to the ego only, unless the settings relate what never moves to its
-        like (:mod:`sgstore.relations._pairs`). What has no position is near nothing; the ego is related to it
-        all the same, by numbers that are missing, unless there is a distance for the ego too.
+        Signals and scenery are related to the ego only, unless the settings also relate static
+        entities to each other (:mod:`sgstore.relations._pairs`). A body without a position is near
+        no other; it is still related to the ego, with missing numbers, unless the ego has a
+        distance limit too.
     """
     settings, between = config.pairs, config.proximity.between
     if not settings.ego:
@@ -110,19 +111,19 @@ def related_pairs(bodies: Bodies, ego: Rows, near: Halves, config: Config) -> Bo
 
 
 def _behind(pairs: Halves, others: Halves, rows: Rows) -> Halves:
-    """Some pairs, and behind them those of others that are in some rows."""
+    """Append the pairs of ``others`` in these rows."""
     count = len(pairs[0])
     a, b = np.empty((2, count + len(rows)), np.intp)
     for column, first, rest in zip((a, b), pairs, others, strict=True):
         column[:count] = first
-        np.take(rest, rows, out=column[count:], mode="clip")  # others go through a copy
+        np.take(rest, rows, out=column[count:], mode="clip")  # this copies only the selected rows
     return a, b
 
 
 def of_kinds(
     bodies: Bodies, ego: Rows, pairs: Halves, kinds: tuple[tuple[str, ...], ...]
 ) -> Halves:
-    """The pairs of listed labels, in either order; all if none are listed."""
+    """Return the pairs of listed kinds, in either order; all pairs for an empty list."""
     if not kinds:
         return pairs
     a, b = pairs
@@ -133,8 +134,8 @@ def of_kinds(
 def are_of_kinds(
     bodies: Bodies, ego: Rows, pairs: Halves, kinds: tuple[tuple[str, ...], ...]
 ) -> Bools:
-    """Mask of the pairs of listed labels, in either order."""
-    listed = np.zeros((len(KINDS) + 1, len(KINDS) + 1), np.bool_)  # the last one: the ego
+    """Return a mask of the pairs of listed kinds, in either order."""
+    listed = np.zeros((len(KINDS) + 1, len(KINDS) + 1), np.bool_)  # the last row is the ego
     for one, other in kinds:
         listed[np.ix_(_kind_codes(one), _kind_codes(other))] = True
     listed |= listed.T
@@ -152,17 +153,17 @@ def _kind_codes(label: str) -> list[int]:
 
 
 def joined_pairs(halves: list[Halves]) -> Halves:
-    """One list of pairs after another."""
+    """Concatenate lists of pairs."""
     return np.concatenate([a for a, _ in halves]), np.concatenate([b for _, b in halves])
 
 
 def _near_pairs(
     bodies: Bodies, rows: Rows, within: float, between: str, unwanted: Bools
 ) -> Iterator[tuple[Rows, Rows]]:
-    """Each unordered pair of these rows that share a frame and are at most so far apart.
+    """Yield each unordered pair of these rows within a distance, in the same frame.
 
-    The rows are sorted by frame and by strips across the x axis. The candidates of a row are those after it in
-    its own strip and in the few that follow: a range of the sorted rows.
+    The rows are sorted by frame and by strips across the x axis. The candidates of a row are the
+    later rows in its own strip and in the next few strips: a range of the sorted rows.
     """
     rows = rows[np.isfinite(bodies.x[rows])]
     reach = within
@@ -175,7 +176,7 @@ def _near_pairs(
     order = np.argsort(key, kind="stable")
     rows, key = rows[order], key[order]
     start = np.arange(1, len(rows) + 1)
-    # One strip more than the distance is wide: the division above may round up.
+    # One strip more than the distance: the division above may round up.
     count = np.searchsorted(key, key + CELLS + 1, side="right") - start
     frame, limit = bodies.frame[rows], span_up_to(within, between)
     for part in parts(count):
@@ -190,7 +191,7 @@ def _near_pairs(
 def _near_in_loops(
     bodies: Bodies, rows: Rows, within: float, between: str, unwanted: Bools
 ) -> Iterator[Halves]:
-    """The same pairs, in another order."""
+    """Yield the same pairs as :func:`_near_pairs`, in another order, with numba loops."""
     from sgstore.relations import _loops
 
     rows = rows[np.isfinite(bodies.x[rows])]
@@ -213,14 +214,15 @@ def _near_in_loops(
             yield a[:many].copy(), b[:many].copy()
 
 
-# Pairs of what never moves: found once, when it appears, and looked up where both of them are in range ----
+# Pairs of static entities: found once, on their first appearance, and looked up where both are in
+# range.
 
 MOST_LEARNT: Final = 1 << 22
-"""Pairs that are remembered; where there are more they are found anew in every frame."""
+"""Greatest number of remembered pairs; above it they are computed in every frame."""
 
 
 class StillPairs:
-    """The pairs of the scenery of a trace that are near one another; none, unless the settings want them.
+    """Near pairs of the scenery of a trace; empty unless the settings request them.
 
     Parameters
     ----------
@@ -234,11 +236,11 @@ class StillPairs:
 
     @property
     def wanted(self) -> bool:
-        """Return whether there is anything to learn."""
+        """True if the settings request static pairs."""
         return self._config.pairs.static and self._config.pairs.within > 0
 
     def learn(self, scenery: Bodies) -> None:
-        """Find the pairs of all scenery so far, as if it stood in one frame, unless they are too many."""
+        """Find the pairs of all scenery so far, independent of frames, unless they are too many."""
         rows = np.arange(len(scenery))
         (a, b), over = gathered(
             lambda unwanted: pairs_among(scenery, rows, self._config, unwanted),
@@ -253,18 +255,19 @@ class StillPairs:
     def among(
         self, bodies: Bodies, keys: Ints, states: int, count: int, unwanted: Bools
     ) -> Iterator[tuple[Rows, Rows]]:
-        """The pairs of which both are in range.
+        """Yield the pairs with both entities in range.
 
         Parameters
         ----------
         bodies : Bodies
-            What is in range.
+            Bodies in range.
         keys : int64
-            What is in range, ascending: from ``states`` on, frame times ``count`` plus the row of the scenery.
+            Entities in range, ascending: from ``states`` on, frame times ``count`` plus the row of
+            the scenery.
         states, count : int
             Rows of the block's states, and of the scenery.
         unwanted : (F,) bool
-            Frames of which no pairs are wanted; it may change between one chunk and the next.
+            Frames to skip; the caller may change it between chunks.
 
         Yields
         ------
@@ -292,49 +295,47 @@ class StillPairs:
 
 
 # Crowds: what keeps pairs of bodies within bounds of memory, whatever a frame holds -------------
-# The pairs of n bodies in one place are n² / 2, and each becomes several edges. Two bounds hold:
-#
-# * a block is cut into pieces of frames that have no more than :data:`AT_ONCE` pairs together;
-# * in one frame no more than :data:`MOST_PAIRS` are related. In a frame with more of them bodies are related to
-#   the ego only, and that is a loss with a name.
+# n bodies in one place have n² / 2 pairs, and each pair can have several edges. Two bounds limit
+# the memory: a block is cut into pieces of frames with at most :data:`AT_ONCE` pairs; and one frame
+# relates at most :data:`MOST_PAIRS`. In a frame above this limit bodies are related to the ego
+# only; the store records this as a loss.
 
 MOST_PAIRS: Final = 1 << 18
-"""Pairs of bodies that are related in one frame, each counted once, and pairs that touch. 724 bodies that are
-all near one another have as many, or 5,000 of which each has a hundred others near it."""
+"""Greatest number of related pairs in one frame, each counted once, and of pairs that touch. 724
+bodies near each other reach it, or 5,000 bodies with a hundred neighbours each."""
 
 AT_ONCE: Final = 1 << 18
-"""Pairs of the frames that are looked at together, as far as it is known before: some 200 MB with all that is
-made of them."""
+"""Estimated pairs of the frames that are processed together: about 200 MB with all results."""
 
 NEAR: Final = "near"
 TOUCHING: Final = "touching"
 
 _WIDEST: Final = 1 << 20
-"""Cells of the plane from the origin beyond which positions share a cell."""
+"""Positions beyond this cell of the plane share a cell."""
 
 
 def gathered(
     chunks: Callable[[Bools], Iterable[Halves]], frame: Ints, frames: int, most: int | None = None
 ) -> tuple[Halves, Bools]:
-    """Pairs of bodies, chunk after chunk, but for frames that have too many.
+    """Collect pairs of bodies from chunks, without frames that have too many.
 
     Parameters
     ----------
     chunks : function
-        Yields pairs of rows. It is given an array that says of which frames no more pairs are wanted; that
-        changes while pairs are taken.
+        Function that yields pairs of rows. Its argument is a mask of frames to skip, which changes
+        while pairs are read.
     frame : (N,) int64
         Frame of each row.
     frames : int
-        How many frames there are.
+        Number of frames.
     most : int, optional
-        How many pairs one of them may have; by default :data:`MOST_PAIRS`.
+        Greatest number of pairs per frame; by default :data:`MOST_PAIRS`.
 
     Returns
     -------
     pairs : tuple of intp arrays
     over : (frames,) bool
-        Which frames have more; they have none among the pairs.
+        Frames with more pairs; their pairs are left out.
     """
     most = MOST_PAIRS if most is None else most
     over, count = np.zeros(frames, np.bool_), np.zeros(frames, np.int64)
@@ -359,25 +360,25 @@ def _without(pairs: Halves, left_out: Bools) -> Halves:
 
 
 def pieces(frames: FrameBlock, kinds: Codes, config: Config, egos: int) -> Iterator[FrameBlock]:
-    """A block as consecutive blocks of which none has too many pairs; mostly that is the block itself.
+    """Split a block into consecutive blocks with a bounded number of pairs; usually one block.
 
     Parameters
     ----------
     frames : FrameBlock
     kinds : int8
-        Kinds of all entities, those of the block included, by node id.
+        Kinds of all entities by node id, including those of the block.
     config : Config
     egos : int
-        How often graphs are made of it.
+        Number of graphs made of each frame.
 
     Yields
     ------
     FrameBlock
-        The first one has what the block introduces, its messages and its events.
+        The first one has the new entities, messages and events of the block.
     """
     most = max(AT_ONCE // max(egos, 1), 1)
     node = frames.states.node
-    known = (node >= 0) & (node < len(kinds))  # what is not is refused when graphs are made
+    known = (node >= 0) & (node < len(kinds))  # the generator rejects unknown nodes later
     rows = np.flatnonzero(known)
     rows = rows[~IS_SIGNAL[kinds[node[rows]]]]
     count = np.bincount(frames.frame_of[rows], minlength=len(frames)).astype(np.int64)
@@ -397,11 +398,11 @@ def pieces(frames: FrameBlock, kinds: Codes, config: Config, egos: int) -> Itera
 
 
 def _neighbours(frames: FrameBlock, rows: Rows, config: Config) -> Ints:
-    """(F,): no fewer than the pairs of each frame that are near one another: those of adjacent cells."""
+    """Return an upper bound of the near pairs of each frame, (F,), by counting adjacent cells."""
     states = frames.states
     reach = max(config.pairs.within, 1.0)
     size = np.nan_to_num(np.hypot(states.length, states.width)[rows])
-    reach += float(size.max(initial=0))  # what is no nearer does not touch either
+    reach += float(size.max(initial=0))  # touching bodies are also within reach
     cells = [
         np.clip(np.nan_to_num(np.floor(column[rows] / reach)), 2 - _WIDEST, _WIDEST - 2) + _WIDEST
         for column in (states.x, states.y)
@@ -422,7 +423,7 @@ def _neighbours(frames: FrameBlock, rows: Rows, config: Config) -> Ints:
 
 
 def _part(frames: FrameBlock, start: int, stop: int) -> FrameBlock:
-    """Some frames of a block; only the first ones bring what comes with the block."""
+    """Return some frames of a block; only the first frames keep the block's new entities and messages."""
     first, last = int(frames.offsets[start]), int(frames.offsets[stop])
     entities, scenery, messages = frames.entities, frames.scenery, frames.messages
     events = frames.events
@@ -452,13 +453,13 @@ def _part(frames: FrameBlock, start: int, stop: int) -> FrameBlock:
 
 
 class Crowds:
-    """The frames of a trace in which there are too many pairs."""
+    """Record of frames of a trace with too many pairs."""
 
     def __init__(self) -> None:
         self._found: dict[str, tuple[int, int, int, Loss]] = {}
 
     def see(self, graph: GraphBlock) -> None:
-        """Take note of the frames of a block."""
+        """Register the crowded frames of a block."""
         for what, frame, bodies in graph.crowded:
             time = int(graph.frames.log_time_ns[frame])
             count, seq, most, loss = self._found.get(what) or (
@@ -469,7 +470,7 @@ class Crowds:
             self._found[what] = count + 1, seq, most, span
 
     def losses(self, config: Config) -> list[Loss]:
-        """Pairs that were left out, by kind, with the first frame, its bodies, and the setting that counts."""
+        """Return the omitted pairs by kind, with the first frame, its bodies, and the setting."""
         found: list[Loss] = []
         for what, (count, seq, bodies, span) in self._found.items():
             if what == NEAR:

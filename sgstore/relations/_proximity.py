@@ -1,9 +1,9 @@
-"""Distance of related bodies from one another: one relation of a ladder of distances, or none.
+"""Distance of related bodies: at most one relation of a ladder of distances.
 
-The distance is between the centres of the boxes, in space; in the plane where a height is not known. There is
-none between storeys, to what is flat, and between what is carried and its carrier. Rungs are half-open,
-``(lo, hi]``, as in CARLASGG's code (its documentation leaves the bounds open), and the nearest holds its
-lower bound too.
+The distance is between the centres of the boxes, in space; in the plane if a height is unknown.
+There is no relation between storeys, to a flat body, or between a carried body and its carrier.
+Rungs are half-open, ``(lo, hi]``, as in the code of CARLASGG (its documentation leaves the bounds
+open). The nearest rung includes its lower bound.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def _edges(scene: BlockScene) -> Edges:
         for bound in bounds:
             rung += span > bound
         found[part] = codes[rung]
-        holds[part] = span <= bounds[-1]  # what has no distance is in no rung
+        holds[part] = span <= bounds[-1]  # a missing distance is in no rung
     if bounds and len(pairs.of_bodies):
         holds &= pairs.of_bodies
     found, holds = np.concatenate([found, found]), np.concatenate([holds, holds])
@@ -55,7 +55,7 @@ def _edges(scene: BlockScene) -> Edges:
 
 
 def rung(name: str) -> Relation:
-    """The relation of a rung, by its name."""
+    """Return the relation of a rung by its name."""
 
     def asked(config: Config) -> bool:
         return name in config.proximity.names

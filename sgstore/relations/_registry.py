@@ -1,4 +1,4 @@
-"""All relations, and the filter of a config: relations, kinds and parts of the map that its graphs keep."""
+"""All relations, and the filter of a config: relations, kinds and parts of the map in its graphs."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ if TYPE_CHECKING:
 
 @cache
 def relations() -> tuple[Relation, ...]:
-    """Return all relations, those of this package first, in the order of the vocabulary.
+    """Return all relations in the order of the vocabulary, built-in relations first.
 
     Raises
     ------
     ConfigError
-        A package names a relation that cannot be loaded, or that is none.
+        A plugin names a relation that cannot be loaded or is not a :class:`Relation`.
     """
     found: list[Relation] = []
     for name, relation in plugins.RELATIONS.every(ConfigError):
@@ -56,7 +56,7 @@ def relations() -> tuple[Relation, ...]:
 
 
 def relations_under(config: Config) -> tuple[Relation, ...]:
-    """Return the relations that a config asks for, given a map; names of its own for rungs and sectors too."""
+    """Return the relations that a config requests, with a map; including its own rungs and sectors."""
     known = {one.name for one in relations()}
     own = [rung(name) for name in config.proximity.names if name not in known]
     own += [sector(name) for name in config.direction.names if name not in known]
@@ -75,7 +75,7 @@ Edges of a scene graph, by name. What a relation needs and a recording lacks mak
 
 
 def as_markdown() -> str:
-    """Return the page ``docs/relations.md``: the relations of this package."""
+    """Return the page ``docs/relations.md``: the built-in relations."""
     own = [plugins.RELATIONS.load(name) for name in plugins.RELATIONS.own]
     rows = [f"| `{one.name}` | {'a map' if one.needs_map else ''} | {one.doc} |" for one in own]
     return PAGE.format(rows="\n".join(rows))
@@ -97,8 +97,8 @@ class Keeping:
     Attributes
     ----------
     parts : (K,) bool
-        Which nodes of the map are kept, its column i node -1 - i. A road is where one of its lanes is, and a
-        junction where one of its roads is.
+        Mask of the kept map nodes; column i is node -1 - i. A road is kept if one of its lanes is,
+        a junction if one of its roads is.
     """
 
     def __init__(self, config: Config, road_map: RoadMap | None) -> None:
@@ -107,7 +107,7 @@ class Keeping:
         without_map = config.lanes.granularity == "none"
         if without_map:
             kept -= set(MAP_KINDS)
-        # Without a list kinds are kept that become known later, too.
+        # Without a list of kinds, later kinds are kept, too.
         self._kinds = ~kinds_mask(MAP_KINDS if without_map else ())
         if config.kinds:
             self._kinds = kinds_mask(tuple(sorted(kept)))
@@ -145,18 +145,18 @@ class Keeping:
         return kept & (used | ~larger)
 
     def names(self, computed: Iterable[Relation], *, with_map: bool) -> set[str]:
-        """The relations that graphs can hold, of those that are computed and those that come with a map."""
+        """Return the relations that graphs can hold: computed ones, and those of the map."""
         kept = {one.name for one in computed} - self._without
         of_map = {one.name for one in relations() if one.of_map} if with_map else set[str]()
         lost = {one.name for one in relations() if self._no_lanes and one.needs_lanes}
         return (kept | of_map) - lost - ({"isIn"} if self._no_map else set())
 
     def entities(self, kind: Codes) -> Bools:
-        """Mask of the entities that are kept, by their kinds."""
+        """Return a mask of the kept entities by their kinds."""
         return self._kinds[kind]
 
     def edges(self, edges: Edges) -> Edges:
-        """The edges that are kept: of kept relations, to and from parts of the map that are kept."""
+        """Return the edges of kept relations between kept nodes."""
         if self._everything:
             return edges
         kept = self._relations[edges.relation]
@@ -171,7 +171,7 @@ class Keeping:
         return taken(merged, np.sort(np.unique(key, axis=0, return_index=True)[1]))
 
     def lane_states(self, lanes: LaneStates) -> LaneStates:
-        """Those in lanes that are kept. Of sections that are one lane, the one with the larger share speaks."""
+        """Filter lane states by kept lanes; of merged sections the one with the largest overlap counts."""
         if self._everything:
             return lanes
         kept = self._stays(lanes.lane) & self._relations[RELATION_CODE["isIn"]]
@@ -187,12 +187,12 @@ class Keeping:
         return replace(merged, overlap=overlap)
 
     def gaps(self, gaps: LaneGaps) -> LaneGaps:
-        """Those that belong to a relation that is kept."""
+        """Return the gaps if ``leads`` or ``follows`` is kept."""
         wanted = self._relations[[RELATION_CODE["leads"], RELATION_CODE["follows"]]].any()
         return gaps if wanted else taken(gaps, np.zeros(0, np.intp))
 
     def present(self, present: Bools) -> Bools:
-        """(F, K): which nodes of the map are in the graphs, of those that are in range."""
+        """Return a mask (F, K) of the map nodes in graphs, from those in range."""
         present = present & self.parts
         if self._same is None:
             return present
@@ -203,7 +203,7 @@ class Keeping:
         return present
 
     def _standing_for(self, node: Ints) -> Ints:
-        """Nodes, lanes among them by the node of all sections."""
+        """Replace lanes by the node of all their sections."""
         if self._same is None:
             return node
         return np.where(node < 0, -1 - self._same[np.where(node < 0, -1 - node, 0)], node)
@@ -213,7 +213,7 @@ class Keeping:
 
 
 def renamed(entities: Entities, types: Mapping[str, TypeMeaning]) -> Entities:
-    """Entities, of the kinds that the client says their types are; type names are in lower case."""
+    """Apply the configured mapping of type names (lower case) to kinds."""
     if not types or not len(entities):
         return entities
     kind = entities.kind.copy()

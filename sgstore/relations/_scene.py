@@ -1,6 +1,6 @@
-"""The input of relation families: bodies, pairs and map context of a block.
+"""Input of relation families: bodies, pairs and map context of a block.
 
-Which intervals of a line meet: how candidates are found without looking at all pairs.
+Overlapping intervals of a line give candidates without testing all pairs.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ if TYPE_CHECKING:
 
 
 CHUNK: Final = 1 << 16
-"""Candidates that are looked at together: bounds the memory of a crowd, and keeps it within a cache."""
+"""Candidates that are processed together: bounds the memory, and fits a cache."""
 
 FAR: Final = 1e9
-"""Where the line ends; m. What lies beyond is taken to be there: it may be a candidate for more."""
+"""End of the line; m. Places beyond it are moved to it and can only add candidates."""
 
 _ROUNDING: Final = 1e-15
-"""Relative error of a place on the line on which all groups lie one behind the other."""
+"""Relative error of a place on the line that holds all groups in sequence."""
 
 
 def meeting(group: Ints, low: Floats, high: Floats) -> Iterator[tuple[Rows, Rows]]:
-    """Each unordered pair of intervals of one group that meet, once; and some more that all but meet.
+    """Yield each unordered pair of overlapping intervals of one group, and some that almost overlap.
 
     Parameters
     ----------
     group : (N,) int64
-        0 and above.
+        Not negative.
     low, high : (N,) float64
-        Ends of the intervals. What is NaN meets nothing.
+        Ends of the intervals. NaN overlaps nothing.
 
     Yields
     ------
@@ -67,7 +67,8 @@ def meeting(group: Ints, low: Floats, high: Floats) -> Iterator[tuple[Rows, Rows
     group, low, high = group[rows], np.clip(low[rows], -FAR, FAR), np.clip(high[rows], -FAR, FAR)
     base = float(low.min())
     span = float(high.max()) - base + 1
-    # All groups one behind the other: the intervals that meet one are the next in order, up to its end.
+    # All groups are laid in sequence: the intervals that overlap one are the next in order, up to
+    # its end.
     start = group * span + (low - base)
     order = np.argsort(start, kind="stable")
     rows, start = rows[order], start[order]
@@ -81,27 +82,27 @@ def meeting(group: Ints, low: Floats, high: Floats) -> Iterator[tuple[Rows, Rows
 
 
 def parts(count: Ints) -> Iterator[slice]:
-    """Consecutive slices of counts that each add up to :data:`CHUNK` or little more."""
+    """Yield consecutive slices of counts with sums of about :data:`CHUNK`."""
     total = np.cumsum(count)
     bounds = np.searchsorted(total, np.arange(CHUNK, int(total[-1]), CHUNK)) if len(total) else []
     for begin, end in zip([0, *bounds], [*bounds, len(count)], strict=True):
         yield slice(begin, end)
 
 
-# What a family of relations sees: the bodies of many frames, the related pairs among them, the map under them
-# ------------------------------------------------------------------------------------------------
-# All of it is computed once for a block and shared by the families. A *body* is an entity in one frame: one
-# that stands still in sixty frames is sixty bodies, so that nothing but array arithmetic is needed on them.
+# Input of a family of relations: the bodies of many frames, their related pairs, and the map under
+# them. All of it is computed once per block and shared by the families. A *body* is an entity in
+# one frame: an entity that stands still in sixty frames is sixty bodies, so that array arithmetic
+# is enough.
 
 
 @dataclass(frozen=True, slots=True)
 class Bodies:
-    """Entities in the graphs of a block, one row an entity and frame, in no order that matters; shape (N,).
+    """Entities in the graphs of a block, one row per entity and frame, in any order; shape (N,).
 
     Attributes
     ----------
     frame : int64
-        Frame, counted in the block.
+        Index of the frame in the block.
     node : int64
         Node id.
     kind : int8
@@ -109,9 +110,9 @@ class Bodies:
     moves : bool
         False for scenery.
     x, y, z, heading, length, width, height : float64
-        The box; m, m, m, rad, m, m, m. The height of what stands upright is missing where it is 0.
+        The box; m, m, m, rad, m, m, m. A zero height of an upright kind is missing.
     carrier : int64
-        Node id of what pulls or carries it; below 0: nothing.
+        Node id of its carrier or tractor; negative for none.
     """
 
     frame: Ints
@@ -132,27 +133,27 @@ class Bodies:
         return len(self.node)
 
     def take(self, rows: NDArray[np.intp]) -> Bodies:
-        """Some of the rows, in the order given."""
+        """Return these rows, in this order."""
         return taken(self, rows)
 
     @property
     def bottom(self) -> Floats:
-        """(N,): height of the lower side of the box; m. What has no height is all at ``z``."""
+        """Return the height of the lower side of the box, (N,); m. Without a height it is ``z``."""
         return self.z - np.nan_to_num(self.height) / 2
 
     @property
     def low_and_high(self) -> tuple[Floats, Floats]:
-        """(N,): heights of the lower and the upper side; see :func:`sgstore.pair_numbers.low_and_high`."""
+        """Return heights of lower and upper side, (N,); see :func:`sgstore.pair_numbers.low_and_high`."""
         return low_and_high(self.z, self.height, IS_SIGNAL[self.kind], IS_UPRIGHT[self.kind])
 
     @property
     def boxes(self) -> Floats:
-        """(N, 5): ``x, y, heading, length, width``."""
+        """Return ``x, y, heading, length, width``, (N, 5)."""
         return np.stack([self.x, self.y, self.heading, self.length, self.width], axis=1)
 
 
 class BodyPairs:
-    """Ordered pairs of bodies that are related: some, and then the mirror image of each of them; shape (K,).
+    """Related ordered pairs of bodies: each pair, then the mirror image of each; shape (K,).
 
     Parameters
     ----------
@@ -160,7 +161,7 @@ class BodyPairs:
     a, b : (K / 2,) intp
         Rows of bodies in the same frame, each pair once.
     between : str
-        What is measured: :attr:`sgstore.config.Proximity.between`.
+        Reference points of the distance: :attr:`sgstore.config.Proximity.between`.
     """
 
     def __init__(self, bodies: Bodies, a: Rows, b: Rows, between: str) -> None:
@@ -172,17 +173,17 @@ class BodyPairs:
 
     @cached_property
     def a(self) -> Rows:
-        """(K,): rows of :class:`Bodies`."""
+        """Return the first body of each pair as rows of :class:`Bodies`, (K,)."""
         return np.concatenate(self._halves)
 
     @cached_property
     def b(self) -> Rows:
-        """(K,): rows of :class:`Bodies`, in the same frames."""
+        """Return the second body of each pair as rows of :class:`Bodies`, (K,)."""
         return np.concatenate(self._halves[::-1])
 
     @cached_property
     def span(self) -> Floats:
-        """(K / 2,): spans of the first half of the pairs, see :func:`spans`."""
+        """Return spans of the first half of the pairs, (K / 2,); see :func:`spans`."""
         half = self._half
         found = np.empty(half)
         for part in even_parts(half):
@@ -193,31 +194,31 @@ class BodyPairs:
 
     @cached_property
     def distance(self) -> Floats:
-        """Distances, as they are measured; m."""
+        """Return distances by the configured measure; m."""
         distance = self.span if self._between == "footprints" else np.sqrt(self.span)
         return np.concatenate([distance, distance])
 
     @cached_property
     def bearing(self) -> Floats:
-        """Bearings of b from a, in (-π, π]; rad. NaN where a's heading is missing; 0 in the same place."""
+        """Return bearings of b from a, in (-π, π]; rad. NaN without a's heading; 0 in the same place."""
         return self.bearings(np.arange(len(self)))
 
     def bearings(self, rows: Rows) -> Floats:
-        """Bearings of some of the pairs; rad."""
+        """Return bearings of these pairs; rad."""
         of, (a, b) = self._bodies, self.some(rows)
         return bearings(of.x[b] - of.x[a], of.y[b] - of.y[a], of.heading[a])
 
     def some(self, rows: Rows) -> tuple[Rows, Rows]:
-        """Both ends of some of the pairs: rows of bodies."""
+        """Return both bodies of these pairs as rows."""
         first, second = (half[rows % max(self._half, 1)] for half in self._halves)
         mirrored = rows >= self._half
         return np.where(mirrored, second, first), np.where(mirrored, first, second)
 
     @cached_property
     def offsets(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Distance of b ahead of a, and to its left; quick, wrong by less than 1e-6 of the distance; m.
+        """Return b's distance ahead of a and to its left; fast, error below 1e-6 of the distance; m.
 
-        NaN where a's heading is missing, or farther from 0 than :data:`MOST_TURNED`.
+        NaN without a's heading, or with a heading beyond :data:`MOST_TURNED`.
         """
         of, half = self._bodies, self._half
         cos, sin = (column.astype(np.float32) for column in self._turns)
@@ -236,7 +237,7 @@ class BodyPairs:
 
     @cached_property
     def for_loops(self) -> Looped:
-        """Halves, frames and nodes of the bodies, their places and turns: what loops over pairs are given."""
+        """Return the input of the pair loops: halves, frames and nodes, positions and turns."""
         of = self._bodies
         return (
             *self._halves,
@@ -247,7 +248,7 @@ class BodyPairs:
 
     @cached_property
     def of_bodies(self) -> Bools:
-        """(K / 2,): which pairs of the first half :func:`meet_as_bodies`; empty: all of them."""
+        """Return a mask (K / 2,) of the pairs that :func:`meet_as_bodies`; empty means all."""
         of = self._bodies
         plain = not (of.carrier >= 0).any() and not (of.height == 0).any()
         levels = of.low_and_high
@@ -257,7 +258,7 @@ class BodyPairs:
 
     @property
     def in_loops(self) -> bool:
-        """Return whether loops tell of them, which know nothing of footprints."""
+        """True if numba loops can process the pairs; they do not support footprints."""
         return self._between != "footprints" and worth()
 
     @cached_property
@@ -268,7 +269,7 @@ class BodyPairs:
 
     @cached_property
     def ends(self) -> tuple[Nodes, Nodes, Nodes]:
-        """Frames, and node ids of a and of b, of the pairs; int32."""
+        """Return frames, and node ids of a and b, of the pairs; int32."""
         frame, node = self._bodies.frame.astype(np.int32), self._bodies.node.astype(np.int32)
         frame, one, other = frame[self._halves[0]], node[self._halves[0]], node[self._halves[1]]
         return (
@@ -279,53 +280,53 @@ class BodyPairs:
 
 
 MOST_TURNED: Final = 1e3
-"""Headings beyond this are no longer exact to a tenth of a nanoradian; rad."""
+"""Headings beyond this have errors above a tenth of a nanoradian; rad."""
 
 EVEN_PART: Final = 1 << 13
-"""Pairs whose numbers are computed together: few enough for the nearest caches of a processor."""
+"""Pairs whose numbers are computed together, to fit the fastest caches."""
 
 
 def by_frame(frame: Ints, frames: int) -> tuple[Rows, Ints]:
-    """Rows by frame, and where those of each frame begin, and the last ones end."""
+    """Return rows ordered by frame, and the start of each frame's rows with the final end."""
     order = np.argsort(frame, kind="stable")
     return order, np.searchsorted(frame[order], np.arange(frames + 1))
 
 
 def turns(bodies: Bodies) -> tuple[Floats, Floats]:
-    """Cosines and sines of the headings."""
+    """Return cosines and sines of the headings."""
     return np.cos(bodies.heading), np.sin(bodies.heading)
 
 
 def even_parts(count: int) -> Iterator[slice]:
-    """Consecutive slices of :data:`EVEN_PART` rows."""
+    """Yield consecutive slices of :data:`EVEN_PART` rows."""
     for start in range(0, count, EVEN_PART):
         yield slice(start, min(start + EVEN_PART, count))
 
 
 def distances(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
-    """Distances of pairs of bodies, as :attr:`sgstore.config.Proximity.between` says; m.
+    """Return distances of pairs of bodies by the measure :attr:`sgstore.config.Proximity.between`; m.
 
-    The origin of a vehicle that moves is on the ground, that of anything else in the centre of its box: where
-    CARLA has them, as far as a recording tells. A footprint without extent or heading is a point.
+    The origin of a moving vehicle is on the ground, that of other bodies in the centre of the box,
+    as in CARLA. A footprint without extent or heading is a point.
     """
     found = spans(bodies, a, b, between)
     return found if between == "footprints" else np.sqrt(found)
 
 
 def spans(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
-    """Numbers that compare as the distances of pairs of bodies do: their squares, or gaps of footprints."""
+    """Return numbers that sort like distances: their squares, or gaps of footprints."""
     if between == "footprints":
         boxes = bodies.boxes
         boxes[np.isnan(boxes).any(axis=1), 2:] = 0
         return gap(boxes[a], boxes[b])
     places = (bodies.x, bodies.y, levels(bodies, between))
     dx, dy, dz = (of[b] - of[a] for of in places)
-    dz = np.where(np.isnan(dz), 0.0, dz)  # in the plane where a height is not known
+    dz = np.where(np.isnan(dz), 0.0, dz)  # in the plane if a height is unknown
     return dx * dx + dy * dy + dz * dz
 
 
 def heights_meet(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Mask of the pairs of bodies that share a height; where it is not known, they do."""
+    """Return a mask of the pairs of bodies that overlap in height; True if it is unknown."""
     low, high = bodies.low_and_high
     reach = np.fmax(low[b] - high[a], low[a] - high[b])
     solid = high > low
@@ -333,9 +334,9 @@ def heights_meet(bodies: Bodies, a: Rows, b: Rows) -> Bools:
 
 
 def on_one_level(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Mask of the pairs of bodies that are not on different storeys; where it is not known, they are not.
+    """Return a mask of the pairs of bodies on the same storey; True if it is unknown.
 
-    Those are on one storey that share a height, or that a road may join which climbs between them.
+    Two bodies are on one storey if they overlap in height, or if a climbing road can join them.
     """
     level = heights_meet(bodies, a, b)
     rest = np.flatnonzero(~level)
@@ -347,25 +348,25 @@ def on_one_level(bodies: Bodies, a: Rows, b: Rows) -> Bools:
 
 
 def meet_as_bodies(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Mask of the pairs of bodies on one level of which neither is flat, nor carries the other."""
+    """Return a mask of the pairs on one level without flat bodies and without carriers."""
     return solid_pairs(bodies, a, b) & on_one_level(bodies, a, b)
 
 
 def solid_pairs(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Mask of the pairs of bodies of which neither is flat, nor carries the other."""
+    """Return a mask of the pairs without flat bodies and without a carrier and its load."""
     flat = ~IS_UPRIGHT[bodies.kind] & (bodies.height == 0)
     return ~(flat[a] | flat[b] | carried_by(bodies, a, b))
 
 
 def carried_by(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Mask of the pairs of which one pulls or carries the other, or that have one carrier."""
+    """Return a mask of the pairs with a carrier and its load, or with a common carrier."""
     carrier, node = bodies.carrier, bodies.node
     bound = (carrier[a] == node[b]) | (carrier[b] == node[a])
     return bound | (carrier[a] >= 0) & (carrier[a] == carrier[b])
 
 
 def levels(bodies: Bodies, between: str) -> Floats:
-    """Heights of what distances are measured between; m."""
+    """Return the heights of the reference points of distances; m."""
     if between != "origins":
         return bodies.z
     on_ground: Bools = bodies.moves & IS_VEHICLE[bodies.kind]
@@ -373,7 +374,7 @@ def levels(bodies: Bodies, between: str) -> Floats:
 
 
 def span_up_to(distance: float, between: str) -> float:
-    """The greatest span of a pair whose distance, as it is rounded, is no greater than this one."""
+    """Return the greatest span whose rounded distance does not exceed this distance."""
     if between == "footprints":
         return distance
     span = distance * distance
@@ -386,18 +387,19 @@ def span_up_to(distance: float, between: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """Parts of the map that bodies stand on, independent of any ego.
+    """Parts of the map under bodies, independent of the ego.
 
     Attributes
     ----------
     hits : LaneHits
-        Lanes that bodies touch; ``row`` is a row of :class:`Bodies`, ascending. Signals touch none.
+        Lanes that bodies touch; ``row`` is a row of :class:`Bodies`, ascending. Empty for signals.
     along : float64
-        For each hit the place of the body's centre along the lane, beyond its ends too; m.
+        Place of the body's centre along the lane of each hit, also beyond its ends; m.
     own : bool
-        For each hit whether the lane is one of the body's own (:func:`sgstore.relations._following.own_hits`).
+        True if the lane of the hit is one of the body's own
+        (:func:`sgstore.relations._following.own_hits`).
     parts : tuple of int64 arrays
-        Rows of :class:`Bodies`, ascending, and node ids of the crosswalks and waypoints that they are at.
+        Rows of :class:`Bodies`, ascending, and node ids of their crosswalks and waypoints.
     off_road : intp array
         Rows of the bodies that touch no driving lane, ascending.
     """
@@ -409,7 +411,7 @@ class Standing:
     off_road: NDArray[np.intp]
 
     def take(self, place: NDArray[np.intp]) -> Standing:
-        """The same of some of the bodies; ``place`` (N,): their new rows, -1 for those left out."""
+        """Filter the hits by bodies; ``place`` (N,) has their new rows, -1 for removed bodies."""
         hits, (rows, nodes) = self.hits, self.parts
         kept, there = place[hits.row] >= 0, place[rows] >= 0
         hits = taken(hits, kept)
@@ -431,13 +433,14 @@ class MapContext:
     ----------
     standing : Standing
     present : (F, K) bool
-        Which nodes of the map are in which graph; column i is node -1 - i.
+        Mask of the map nodes in each graph; column i is node -1 - i.
     controls, affects : tuple of int64 arrays
-        Node ids of signals of the trace, ascending, and of a lane that each applies to or may affect.
+        Node ids of signals of the trace, ascending, and of a lane that each one controls or may
+        affect.
     map_affects : tuple of int64 arrays
         Node ids of signals of the map, and of a lane that each may affect.
     following : tuple of intp, intp, float64 arrays
-        Rows of bodies: one that follows, the one that leads it, and the gap between them along the lanes; m.
+        Rows of bodies: the follower, its leader, and the gap along the lanes; m.
     """
 
     standing: Standing
@@ -454,14 +457,15 @@ def _columns_of(count: int) -> Columns:
 
 
 class EdgeRoom:
-    """Columns that the families of relations fill with the edges of a block, one family behind another.
+    """Shared columns that the families of relations fill with the edges of a block.
 
-    So edges are written once. A family may as well bring columns of its own: they are copied in the end.
+    Therefore edges are written once. A family can also return its own columns, which are copied at
+    the end.
 
     Parameters
     ----------
     count : int
-        For how many edges there is room.
+        Capacity in edges.
     """
 
     def __init__(self, count: int = 0) -> None:
@@ -470,7 +474,7 @@ class EdgeRoom:
         self._used = 0
 
     def rest(self, count: int) -> Columns:
-        """Columns with room for so many edges, to be filled from their beginning."""
+        """Return columns with room for ``count`` edges, to be filled from the start."""
         if self._used + count > len(self._columns[0]):
             return _columns_of(count)
         frame, relation, src, dst = self._columns
@@ -478,7 +482,7 @@ class EdgeRoom:
         return frame[first:], relation[first:], src[first:], dst[first:]
 
     def filled(self, columns: Columns, count: int, more: Edges | None = None) -> Edges:
-        """The first edges of such columns, and some more behind them if there is room."""
+        """Return the first edges of these columns, followed by ``more`` edges."""
         if more is not None and len(more):
             if count + len(more) > len(columns[0]):
                 return Edges.chained([self.filled(columns, count), more])
@@ -491,7 +495,7 @@ class EdgeRoom:
         return edges
 
     def chained(self, parts: Sequence[Edges]) -> Edges:
-        """Edges of all parts: those that are in their place, and the others behind them."""
+        """Concatenate the edges of all parts; parts in the shared columns are not copied."""
         others = [part for part in parts if not any(part is own for own in self._parts)]
         count = self._used + sum(map(len, others))
         if len(parts) - len(others) < len(self._parts) or count > len(self._columns[0]):
@@ -517,21 +521,21 @@ def _fill(columns: Columns, first: int, edges: Edges) -> None:
 
 @dataclass(frozen=True, slots=True)
 class BlockScene:
-    """The frames of a block, ready for the families of relations.
+    """Frames of a block, prepared for the families of relations.
 
     Attributes
     ----------
     config : Config
     bodies : Bodies
     ego : (F,) intp
-        Row of the ego of each frame, -1 where there is none.
+        Row of the ego of each frame, or -1.
     pairs : BodyPairs
     contacts : tuple of intp arrays
-        Rows of bodies that touch one another, each pair once.
+        Rows of bodies that touch, each pair once.
     ground : MapContext or None
-        None without a map.
+        ``None`` without a map.
     room : EdgeRoom
-        Where families may put their edges.
+        Shared columns for the edges.
     """
 
     config: Config
@@ -543,46 +547,47 @@ class BlockScene:
     room: EdgeRoom = field(default_factory=EdgeRoom)
 
     def parameters(self, relation: Relation) -> Mapping[str, Any]:
-        """Settings of a relation's own: those of the config, and the defaults of the others."""
+        """Return the settings of a relation: those of the config, and defaults for the others."""
         return {**relation.parameters, **self.config.relations.get(relation.name, {})}
 
 
 def always(config: Config) -> bool:
-    """Every config asks for it."""
+    """Return True: every config requests the relation."""
     return True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Relation:
-    """A relation: all that is to be said of it, in one place.
+    """Complete declaration of a relation.
 
     Attributes
     ----------
     name : str
         Letters, digits and ``_``, a letter first; compared without regard to case and underscores.
     doc : str
-        Its meaning, for tables: from what to what it leads, and when it holds.
+        Its meaning, for tables: source, target and condition.
     edges : function, optional
-        The edges of a scene; pure. Relations that share a function are computed together, and it may yield
-        any of them. None: the relation comes with the map.
+        Pure function that returns the edges of a scene. Relations that share a function are
+        computed together; it may yield edges of any of them. ``None`` means that the relation comes
+        with the map.
     symmetric : bool
-        Whether each edge has its mirror image.
+        True if each edge has its mirror image.
     needs_map : bool
-        Whether nothing is known of it without a map. Otherwise :attr:`BlockScene.ground` may be None.
+        True if it is unknown without a map. Otherwise :attr:`BlockScene.ground` can be ``None``.
     needs_lanes : bool
-        Whether it has a lane at one end, so that nothing is known of it where lanes are left out.
+        True if one end is a lane; it is then unknown without lanes.
     of_map : bool
-        Whether it holds among parts of a map, too; then every map answers it.
+        True if it also holds among parts of a map; then every map provides it.
     of_pairs : bool
-        Whether it holds between related pairs (:attr:`BlockScene.pairs`), so that nothing is known of it where
-        the settings relate none.
+        True if it holds between related pairs (:attr:`BlockScene.pairs`); it is then unknown if the
+        settings relate no pairs.
     settings : function
-        Whether a config asks for it.
+        Function that returns True if a config requests it.
     parameters : mapping
-        Settings of its own, by name with their defaults: what a config may say in ``[relations.NAME]``;
-        numbers, texts, true or false. See :meth:`BlockScene.parameters`.
+        Its settings, by name with defaults, for ``[relations.NAME]`` of a config; numbers, texts,
+        true or false. See :meth:`BlockScene.parameters`.
     legend : str
-        A few words for the legend of a picture, seen from the other end; empty: the name says it.
+        Short text for the legend of a picture, seen from the other end; empty means the name.
     """
 
     name: str
@@ -598,19 +603,19 @@ class Relation:
     legend: str = ""
 
     def asked(self, config: Config) -> bool:
-        """Return whether the relation is computed under a config, given a map if it needs one."""
+        """True if a config requests the relation, with a map if it needs one."""
         return self.settings(config) and (not self.of_pairs or relates_pairs(config))
 
 
 def relates_pairs(config: Config) -> bool:
-    """Return whether the settings relate any pairs; otherwise nothing is known of them."""
+    """True if the settings relate any pairs."""
     return config.pairs.ego or config.pairs.within > 0
 
 
 def edges_between(
     scene: BlockScene, relation: str | Codes, src: NDArray[np.intp], dst: NDArray[np.intp]
 ) -> Edges:
-    """Edges from body to body (rows), all with one relation or each with its own code."""
+    """Return edges from body to body (rows), with one relation or one code each."""
     bodies = scene.bodies
     return Edges(
         bodies.frame[src], _relation_codes(relation, len(src)), bodies.node[src], bodies.node[dst]
@@ -620,7 +625,7 @@ def edges_between(
 def edges_of_pairs(
     scene: BlockScene, codes: Codes, holds: Bools, *, seen_by_a: bool = False
 ) -> tuple[Columns, int]:
-    """Edges of the related pairs of which something holds, from a to b; or from b, ``seen_by_a``, to a.
+    """Return edges from a to b, or from b to a with ``seen_by_a``, for the pairs in a mask.
 
     Parameters
     ----------
@@ -633,7 +638,7 @@ def edges_of_pairs(
     Returns
     -------
     columns, count
-        As :meth:`EdgeRoom.filled` takes them.
+        Input of :meth:`EdgeRoom.filled`.
     """
     columns = scene.room.rest(len(codes))
     frame, src, dst = scene.pairs.ends
@@ -645,14 +650,16 @@ def edges_of_pairs(
         if rows is None:
             column[:count] = values
         else:
-            np.take(values, rows, out=column[:count], mode="clip")  # others go through a copy
+            np.take(
+                values, rows, out=column[:count], mode="clip"
+            )  # this copies only the selected rows
     return columns, count
 
 
 def edges_to_map(
     scene: BlockScene, relation: str, src: NDArray[np.intp] | Ints, dst: Ints
 ) -> Edges:
-    """Edges from bodies (rows) to nodes of the map (node ids)."""
+    """Return edges from bodies (rows) to nodes of the map (node ids)."""
     bodies = scene.bodies
     return Edges(bodies.frame[src], _relation_codes(relation, len(src)), bodies.node[src], dst)
 
@@ -664,7 +671,7 @@ def _relation_codes(relation: str | Codes, count: int) -> Codes:
 
 
 def kinds_mask(names: tuple[str, ...]) -> Bools:
-    """Table by kind code: whether the kind is one of those named."""
+    """Return a table of bool by kind code: True for the named kinds."""
     table = np.zeros(MOST_KINDS, np.bool_)
     table[[KIND_CODE[name] for name in names]] = True
     return table
@@ -677,12 +684,12 @@ IS_USER: Final = kinds_mask((*VEHICLES, "person", "animal"))
 
 
 def spread(starts: Ints, counts: Ints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Many ranges in one array.
+    """Expand many ranges into one array.
 
     Returns
     -------
     owner, index : (sum of counts,) intp
-        For each range i in turn, ``counts[i]`` times i, and the indices from ``starts[i]`` on.
+        For each range i, ``counts[i]`` times i, and the indices from ``starts[i]`` on.
     """
     owner = np.repeat(np.arange(len(counts)), counts)
     before = np.cumsum(counts) - counts
@@ -690,6 +697,6 @@ def spread(starts: Ints, counts: Ints) -> tuple[NDArray[np.intp], NDArray[np.int
 
 
 def joined(keys: Ints, wanted: Ints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """All matches of ``wanted`` in ascending ``keys``: rows of ``wanted``, ascending, and rows of ``keys``."""
+    """Return all matches of ``wanted`` in ascending ``keys``: rows of ``wanted``, and rows of ``keys``."""
     start = np.searchsorted(keys, wanted)
     return spread(start, np.searchsorted(keys, wanted, side="right") - start)

@@ -1,17 +1,17 @@
-"""Bodies that the ego sees: all that are not hidden behind other bodies.
+"""Bodies that the ego sees: all bodies that no other body hides.
 
-The eye is above the centre of the ego, at the height of its roof. A body is seen when the straight line from
-there to its centre, or to one of the four corners of its footprint at the height of its centre, is free. A body
-hides what lies behind its footprint, as far as the line passes it between its lower and its upper side: a car
-hides the car behind it, not the traffic light above, and a bridge hides nothing on the road below.
+The eye is above the centre of the ego, at the height of its roof. A body is seen if a straight line
+to its centre, or to a corner of its footprint at that height, is free. A body blocks a line that
+crosses its footprint between its lower and its upper side: a car hides the car behind it, but not
+the traffic light above, and a bridge hides nothing on the road below.
 
-* What has no height hides nothing, nor does a signal, nor a body whose footprint the eye is in: seen from
-  within, a box says nothing of what is around. The ego hides nothing, and nobody hides itself.
-* Where the height of the eye or of what is looked at is missing, the plane alone counts. What has no footprint
-  is looked at by its centre; what has no place is not seen.
-* What is on another storey (as of ``overlaps``) is not seen; signals are on none.
-* A line along a side, or through a corner, is free. There is no limit but the range of the graph, and neither
-  the direction in which the ego looks nor the weather counts: those are a matter of sensors.
+* A body without height hides nothing; neither does a signal, nor a body whose footprint contains
+  the eye. The ego hides nothing, and a body does not hide itself.
+* Without the height of the eye or of the body, only the plane counts. A body without a footprint is
+  tested by its centre; a body without position is not seen.
+* A body on another storey (as in ``overlaps``) is not seen; signals have no storey.
+* A line along a side, or through a corner, is free. The only limit is the range of the graph. The
+  view direction of the ego and the weather do not count: they concern sensors.
 """
 
 from __future__ import annotations
@@ -46,23 +46,23 @@ if TYPE_CHECKING:
 
 
 GRAZE: Final = 1e-6
-"""What is no deeper within a footprint passes it by; m."""
+"""A line that enters a footprint by less does not cross it; m."""
 
 AT_ONCE: Final = 4096
-"""Pairs of a body and another before it that are looked at together."""
+"""Pairs of a body and a possible cover that are processed together."""
 
 POINTS: Final = 5
-"""Points of a body that are looked at: its centre and the four corners."""
+"""Points of a body that are tested: its centre and the four corners."""
 
 
 def seen(bodies: Bodies, ego: Rows) -> Rows:
-    """Rows of the bodies that the ego of their frame sees.
+    """Return rows of the bodies that the ego of their frame sees.
 
     Parameters
     ----------
     bodies : Bodies
     ego : (F,) intp
-        Row of the ego of each frame; -1: nothing is seen.
+        Row of the ego of each frame; with -1 the frame has no seen bodies.
     """
     if worth():
         return _seen_in_loops(bodies, ego)
@@ -72,7 +72,7 @@ def seen(bodies: Bodies, ego: Rows) -> Rows:
     views = _views(bodies, rows, mine[rows])
     hidden = np.zeros((len(rows), POINTS), np.bool_)
     for target, cover in _in_one_direction(views, bodies.frame[rows]):
-        # Near ones first: they hide the most, and what is hidden is not looked at again.
+        # Near covers first: they hide the most, and hidden bodies are not tested again.
         order = np.argsort(views.near[cover], kind="stable")
         for first in range(0, len(order), AT_ONCE):
             part = order[first : first + AT_ONCE]
@@ -96,21 +96,20 @@ def _seen_in_loops(bodies: Bodies, ego: Rows) -> Rows:
 
 @dataclass(frozen=True, slots=True)
 class _Views:
-    """Bodies as they are seen from the eye, which is the origin, the axes being those of the map; shape (N,).
+    """Bodies relative to the eye, in the axes of the map; shape (N,).
 
     Attributes
     ----------
     x, y : (N, 5) float64
-        Points that are looked at: the centre, and the corners, which are in the centre too where the footprint
-        is not known; m.
+        Tested points: the centre, and the corners (equal to the centre without a footprint); m.
     z : float64
         Height of these points above the eye; m.
     low, high : float64
-        Directions between which the footprint lies, ``low`` in [-π, π), ``high`` not below it; rad.
+        Range of directions of the footprint, ``low`` in [-π, π), ``high`` not below it; rad.
     near, far : float64
         Bounds of the distances of its points; m.
     hides : bool
-        Whether it can hide anything.
+        True if it can hide other bodies.
     cos, sin, length, width : float64
         Direction and half the size of the footprint; m.
     bottom, top : float64
@@ -171,8 +170,8 @@ def _views(bodies: Bodies, rows: Rows, eye: Rows) -> _Views:
 
 
 def _in_one_direction(views: _Views, frame: Ints) -> Iterator[tuple[Rows, Rows]]:
-    """Bodies, and others that may hide them: somewhere they are in one direction, and nearer."""
-    # What reaches beyond π is there a second time, from the other side.
+    """Yield pairs of a body and a nearer one that shares a direction with it."""
+    # Ranges beyond π occur a second time, from the other side.
     again = np.flatnonzero(views.high > np.pi)
     rows = np.concatenate([np.arange(len(views.low)), again])
     low = np.concatenate([views.low, views.low[again] - 2 * np.pi])
@@ -185,7 +184,7 @@ def _in_one_direction(views: _Views, frame: Ints) -> Iterator[tuple[Rows, Rows]]
 
 
 def _blocked(views: _Views, target: Rows, cover: Rows, point: int) -> Bools:
-    """Mask of lines to a point of the target that the cover blocks, between its lower and upper side."""
+    """Return a mask of lines to a point of the target that the cover blocks."""
     cos, sin = views.cos[cover], views.sin[cover]
     x, y = views.x[cover, 0], views.y[cover, 0]
     to_x, to_y = views.x[target, point], views.y[target, point]
@@ -201,14 +200,16 @@ def _blocked(views: _Views, target: Rows, cover: Rows, point: int) -> Bools:
         np.minimum(enters * height, leaves * height),
         np.maximum(enters * height, leaves * height),
     )
-    passes = (low >= views.top[cover]) | (high <= views.bottom[cover])  # never where one is missing
+    passes = (low >= views.top[cover]) | (
+        high <= views.bottom[cover]
+    )  # False if a height is missing
     return (enters < leaves) & ~passes
 
 
 def _within(
     start: Floats, run: Floats, half: Floats, enters: Floats | float, leaves: Floats | float
 ) -> tuple[Floats, Floats]:
-    """The part of a way, between two shares of it, on which a coordinate is between minus and plus ``half``."""
+    """Clip a way, between two shares of it, to the part where a coordinate is within ±``half``."""
     with np.errstate(divide="ignore", invalid="ignore"):
         one, other = (-half - start) / run, (half - start) / run
     return (
