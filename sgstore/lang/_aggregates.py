@@ -1,7 +1,7 @@
-"""Aggregates: what is counted, summed or collected of all matches, each declared once.
+"""Aggregates: functions that count, sum or collect values over all matches.
 
-They stand after ``RETURN``. Values that are unknown do not count; of none ``COUNT`` is 0, ``collect`` an empty
-list, and the others NULL.
+They are allowed after ``RETURN``. Unknown values are ignored. Without values, ``COUNT`` is 0, ``collect`` is
+an empty list, and the others are NULL.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ if TYPE_CHECKING:
 
 
 PLACE: Final = '":rows".":place"'
-"""The column that says in which order matches come: what is collected keeps it."""
+"""Column with the order of matches, which ``collect`` keeps."""
 
 
 @dataclass(frozen=True, slots=True)
 class AggregateFunction:
-    """An aggregate.
+    """Aggregate with its SQL and its types.
 
     Attributes
     ----------
     sql : function
-        Its SQL, given that of what it is taken of (behind ``DISTINCT``, if it is taken of different values) and
-        its share.
+        Function from the SQL of the operand (after ``DISTINCT``, if present) and the share to the SQL of the
+        aggregate.
     of : frozenset of Type
-        Types that it is taken of.
+        Allowed types of the operand.
     gives : Type or None
-        Type of its value; ``None``: that of what it is taken of.
+        Type of the result; ``None`` means the type of the operand.
     share : bool
-        Whether it takes a second argument: a percentage.
+        True if there is a second argument: a percentage.
     """
 
     sql: Callable[[str, float], str]
@@ -62,7 +62,7 @@ def _quantile(inner: str, share: float) -> str:
 
 
 def _collected(inner: str, _: float) -> str:
-    """A list of values: empty of no match; of different values, each once in their own order."""
+    """Return the SQL of ``collect``: a list, sorted by value for ``DISTINCT``. Without matches it is empty."""
     value = inner.removeprefix("DISTINCT ")
     order = PLACE if value == inner else value
     return f"coalesce(list({inner} ORDER BY {order}) FILTER (WHERE {value} IS NOT NULL), [])"
@@ -82,17 +82,17 @@ AGGREGATES: Final[dict[str, AggregateFunction]] = {
 """Aggregates by folded name."""
 
 EXTREMES: Final = frozenset({"min", "max"})
-"""Those whose names are functions of two numbers or more as well."""
+"""Aggregates whose names are also functions of two or more numbers."""
 
 
 def is_aggregate(e: s.Call) -> bool:
-    """Tell whether a call is of an aggregate, and not of a function of the same name."""
+    """True if a call is an aggregate, and not a function with the same name."""
     name = normalize_name(e.name)
     return name in AGGREGATES and (name not in EXTREMES or len(e.arguments) == 1)
 
 
 def aggregate(e: s.Call, names: SymbolTable) -> b.Aggregate:
-    """A call of an aggregate, bound.
+    """Bind a call of an aggregate.
 
     Raises
     ------
@@ -122,7 +122,7 @@ def aggregate(e: s.Call, names: SymbolTable) -> b.Aggregate:
 
 
 def _share(written: s.Expression, e: s.Call, names: SymbolTable) -> float:
-    """A percentage as a share of one."""
+    """Return a percentage as a fraction of one."""
     found = names.bind(written)
     if not isinstance(found, b.Value) or isinstance(found.value, bool | str | None):
         names.session.refuse(
@@ -136,7 +136,7 @@ def _share(written: s.Expression, e: s.Call, names: SymbolTable) -> float:
 
 
 def sql_of(one: b.Aggregate, inner: str) -> str:
-    """Return the SQL of an aggregate, given that of what it is taken of."""
+    """Return the SQL of an aggregate from the SQL of its operand."""
     if one.operand is not None and one.operand.type is Type.number and one.word in _REAL:
         inner = f"CAST({inner} AS DOUBLE)"
     if one.distinct:
@@ -145,9 +145,9 @@ def sql_of(one: b.Aggregate, inner: str) -> str:
     owned = isinstance(one.operand, b.Operation) and one.operand.word == "whose"
     if not owned or one.word != "collect":
         return found
-    # Nodes of several traces are told apart by whose they are, and shown as their ids.
+    # Nodes of several traces are distinguished by their owner, but shown as ids.
     return f'list_sort([struct_extract("one", 2) FOR "one" IN {found}])'
 
 
 _REAL: Final = frozenset({"median", "percentile", "stddev"})
-"""Aggregates that interpolate or take roots: of whole numbers as of others."""
+"""Aggregates that interpolate or take roots. They need floating-point operands."""

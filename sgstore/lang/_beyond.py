@@ -1,7 +1,8 @@
-"""Distance relations of entities beyond the graph, by their definition.
+"""Distance relations of entities beyond the graph, computed from their definition.
 
-A graph has edges between its own entities only. The rungs of ``[proximity]`` and ``overlaps`` are defined by
-places and sizes, which are also known beyond the graph. In scope ``world`` a block with such an edge is
+A graph has edges between its own entities only. The distance relations of ``[proximity]`` and ``overlaps``
+are defined by positions and sizes, which are also known beyond the graph. In scope ``world`` a block with
+such an edge is
 therefore evaluated twice: with the edge, and with its definition for pairs that are not both in the graph. No
 match is in both results, so their counts add up.
 """
@@ -24,17 +25,16 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
 _MOST: Final = 3
-"""Edges in braces that are evaluated so: each set of them is one more query.
-
-With more edges, a check is unknown and a pattern matches within the graph.
+"""Largest number of edges in braces with this evaluation. Each subset is one more query. With more edges, a
+check is unknown and a pattern matches within the graph.
 """
 
 _SIDES: Final = 10.0
-"""Half lengths of two bodies together: the distance of centres is greater than that of edges; m."""
+"""Sum of the half lengths of two bodies: the extra distance of centres compared with edges; m."""
 
 
 def beyond_graph(edge: b.Edge) -> b.Bound:
-    """Return the condition that the ends of an edge are two, and not both in the graph."""
+    """Return the condition that the ends of an edge differ, and are not both in the graph."""
     keys = edge.src, edge.dst
     two = b.Operation("<>", tuple(map(b.NodeValue, keys)), Type.boolean)
     ends = (b.NodeAttribute(key, IN_GRAPH, Type.boolean) for key in keys)
@@ -47,9 +47,9 @@ def whole_block(block: b.BlockValue, number: int) -> b.Bound:
     Parameters
     ----------
     block : BlockValue
-        Has the edges that were computed.
+        Block that covers only edges in the graph.
     number : int
-        The first number that no block has yet.
+        First unused block number.
     """
     edges = [edge for edge in block.scope.edges if _is_told(edge, block)]
     if not edges or len(edges) > _MOST or block.word not in _JOINED:
@@ -66,7 +66,7 @@ def whole_block(block: b.BlockValue, number: int) -> b.Bound:
 
 
 def _is_told(edge: b.Edge, block: b.BlockValue) -> bool:
-    """Return true if an edge beyond the graph follows from its definition."""
+    """True if an edge beyond the graph can be computed from its definition."""
     if edge.high > 1 or edge.named or not edge.beyond:
         return False
     kinds = [block.scope.kinds(key) for key in (edge.src, edge.dst)]
@@ -78,13 +78,13 @@ def _is_told(edge: b.Edge, block: b.BlockValue) -> bool:
         return False
     if edge.relations - bounded_in(edge.beyond):
         return False
-    # Who is as near to the ego is in the graph.
+    # Entities that near to the ego are in the graph.
     of_ego = any(not one.other for one in kinds)
     return not (of_ego and all(_reach(edge, reach) <= reach.radius for reach in known))
 
 
 def bounded_in(scopes: b.Scopes) -> frozenset[str]:
-    """Return the relations that end at some distance; a trace without such a rung has none."""
+    """Return the relations with a limited distance, from the settings of some traces."""
     rungs = (name for reach, _ in scopes if reach is not None for name, _ in reach.rungs)
     return frozenset({"overlaps", *PROXIMITY, *rungs}) - frozenset(DIRECTIONS)
 
@@ -95,7 +95,7 @@ def _reach(edge: b.Edge, reach: RelationScope) -> float:
 
 
 def _defined(block: b.BlockValue, edges: tuple[b.Edge, ...], number: int) -> b.BlockValue:
-    """The block of pairs beyond the graph that have some edges by their definition."""
+    """Return a copy of a block for pairs beyond the graph, with some edges replaced by their definition."""
     told = {edge.key for edge in edges}
     where = [*block.scope.where]
     for edge in edges:
@@ -105,16 +105,16 @@ def _defined(block: b.BlockValue, edges: tuple[b.Edge, ...], number: int) -> b.B
 
 
 def looks_less(check: b.BoundCheck, ego: b.Node) -> b.BoundCheck:
-    """Return a check in which an entity farther away than its limit is absent.
+    """Return a copy of a check in which entities farther away than its limit are absent.
 
     Parameters
     ----------
     check : BoundCheck
-        With a limit.
+        Check with a limit.
     ego : Node
-        Added to its nodes if it has no ego.
+        Node to add if the check has no ego.
     """
-    assert check.limit is not None  # noqa: S101 - it has one
+    assert check.limit is not None  # noqa: S101 - required by the caller
     own = [key for key, node in check.scope.nodes.items() if not node.kinds.other]
     nodes = check.scope.nodes if own else {**check.scope.nodes, ego.key: ego}
     limited = partial(_limited, ego=nodes[own[0] if own else ego.key], limit=check.limit)
@@ -131,7 +131,7 @@ def looks_less(check: b.BoundCheck, ego: b.Node) -> b.BoundCheck:
 
 
 def _limited(value: b.Bound, ego: b.Node, limit: float) -> b.Bound:
-    """Return a value whose braces match no entity farther from the ego than the limit."""
+    """Return a value whose blocks match only entities within the limit around the ego."""
     again = partial(_limited, ego=ego, limit=limit)
     if not isinstance(value, b.BlockValue):
         return b.with_operands(value, again)
@@ -146,14 +146,14 @@ def _limited(value: b.Bound, ego: b.Node, limit: float) -> b.Bound:
 
 
 def is_limited(node: b.Node) -> bool:
-    """Tell whether a node may be an entity that is not the ego."""
+    """True if a node may be an entity other than the ego."""
     return bool(node.kinds.other & entity_kinds())
 
 
 def within(key: str, ego: str, limit: float) -> b.Bound:
-    """Return the condition that the footprint of a node is no farther from the ego's centre than a limit.
+    """Return the condition that the footprint of a node is within a distance of the ego's centre.
 
-    A node without a place, or one of the map, counts as near.
+    A node without a position, and a part of the map, count as near.
     """
 
     def number(name: str) -> b.Bound:
@@ -173,9 +173,9 @@ def within(key: str, ego: str, limit: float) -> b.Bound:
 
 
 def holds(edge: b.Edge, names: Iterable[str]) -> b.Bound:
-    """Return the condition that an edge has one of some relations by their definition.
+    """Return the condition that an edge has one of some relations, from their definition.
 
-    If the settings of a trace are not known: the condition that it may have one.
+    For a trace with unknown settings: the condition that the edge may have one of them.
     """
     among = frozenset(names)
 
@@ -212,4 +212,4 @@ _JOINED: Final[Mapping[str, Callable[[list[b.BlockValue]], b.Bound]]] = {
     "MIN": lambda blocks: _extreme("min", blocks),
     "MAX": lambda blocks: _extreme("max", blocks),
 }
-"""What a block is, made of those that have its matches."""
+"""Functions that combine the blocks with disjoint matches into one value."""

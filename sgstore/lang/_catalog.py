@@ -1,12 +1,12 @@
 """Catalog of a store for the compiler: its attributes and its contents.
 
-The attributes are fixed by the schema and are the same for every store. A :class:`Catalog` says what one
-store holds: which kinds of nodes live where, which triples (relation, kind, kind) occur and how often, and
-what its traces can answer. It is a value; the compiler asks nothing of a database.
+The attributes are fixed by the schema and are the same for every store. A :class:`Catalog` describes one
+store: the kinds of nodes in each table, the triples (relation, kind, kind) with their numbers of rows, and
+the relations that its traces know. The catalog is a plain value, so the compiler needs no database.
 
-A node lives in one of three places: an entity that moves or changes has a row in ``state`` for each frame and
-its constants in ``entity``; a static entity has everything in ``entity``, a part of the road map in
-``map_node``, and both have their presence in ``node``.
+A node is stored in one of three ways. An entity that moves or changes has a row in ``state`` for each frame,
+and its constants in ``entity``. A static entity has all its values in ``entity``. A part of the road map has
+them in ``map_node``. For the last two, table ``node`` holds the frames in which they are present.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ Triple = tuple[str, str, str]
 
 
 class Home(StrEnum):
-    """Table that holds the values of an attribute."""
+    """Table that stores the values of an attribute."""
 
     state = "state"
-    """Of entities that move or change, frame by frame: table ``state``."""
+    """Values of entities that move or change, frame by frame: table ``state``."""
     entity = "entity"
     """Constants of every entity, moving or static: table ``entity``."""
     scenery = "scenery"
@@ -58,65 +58,63 @@ class Home(StrEnum):
 
 
 class DisplayUnit(StrEnum):
-    """Conversion of a value in the database to the value that people see."""
+    """Conversion of a value in the database to the value that users see."""
 
     plain = "plain"
     degrees = "degrees"
     east = "east"
-    """A coordinate about the trace's origin; in ``map_node`` it is absolute already."""
+    """Coordinate relative to the origin of the trace; absolute in ``map_node``."""
     north = "north"
     up = "up"
     light = "light"
-    """A bit of the mask of a vehicle's lights."""
+    """Bit of the light mask of a vehicle."""
     derived = "derived"
-    """A bit that says which numbers were computed by differences."""
+    """Bit of the mask of values computed by differences."""
     along = "along"
     """Length of (ax, ay) along the heading."""
     given = "given"
-    """True where there is a value."""
+    """True if the column has a value."""
     velocity = "velocity"
-    """m/s; what stands for ever has velocity 0."""
+    """Velocity in m/s; 0 for static nodes."""
     standing = "standing"
-    """Parts of the map never move."""
+    """True if the node never moves, as parts of the map."""
     binding = "binding"
-    """The node id itself, in no table."""
+    """The node id itself, from no table."""
     owner = "owner"
-    """Whose number the node id is: the trace's of an entity, the map's of a part of it; in no table."""
+    """Owner of the node id: the trace of an entity, or the map of a map part; from no table."""
     whole = "whole"
-    """A whole number."""
+    """Integer."""
     label = "label"
-    """What people call the node: of a part of the map its name, of an entity its kind and id."""
+    """Display name of the node: the name of a map part, or the kind and id of an entity."""
     seconds = "seconds"
-    """A time in nanoseconds; seen as seconds since the trace began."""
+    """Time in nanoseconds, shown as seconds since the start of the trace."""
     classed = "classed"
-    """The class of a frame's graph in an abstraction; the column is the name of that."""
+    """Class of the frame's graph in an abstraction. The column is the name of the abstraction."""
     weather = "weather"
-    """What the last event of weather and light up to the frame says; the column is its word."""
+    """Word of the last weather event up to the frame. The column is the name of the word."""
     clock = "clock"
-    """The time of day that such an event says, and what has passed since; hours."""
+    """Time of day from the last weather event, plus the elapsed time; hours."""
     counted = "counted"
-    """How many frames of the store are of the class of the frame, in an abstraction; the column is its name."""
+    """Number of frames in the store with the class of this frame. The column is the name of the abstraction."""
     seen = "seen"
-    """Whether the class of the frame, in an abstraction, is that of a frame of a dataset."""
+    """True if a frame of a dataset has the class of this frame in an abstraction."""
     inside = "inside"
-    """Whether a node is in the graph of the frame; of what moves, its state says so."""
+    """True if a node is in the graph of the frame. For a moving entity, its state holds this flag."""
     role = "role"
-    """What a lane is to the ego, frame by frame: in the view ``roles``."""
+    """Role of a lane relative to the ego, frame by frame: view ``roles``."""
     own = "own"
-    """An attribute of a client's own, frame by frame: in the view ``attributes``."""
+    """User-defined attribute, frame by frame: view ``attributes``."""
     span = "span"
-    """A length of time in nanoseconds; seen in seconds."""
+    """Duration in nanoseconds, shown in seconds."""
     recording = "recording"
-    """What stands in the table of recordings; the column is there."""
+    """Column of the table of recordings."""
 
 
 class Type(StrEnum):
     """Types of values in expressions."""
 
     number = "number"
-    whole = (
-        "whole number"  # of an attribute of a client's own, in a catalog: a number in expressions
-    )
+    whole = "whole number"  # type of a user-defined attribute in a catalog; in expressions it is a number
     text = "text"
     boolean = "boolean"
     node = "node"
@@ -126,7 +124,7 @@ class Type(StrEnum):
 
 
 DERIVED: Final = ("velocity", "acceleration", "yaw_rate")
-"""What may have been computed by differences; the index is the bit in ``state.derived``."""
+"""Quantities that may have been computed by differences. The index is the bit in ``state.derived``."""
 
 _ENTITIES: Final = frozenset(OWN_ENTITY_KINDS)
 _LANES: Final = frozenset({"lane"})
@@ -136,37 +134,37 @@ _ON_ROADS: Final = frozenset({"lane", "junction", "road", "crosswalk", *SIGNALS}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attribute:
-    """An attribute of nodes, edges, frames or traces; each is there once.
+    """Attribute of nodes, edges, frames or traces.
 
     Attributes
     ----------
     name : str
-        Canonical spelling; compared without regard to case and underscores.
+        Canonical spelling; compared ignoring case and underscores.
     type : Type
     columns : mapping of Home to str
-        Column in each home that has it.
+        Column in each home that stores the attribute.
     unit : DisplayUnit
-        How the column becomes the value.
+        Conversion from the column to the value.
     own_kinds : frozenset of str
-        Kinds of the vocabulary whose nodes may have it; :attr:`kinds` are all of them.
+        Built-in kinds of nodes that may have the attribute; :attr:`kinds` also has added kinds.
     values : sequence of str
-        All values that it can have, if they are a closed list.
+        All possible values, if the list is closed.
     enum : str
-        The enumeration of the vocabulary that its values are of; empty for all others.
+        Enumeration of the vocabulary that contains the values; empty for other attributes.
     given : str
-        The table that tells it where a store is part of a collection: see :attr:`Catalog.part`.
+        Table with the values if the store is part of a collection: see :attr:`Catalog.part`.
     precision : str
-        Of a value that ``WITH`` passes on: how it is rounded before it is compared.
+        For a value that ``WITH`` passes on: the rounding before comparisons.
     stored : bool
-        Whether such a value is a number of 32 bits as the store keeps it.
+        True if such a value is a 32-bit number from the store.
     meaning : str
-        For the documentation; with unit.
+        Meaning for the documentation; with unit.
     table : str
-        The user's own table that it is a column of, or whose frames it is about; empty for all others.
+        User table that has the column, or whose frames the attribute is about; empty for others.
     traces : tuple of int
-        Ids of the traces that it is about.
+        Ids of the traces that the attribute is about.
     whole : bool
-        Whether all its values are whole numbers, some of which no float is equal to.
+        True if all values are integers, which may be too large for an exact float.
     """
 
     name: str
@@ -186,13 +184,13 @@ class Attribute:
 
     @property
     def kinds(self) -> frozenset[str]:
-        """All kinds that have it: what all entities have, those that were added have, too."""
+        """All kinds that may have the attribute. Attributes of all entities include added entity kinds."""
         every = self.own_kinds >= _ENTITIES
         return self.own_kinds | entity_kinds() if every else self.own_kinds
 
     @property
     def of_store(self) -> bool:
-        """Tell whether it is told by what the store holds beside the graph of the frame."""
+        """True if the value comes from a table other than the frame's graph."""
         other = {DisplayUnit.seen, DisplayUnit.counted, DisplayUnit.weather, DisplayUnit.clock}
         return bool(self.table) or self.unit in other
 
@@ -214,7 +212,7 @@ def _constant(name: str, column: str, meaning: str, values: Sequence[str] = ()) 
 
 
 def _repeated(name: str, meaning: str, values: Sequence[str] = ()) -> Attribute:
-    """A constant of entities that their states repeat."""
+    """Return a constant of entities that is repeated in each of their states."""
     homes = {Home.state: name, Home.entity: name}
     return Attribute(name, Type.text, homes, meaning, own_kinds=_ENTITIES, values=values)
 
@@ -245,12 +243,12 @@ IN_GRAPH: Final = Attribute(
     DisplayUnit.inside,
     _ENTITIES,
 )
-"""Of queries made here alone: who writes one has the scope."""
+"""Used only in generated queries. In written queries, the scope has this role."""
 
 COMPUTED: Final = Attribute(
     "computed", Type.boolean, {}, "whether its relations were computed here, and not imported"
 )
-"""Of a trace, in queries made here alone; its settings say it."""
+"""Attribute of a trace, used only in generated queries. Its value comes from the settings."""
 
 NODE_ATTRIBUTES: Final = _named(
     (
@@ -422,16 +420,16 @@ NODE_ATTRIBUTES: Final = _named(
 
 @cache
 def own_attribute(name: str, kind: Type) -> Attribute:
-    """Return an attribute of a client's own, which nodes of any kind, or edges of any relation, may have."""
+    """Return a user-defined attribute, which nodes of any kind or edges of any relation may have."""
     whole = kind is Type.whole
     kind = Type.number if whole else kind
     return Attribute(name, kind, {}, "of a client's own", DisplayUnit.own, whole=whole)
 
 
 def own_type(types: Collection[Type]) -> Type:
-    """Return the type of an attribute of a client's own, by its types in each of several traces.
+    """Return the type of a user-defined attribute from its types in several traces.
 
-    What is a number in one trace is a number everywhere. A text of another trace is then no value.
+    A number in one trace makes the attribute a number. Texts in other traces then count as missing values.
     """
     for kind in (Type.number, Type.whole):
         if kind in types:
@@ -502,11 +500,11 @@ FOLLOWING: Final = ("leads", "follows")
 """Relations whose edges have the attribute ``gap``."""
 
 EDGE_ALIASES: Final = {"offset": "laneoffset", "primary": "isprimary"}
-"""Shorter words for them, folded."""
+"""Short aliases of edge attributes, folded."""
 
 
 def class_attribute(abstraction: str, name: str = "") -> Attribute:
-    """The class of a frame in an abstraction; NULL where it is not in the store."""
+    """Return the attribute for the class of a frame in an abstraction. NULL if it is not in the store."""
     return Attribute(
         name or f"class_{abstraction}",
         Type.text,
@@ -574,7 +572,7 @@ ENV_ATTRIBUTES: Final = {
         _weather("time_of_day", "hours since midnight"),
     )
 }
-"""Attributes of ``env``, weather and light, by folded name (view ``events``); their words are those of OSI."""
+"""Attributes of ``env``: weather and light, by folded name (view ``events``). The words are those of OSI."""
 
 TRACE_ATTRIBUTES: Final = _named(
     (
@@ -610,7 +608,7 @@ PAIR_NAMES: Final[Mapping[str, str]] = {
     for word in (name, one.column, one.alias)
     if word
 } | {normalize_name(name): name for name in RECORDED}
-"""The functions of two entities by folded name, aliases included, and measures of what was recorded."""
+"""Functions of two entities by folded name, with aliases, and recorded measures."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -623,17 +621,17 @@ class RelationScope:
     ego, static : bool
     kinds : tuple of pairs of str
     between : str
-        What distances are measured between: :attr:`sgstore.config.Proximity.between`.
+        Points between which distances are measured: :attr:`sgstore.config.Proximity.between`.
     rungs : tuple of (str, float)
-        Relations of distance, from the nearest on, and their upper bounds; m.
+        Distance relations, nearest first, and their upper bounds; m.
     near_kinds : tuple of pairs of str
-        Those that they are among; empty: all.
+        Pairs of kinds with distance relations; empty means all.
     radius : float
-        A circle around the ego that is in its graph; m.
+        Radius around the ego within which entities are in its graph; m.
     farthest : float
-        How far from the ego an entity is at most of which something is known; m.
+        Largest distance from the ego of a known entity; m.
     without : frozenset of str
-        Relations that are not computed of entities, though a map may have them among its parts.
+        Relations that are not computed for entities. A map may still have them between its parts.
     """
 
     within: float = 25.0
@@ -650,7 +648,7 @@ class RelationScope:
 
     @classmethod
     def of(cls, settings: Mapping[str, Any]) -> Self | None:
-        """As the settings of a trace have it; ``None`` where they do not say it."""
+        """Return the scope from the settings of a trace. ``None`` means that the settings have no pairs."""
         pairs = settings.get("pairs")
         if pairs is None:
             return None
@@ -679,14 +677,14 @@ def _pairs_of(labels: Iterable[Iterable[str]]) -> tuple[tuple[str, ...], ...]:
 
 
 def excluded_kinds(labels: Iterable[str], counted: Iterable[str]) -> frozenset[str]:
-    """Return the kinds of which settings leave out some nodes, or all.
+    """Return the kinds whose nodes the settings leave out, all or some of them.
 
     Parameters
     ----------
     labels : iterable of str
-        Of what is kept: :attr:`sgstore.config.Config.kinds`; none: everything.
+        Labels of kept nodes: :attr:`sgstore.config.Config.kinds`; empty means all.
     counted : iterable of str
-        Kinds of what was left out.
+        Kinds of the nodes that were left out.
     """
     kept = [frozenset(kinds_labelled(label) or ()) for label in labels]
     every = frozenset(OWN_KINDS) | entity_kinds()
@@ -702,21 +700,21 @@ class TraceFacts:
     trace_id : int
     name : str
     ego : str
-        The simulator's id of the ego; empty without one.
+        Simulator id of the ego; empty without an ego.
     answers : frozenset of str
-        Relations that it can answer; of the others nothing is known.
+        Relations that are known in the trace.
     reach : RelationScope or None
-        Which pairs of entities are related in it; ``None`` where that is not known.
+        Pairs of entities with relations; ``None`` if unknown.
     period_ns : int
         Median time between two frames.
     extent : (int, int)
-        Its first bucket, and how many follow from there on.
+        First bucket, and number of buckets.
     known : float
-        How far around the ego all is known that was recorded; m. Infinite where nothing was left out.
+        Radius around the ego within which all recorded entities are known; m. Infinite if nothing was left out.
     uneven : int
-        What there is that is no pair of bodies: bits of :data:`sgstore.pair_numbers.UNEVEN`.
+        Objects other than ordinary bodies that occur: bits of :data:`sgstore.pair_numbers.UNEVEN`.
     excluded : frozenset of str
-        Kinds of which settings leave out some nodes, or all.
+        Kinds whose nodes the settings leave out, all or some of them.
     """
 
     trace_id: int
@@ -733,18 +731,19 @@ class TraceFacts:
 
 @dataclass(frozen=True, slots=True)
 class TableFacts:
-    """Facts about a user's own table that the compiler needs.
+    """Facts about a user table that the compiler needs.
 
     Attributes
     ----------
     name : str
     columns : mapping of str to Type
     refused : str or None
-        Why its columns are not attributes of frames; ``None`` if they are: it has one row a frame.
+        Reason why its columns cannot be attributes of frames. ``None`` if they can: the table has one row for
+        each frame.
     traces : frozenset of int or None
-        If its rows are of whole traces: their ids.
+        Ids of the traces, if each row belongs to a whole trace.
     joins : bool
-        Whether its rows belong to frames.
+        True if the rows belong to frames.
     """
 
     name: str
@@ -754,7 +753,7 @@ class TableFacts:
     joins: bool = True
 
     def attribute(self, column: str) -> Attribute | None:
-        """The attribute of frames that a column is, whatever the case of letters; ``None``: no such column."""
+        """Return the frame attribute of a column, ignoring case. ``None`` means an unknown column."""
         name = next((one for one in self.columns if one.lower() == column.lower()), None)
         if name is None:
             return None
@@ -764,7 +763,7 @@ class TableFacts:
 
 @dataclass(frozen=True, slots=True)
 class Catalog:
-    """Contents of a store, as far as the compiler needs them.
+    """Contents of a store that the compiler needs.
 
     Attributes
     ----------
@@ -773,47 +772,47 @@ class Catalog:
     map_edges : mapping of Triple to int
         Rows of table ``map_edge`` for each triple that occurs.
     moving, fixed, mapped : frozenset of str
-        Kinds that occur in table ``state``, among the static ones of ``entity``, and in ``map_node``.
+        Kinds in table ``state``, kinds of static entities in ``entity``, and kinds in ``map_node``.
     traces : tuple of TraceFacts
     classed : tuple of str
-        Abstractions in which the classes of frames are in the store.
+        Abstractions whose frame classes are in the store.
     name : str
-        Of the abstraction that this is the catalog of; empty: of the store.
+        Abstraction that the catalog describes; empty for the store itself.
     relations : frozenset of str or None
-        Those that the abstraction has; ``None``: all.
+        Relations of the abstraction; ``None`` means all.
     shadows : tuple of (str, str)
-        Tables that are others under the abstraction, and what they are there.
+        Replaced tables of the abstraction, with the tables that replace them.
     beyond : tuple of (str, str)
-        Tables that are others in scope ``world``, and what they are there; none where nothing is known beyond
-        the graphs.
+        Replaced tables in scope ``world``, with the tables that replace them. Empty if the store has no data
+        beyond the graphs.
     beyond_edges : mapping of Triple to int
-        Rows of table ``world_edge``, as ``edges``.
+        Rows of table ``world_edge`` for each triple.
     world : bool
-        Whether this is the catalog in scope ``world``, of a store that knows something beyond the graphs.
+        True for the catalog in scope ``world`` of a store with data beyond the graphs.
     around : bool
-        Whether it is asked in scope ``world``, whatever the store knows.
+        True if the query has scope ``world``, with or without data beyond the graphs.
     only : frozenset of int or None
-        The traces that are asked; ``None``: all.
+        Traces to search; ``None`` means all.
     tables : mapping of str to TableFacts
-        Tables of users' own that are joined.
+        User tables.
     sets : mapping of str to function
-        The abstractions that a query can name: what makes the catalog of each from this one.
+        For each abstraction that a query can name: the function that derives its catalog.
     own : mapping of str to Type
-        Attributes of a client's own that nodes have, by their names.
+        User-defined attributes of nodes, by name.
     own_edges : mapping of str to Type
-        The same of edges.
+        User-defined attributes of edges, by name.
     names : mapping or None
-        Kinds, relations and states of lights that the store has beside those of this package; ``None``: those
-        of all stores that the process has met.
+        Added kinds, relations and light states of the store. ``None`` means those of all stores opened by the
+        process.
     unknowing : frozenset of int
-        Traces that do not know what a query needs (:mod:`sgstore.lang._needs`): it leaves them out.
+        Traces that do not meet the needs of a query (:mod:`sgstore.lang._needs`) and are left out.
     lacks : dict
-        Which traces lack what, as far as it was asked; it is remembered with the catalog.
+        Cache of the traces that do not meet each need.
     part : bool
-        Whether the store is a part of a collection. Then a dataset, an ego or a derived set that it has not is
-        one that other parts have, and what is counted over all parts is given as a table.
+        True if the store is a part of a collection. Then a missing dataset, ego or derived set belongs to
+        other parts, and counts over all parts come from a table.
     online : bool
-        Whether frames come one by one, so that nothing later is known.
+        True if frames arrive one by one, so that later frames are unknown.
     """
 
     edges: Mapping[Triple, int] = field(default_factory=dict[Triple, int])
@@ -846,7 +845,7 @@ class Catalog:
     online: bool = False
 
     def under(self, abstraction: str) -> Catalog | None:
-        """Return the catalog under an abstraction, in any spelling; ``None`` if there is none of that name."""
+        """Return the catalog of an abstraction, in any spelling. ``None`` means an unknown abstraction."""
         wanted = normalize_name(abstraction)
         found = [made for name, made in self.sets.items() if normalize_name(name) == wanted]
         if not found and self.part:
@@ -854,7 +853,7 @@ class Catalog:
         return found[-1](self) if found else None
 
     def in_world(self) -> Catalog:
-        """Return the catalog in scope ``world``; the same where nothing is known beyond the graphs."""
+        """Return the catalog for scope ``world``. Without data beyond the graphs, only ``around`` changes."""
         if self.world or not (self.beyond or self.beyond_edges):
             return replace(self, around=True)
         edges = dict(self.edges)
@@ -865,7 +864,7 @@ class Catalog:
 
 
 def attributes_of(catalog: Catalog) -> dict[str, list[Attribute]]:
-    """All attributes that a query can ask for, by what has them; a client's own among those of nodes."""
+    """Return all attributes that a query can use, grouped by owner: node, edge, frame, env, trace."""
     own = [
         replace(own_attribute(name, kind), meaning="of your own")
         for name, kind in catalog.own.items()

@@ -1,4 +1,4 @@
-"""Words of the query language for completion: what a store can be asked, each with its meaning."""
+"""Words of the query language for completion, each with its meaning."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def words(catalog: Catalog) -> dict[str, Any]:
     Parameters
     ----------
     catalog : Catalog
-        Of the store; what occurs in it is told first.
+        Catalog of the store. Words that occur in the store come first.
     """
     there = catalog.moving | catalog.fixed | catalog.mapped
     met = {relation for relation, _, _ in (*catalog.edges, *catalog.map_edges)}

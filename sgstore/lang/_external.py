@@ -1,8 +1,7 @@
-"""Relations of frames and bindings as statements of their own, and results of matches that are known already.
+"""SQL of relations of frames and bindings, and results for matches that are already known.
 
-What looks at several frames is worked out in columns, of relations that come from a store
-(:func:`relation`); what is found comes back as a relation that the results of a query are taken from, as if the
-pattern had just been searched for (:func:`external_matches`).
+Conditions over several frames are evaluated on columns read from a store (:func:`relation`). The matches then
+become a relation again, and the results of the query are computed from it (:func:`external_matches`).
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ _WORDS: Final = frozenset({Type.text, Type.edge})
 
 FRAME: Final = "frame_id"
 GATHERED: Final = ":gathered"
-"""The table of what is found, where a statement speaks of all of it."""
+"""Table with all matches."""
 
 
 def relation(
@@ -75,32 +74,32 @@ def relation(
     bound: Iterable[str] | None = None,
     most: int | None = None,
 ) -> SqlStatement:
-    """The statement for the frames and bindings in which a pattern holds.
+    """Return the SQL for the frames and bindings in which a pattern holds.
 
     Parameters
     ----------
     query : Query
-        Its result does not matter.
+        Query with the pattern. Its result clause is ignored.
     catalog : Catalog
     window : Window or None
-        The buckets to look at; ``None``: all.
+        Buckets to search; ``None`` means all.
     values : iterable of Bound
-        Asked of each match.
+        Values to compute for each match.
     bound : iterable of str, optional
-        Keys of the nodes and edges that are bound, the others being asked to exist; ``None``: all nodes.
+        Keys of the nodes and edges to return. The others must only exist. ``None`` means all nodes.
     most : int, optional
-        How many rows are read at most.
+        Largest number of rows to read.
 
     Returns
     -------
     SqlStatement
         Columns: ``frame_id``, the keys of the nodes in alphabetical order, those of the edges, then the values,
-        as ``:0``, ``:1``, … Rows have no order.
+        as ``:0``, ``:1``, …. The rows are not sorted.
     """
     keys = set(query.scope.nodes if bound is None else bound)
     nodes = sorted(keys & set(query.scope.nodes))
     edges = sorted(keys & {edge.key for edge in query.scope.edges})
-    # What is asked of matches is rewritten with them: its blocks are opened as those of conditions are.
+    # The values are rewritten together with the pattern, because their blocks are expanded as in conditions.
     asked = tuple(ReturnColumn(f":{n}", value) for n, value in enumerate(values))
     result = Result(columns=asked, whole=False, distinct=False)
     query = rewritten(replace(query, result=result), catalog)
@@ -125,33 +124,33 @@ def relation(
 _CLOCK: Final = """SELECT "frame_id", "seq", "time_ns", "log_time_ns" FROM "frame"
 WHERE "frame_id" >= $1 AND "frame_id" < $2"""
 CLOCK: Final = f'{_CLOCK} ORDER BY "frame_id"'
-"""The frames of a range, in order."""
+"""Frames of a range, in order."""
 
 CLOCK_OF_TRACES: Final = f"""{_CLOCK}
   AND "frame_id" >> {TRACE_OF_FRAME} IN (SELECT unnest(CAST($3 AS BIGINT[]))) ORDER BY "frame_id" """
-"""The frames of some traces in a range, in order."""
+"""Frames of some traces in a range, in order."""
 
 BUCKETS: Final = """SELECT "bucket", "valid", "joined" FROM "bucket"
 WHERE "bucket" >= $1 AND "bucket" < $2"""
-"""The buckets of a range: their frames, and those that follow soon on the one before; in any order."""
+"""Buckets of a range, with their numbers of frames and of frames without a gap before; unsorted."""
 
 TIMES: Final = """SELECT "frame_id", "time_ns" FROM "frame"
 WHERE "frame_id" >= $1 AND "frame_id" < $2"""
-"""The times of the frames of a range, in any order."""
+"""Times of the frames of a range; unsorted."""
 
 TRACES: Final = 'SELECT "trace_id", "name", "start_ns", coalesce("period_ns", 0) FROM "trace"'
-"""All traces: what the times of their frames are counted by."""
+"""All traces with their start times and median periods."""
 
 
 def entities(query: Query, node: str, catalog: Catalog, window: Window | None) -> SqlStatement:
-    """The statement for the nodes of some kinds that are in a trace in any frame.
+    """Return the SQL for the entities of a query node that occur in any frame of a trace.
 
     Parameters
     ----------
     query : Query
-        Whose node it is.
+        Query with the node.
     node : str
-        Its key.
+        Key of the node.
 
     Returns
     -------
@@ -170,17 +169,17 @@ def entities(query: Query, node: str, catalog: Catalog, window: Window | None) -
 
 
 def traces_with(kinds: Kinds, attribute: Attribute | None, *, moving: bool) -> str:
-    """The statement for the traces in which something of some kinds is, and an attribute of it is known.
+    """Return the SQL for traces that have a node of given kinds with a known attribute.
 
-    It looks at whole tables, and at no frames, so it is quick in a large store.
+    The statement reads tables without a frame join, so it is fast in a large store.
 
     Parameters
     ----------
     kinds : Kinds
     attribute : Attribute or None
-        ``None``: whatever is known of it.
+        ``None`` means that no attribute is required.
     moving : bool
-        Whether only what may move counts.
+        True if only nodes that may move count.
 
     Returns
     -------
@@ -221,26 +220,26 @@ def traces_with(kinds: Kinds, attribute: Attribute | None, *, moving: bool) -> s
 
 TOLD_WEATHER: Final = """SELECT DISTINCT "trace_id" FROM "event"
 WHERE "kind" = 'environment' AND regexp_matches("detail", $1)"""
-"""The traces that ever told a word of weather and light, given as a regular expression."""
+"""Traces with a weather event that matches a regular expression."""
 
 
-# What is found already ------------------------------------------------------------------------------------
+# Known matches ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExternalRelation:
-    """Matches that are known, as columns.
+    """Known matches in columns.
 
     Attributes
     ----------
     first, last : list of int
-        Of runs of ``frame_id``, each within a bucket: the same is matched in each of them.
+        First and last ``frame_id`` of each run of frames with the same match. A run lies in one bucket.
     nodes : dict of str to list of int
         Node ids by key.
     edges : dict of str to list of str
-        Relations by the keys of the edges that have names.
+        Relations by the keys of the named edges.
     values : list of lists
-        What was worked out for each match: in the order of the places of :func:`external_matches`.
+        Computed values of each match, in the order of the placeholders of :func:`external_matches`.
     """
 
     first: list[int]
@@ -251,7 +250,7 @@ class ExternalRelation:
 
 
 def nothing(query: Query, values: int) -> ExternalRelation:
-    """No matches of a query."""
+    """Return an empty relation of matches for a query."""
     nodes: dict[str, list[int]] = {key: [] for key in query.scope.nodes}
     edges: dict[str, list[str]] = {edge.key: [] for edge in query.scope.edges}
     return ExternalRelation([], [], nodes, edges, [[] for _ in range(values)])
@@ -263,7 +262,7 @@ FROM: Final = FrameAttribute(
 )
 TO: Final = FrameAttribute(Attribute(":to", Type.number, {}, "", DisplayUnit.whole), Type.number)
 SPAN: Final = (FROM, TO)
-"""The first and the last ``frame_id`` of a match over several frames."""
+"""First and last ``frame_id`` of a match over several frames."""
 
 
 def external_matches(
@@ -272,17 +271,18 @@ def external_matches(
     found: ExternalRelation | Callable[[Window | None], ExternalRelation],
     told: Sequence[FrameAttribute],
 ) -> SqlBuilder:
-    """A builder for a query whose matches are known; what is returned of them is asked of the store.
+    """Return a builder for a query whose matches are known. Other values come from the store.
 
     Parameters
     ----------
     query : Query
-        Of which :func:`with_places` made that its values speak of what is told.
+        Query whose values use the placeholders of :func:`with_places`.
     catalog : Catalog
     found : ExternalRelation or function
-        What finds in a window of whole traces is asked of one after the other, when the statement is asked.
+        The matches, or a function that finds them in a window of whole traces. The function is called for one
+        window after the other when the statement runs.
     told : sequence of FrameAttribute
-        What stands for the values of ``found``.
+        Placeholders for the values of ``found``.
     """
     sql = SqlBuilder(query, catalog)
     shape = found if isinstance(found, ExternalRelation) else nothing(query, len(told))
@@ -307,14 +307,14 @@ def external_matches(
 
 
 def _columns(found: ExternalRelation, shape: ExternalRelation) -> list[list[Any]]:
-    """All that is known of matches, a column after the other: nodes and edges in the order of ``shape``."""
+    """Return all columns of known matches, with nodes and edges in the order of ``shape``."""
     nodes = [found.nodes[key] for key in shape.nodes]
     edges = [found.edges[key] for key in shape.edges]
     return [found.first, found.last, *nodes, *edges, *found.values]
 
 
 def with_places(query: Query) -> tuple[Query, dict[Bound, FrameAttribute]]:
-    """A query whose values over time are places for what is worked out elsewhere, and what they are for."""
+    """Replace values over time by placeholders. Return the new query and the placeholder of each value."""
     places: dict[Bound, FrameAttribute] = {}
 
     def placed(value: Bound) -> Bound:

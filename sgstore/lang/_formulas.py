@@ -1,4 +1,4 @@
-"""SQL expressions: values, attributes, conditions and numbers of pairs."""
+"""SQL expressions of values, attributes, conditions and pair numbers."""
 
 from __future__ import annotations
 
@@ -43,39 +43,39 @@ if TYPE_CHECKING:
 
 
 def pair_column(name: str, a: str, b: str) -> str:
-    """The column of a number of a pair, or of a column of one of the two (``a_x``: x of a)."""
+    """Return the column of a pair number, or of an attribute of one entity (``a_x`` is x of a)."""
     if stage_of(name):
         return quoted(f"{name}({a}, {b})")
     return quoted(f"{a if name[0] == 'a' else b}:{name[2:]}")
 
 
 def pair_text(name: str, a: str, b: str, without: frozenset[str] = frozenset()) -> str:
-    """A number of a pair in terms of the columns of the layers before, without some marks."""
+    """Return the SQL of a pair number, in terms of the columns of earlier layers."""
     return pair_sql(name, lambda part: pair_column(part, a, b), without)
 
 
 # Pieces of SQL text: values, attributes, conditions, and the numbers of pairs of entities -------
-# Portable SQL only: what stands here runs on DuckDB and can be carried to other engines. Every identifier is
-# quoted, every value of the user's is bound; words of the vocabulary stand in the text.
+# Only portable SQL: the text runs on DuckDB and can be adapted to other engines. Every identifier is quoted
+# and every value of the user is bound. Words of the vocabulary are literals.
 
 
 @dataclass(slots=True)
 class BoundValues:
-    """The values of the user's that a statement binds, in order."""
+    """User values bound by a statement, in order."""
 
     items: list[Any] = field(default_factory=list[Any])
 
     def add(self, value: object) -> str:
-        """The placeholder of a value."""
+        """Add a value and return its placeholder."""
         self.items.append(value)
         return f"${len(self.items)}"
 
 
 @dataclass(slots=True)
 class Select:
-    """A statement in the making: one line for each column, table and condition.
+    """Builder of a ``SELECT`` statement: one line for each column, table and condition.
 
-    One that is ``lenient`` keeps its rows where a table that is joined has none for them.
+    If ``lenient``, tables are joined by ``LEFT JOIN``, so rows without a partner are kept.
     """
 
     columns: list[str] = field(default_factory=list[str])
@@ -90,7 +90,7 @@ class Select:
     lenient: bool = False
 
     def text(self) -> str:
-        """The statement."""
+        """Return the SQL text."""
         head = "SELECT DISTINCT " if self.distinct else "SELECT "
         lines = [head + ",\n  ".join(self.columns)]
         lines += ["FROM " + "\n  ".join(self.tables)] if self.tables else []
@@ -103,7 +103,7 @@ class Select:
         return "\n".join(lines)
 
     def join(self, table: str, conditions: Sequence[str], how: str = "JOIN") -> None:
-        """Add a table; without conditions it goes with every row."""
+        """Join a table. Without conditions, it is a cross join."""
         if not self.tables:
             self.tables.append(table)
             self.where += conditions
@@ -115,12 +115,12 @@ class Select:
 
 
 def indented(text: str) -> str:
-    """A statement within another."""
+    """Indent a statement for use in another statement."""
     return "\n".join(f"    {line}" for line in text.splitlines())
 
 
 def nested(text: str, name: str) -> str:
-    """A statement as a table."""
+    """Return a statement as a derived table."""
     return f"(\n{indented(text)}\n  ) AS {quoted(name)}"
 
 
@@ -129,7 +129,7 @@ def nested(text: str, name: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Aliases:
-    """Aliases under which the tables of a node's attributes stand in a statement; ``None``: not there."""
+    """SQL aliases of the tables with a node's attributes. ``None`` means that the table is not joined."""
 
     state: str | None = None
     entity: str | None = None
@@ -143,7 +143,7 @@ _ORIGINS: Final = {
     DisplayUnit.up: "origin_z",
 }
 PLACES: Final = ", ".join(literal(kind) for kind in MAP_KINDS)
-"""Kinds of parts of the map that are no entities, as its signs and lights are."""
+"""Kinds of map parts that are not entities. Signs and lights are entities."""
 
 _ABSENT: Final = {
     Type.number: "CAST(NULL AS DOUBLE)",
@@ -153,7 +153,7 @@ _ABSENT: Final = {
 
 
 def attribute_text(attribute: Attribute, at: Aliases) -> str:
-    """The value of an attribute of a node that lives in one of some places."""
+    """Return the SQL of a node attribute, for nodes stored in one of several tables."""
     if attribute.unit is DisplayUnit.label:
         return _label(at)
     if attribute.name == "kind" and at.state and not (at.entity or at.map):
@@ -178,9 +178,9 @@ def attribute_text(attribute: Attribute, at: Aliases) -> str:
 
 
 def raw_text(name: str, at: Aliases, *, upright: bool = False) -> str:
-    """A raw column of a node, wherever it lives; positions about the trace's origin.
+    """Return the SQL of a raw column of a node. Positions are relative to the origin of the trace.
 
-    What stands for ever has no states, and velocity and acceleration 0.
+    Static entities have no states. Their velocity and acceleration are 0.
     """
     if name in {"low", "high"}:
         return _side_text(name, at, upright=upright)
@@ -201,7 +201,7 @@ def raw_text(name: str, at: Aliases, *, upright: bool = False) -> str:
     if at.map:
         value = "0e0" if still else f"{at.map}.{quoted(name)}"
         value = f'{value} - {at.trace}."origin_{name}"' if name in {"x", "y", "z"} else value
-        # Signs and lights of a map are entities; of lanes and roads there are no numbers of pairs.
+        # Signs and lights of a map are entities. Lanes and roads have no pair numbers.
         parts.append(f'CASE WHEN {at.map}."kind" NOT IN ({PLACES}) THEN {value} END')
     if not parts:
         return "CAST(NULL AS DOUBLE)"
@@ -209,7 +209,7 @@ def raw_text(name: str, at: Aliases, *, upright: bool = False) -> str:
 
 
 def _side_text(name: str, at: Aliases, *, upright: bool) -> str:
-    """The height of the lower or upper side of a body; of signals, and those of a map, there is none."""
+    """Return the SQL of the lower or upper height of a body. It is NULL for signals and map parts."""
     parts = [
         low_and_high_sql(
             lambda column, alias=alias: (
@@ -228,7 +228,7 @@ def _side_text(name: str, at: Aliases, *, upright: bool) -> str:
 
 
 def owner_text(node: str, profile: Profile, trace: str, road_map: str) -> str:
-    """Return the SQL of the owner of a node id: the trace of an entity, or, below 0, the map."""
+    """Return the SQL of the owner of a node id: the trace of an entity, or the map if negative."""
     if not profile.mapped:
         return trace
     of_map = f"coalesce({road_map}, -1 - ({trace}))"
@@ -238,16 +238,16 @@ def owner_text(node: str, profile: Profile, trace: str, road_map: str) -> str:
 
 
 def role_text(frame: str, node: str) -> str:
-    """Return the SQL of the role of a lane to the ego in a frame."""
+    """Return the SQL of the role of a lane relative to the ego in a frame."""
     on = [f'":r"."frame_id" = {frame}', f'":r"."node_id" = {node}']
     role = Select(['any_value(":r"."role")'], ['"roles" AS ":r"'], on)
     return f"({role.text()})"
 
 
 def own_text(attribute: Attribute, frame: str, node: str, edge: Sequence[str] = ()) -> str:
-    """Return the SQL of an attribute of a client's own in a frame.
+    """Return the SQL of a user-defined attribute in a frame.
 
-    It is one of a node, or of the edge from there whose relation and other end are given.
+    The attribute belongs to a node, or to the edge from this node with the given relation and other end.
     """
     told = 'json_extract_string(":o"."value", \'$\')'
     value = told
@@ -295,7 +295,7 @@ _STILL: Final = {
     (DisplayUnit.velocity, Home.scenery): "CASE WHEN {0} THEN 0e0 END",
     (DisplayUnit.velocity, Home.map): f"CASE WHEN {{0}} NOT IN ({PLACES}) THEN 0e0 END",
 }
-"""What is said of that which never moves."""
+"""Values of entities and map parts that never move."""
 
 _CONVERTED: Final = {DisplayUnit.degrees: "degrees({1})", DisplayUnit.whole: "CAST({0} AS BIGINT)"}
 
@@ -314,7 +314,7 @@ def _label(at: Aliases) -> str:
 
 
 def as_type(column: str, kind: Type) -> str:
-    """A column of a user's own table as a value of patterns."""
+    """Convert a column of a user table to a value of the query language."""
     return f"CAST({column} AS {_NATIVE[kind]})"
 
 
@@ -322,7 +322,7 @@ _NATIVE: Final = {Type.number: "DOUBLE", Type.text: "VARCHAR", Type.boolean: "BO
 
 
 def frame_text(leaf: FrameAttribute | TraceAttribute, frame: str, trace: str, map_: str) -> str:
-    """The value of an attribute of the frame or of the trace."""
+    """Return the SQL of an attribute of the frame or trace."""
     attribute = leaf.attribute
     home, column = next(iter(attribute.columns.items()))
     if attribute.unit in {
@@ -355,19 +355,19 @@ def frame_text(leaf: FrameAttribute | TraceAttribute, frame: str, trace: str, ma
 
 
 def seconds_text(ns: str) -> str:
-    """Return the SQL of a time in nanoseconds as seconds: as :func:`sgstore.world.seconds_of`."""
+    """Return the SQL that converts nanoseconds to seconds, as :func:`sgstore.world.seconds_of`."""
     return f"round(CAST({ns} AS DOUBLE) / 1e3) / 1e6"
 
 
 def _class_text(abstraction: str, frame: str) -> str:
-    """The class of a frame in an abstraction."""
+    """Return the SQL of the class of a frame in an abstraction."""
     on = [f'"c"."frame_id" = {frame}."frame_id"', f'"c"."abstraction" = {literal(abstraction)}']
     classes = Select(['any_value("c"."class")'], ['"classes" AS "c"'], on)
     return f"({classes.text()})"
 
 
 def _looked_up(attribute: Attribute, frame: str) -> str:
-    """Return the SQL of a value of a frame that other frames or events tell."""
+    """Return the SQL of a frame value that comes from other frames or events."""
     column = next(iter(attribute.columns.values()))
     if attribute.unit in {DisplayUnit.weather, DisplayUnit.clock}:
         return _weather_text(column, frame)
@@ -390,7 +390,7 @@ def _looked_up(attribute: Attribute, frame: str) -> str:
 
 
 def _given_text(attribute: Attribute, abstraction: str, frame: str) -> str:
-    """Return the SQL of what the classes of all parts of a collection tell of a frame."""
+    """Return the SQL of a frame value from the class tables of a whole collection."""
     seen = attribute.unit is DisplayUnit.seen
     dataset = attribute.name.removeprefix(f"class_{abstraction} in ") if seen else ""
     on = [f'"k"."abstraction" = {literal(abstraction)}', f'"k"."dataset" = {literal(dataset)}']
@@ -404,7 +404,7 @@ def _given_text(attribute: Attribute, abstraction: str, frame: str) -> str:
 
 
 def _weather_text(word_: str, frame: str) -> str:
-    """A word of the last event of weather and light of a trace, up to the frame."""
+    """Return the SQL of a weather word from the last weather event up to the frame."""
     told = f'regexp_extract("v"."detail", \'(^|, ){word_}=([^,]*)\', 2)'
     if word_ == "time_of_day":
         parts = [
@@ -427,15 +427,17 @@ def _weather_text(word_: str, frame: str) -> str:
     return f"({last.text()})"
 
 
-# What is recorded as having happened -------------------------------------------------------------
+# Recorded events ---------------------------------------------------------------------------------
 
 
 def happened_rows(happened: Happened) -> str:
-    """The statement for the frames in which something happens: ``frame_id``, and to whom: ``:0``, ``:1``."""
+    """Return SQL for the frames of an event, with the nodes involved as ``:0`` and ``:1``."""
     if happened.table:
         return _rows_of_table(happened)
     told, ends = [literal(happened.kind)], ('"node_id"', '"other"')
-    ways = [ends, ends[::-1]][: 1 + bool(happened.nodes)]  # of two it is told of either
+    ways = [ends, ends[::-1]][
+        : 1 + bool(happened.nodes)
+    ]  # an event of two nodes is found in either order
     rows: list[str] = []
     for way in ways:
         columns = [f'{end} AS ":{n}"' for n, end in enumerate(way[: len(happened.nodes)])]
@@ -459,7 +461,7 @@ def _rows_of_table(happened: Happened) -> str:
 
 
 def happened_text(happened: Happened, frame: str, nodes: Sequence[str]) -> str:
-    """Return the SQL of whether something happens in a frame to some nodes; NULL where nobody records it."""
+    """Return SQL that tests an event of some nodes. NULL means that the event is not recorded."""
     where = [f'":e"."frame_id" = {frame}']
     where += [f'":e".":{place}" = {node}' for place, node in enumerate(nodes)]
     there = Select(["1"], [nested(happened_rows(happened), ":e")], where)
@@ -470,7 +472,7 @@ def happened_text(happened: Happened, frame: str, nodes: Sequence[str]) -> str:
 
 
 def happened_in_frame(happened: Happened) -> str:
-    """The statement for those to whom something happens in a frame: two columns, NULL where there is nobody."""
+    """Return SQL for the nodes of an event in one frame: two columns, padded with NULL."""
     told = [f'":{place}"' for place in range(len(happened.nodes))]
     columns = [*told, "NULL", "NULL"][:2]
     rows = nested(happened_rows(happened), ":e")
@@ -481,11 +483,11 @@ EVENT_SCHEMAS: Final = {
     "collision": "CarlaCollisionEvent",
     "lane_invasion": "CarlaLaneInvasionEvent",
 }
-"""Ends of the names of the schemas of channels that tell of events: such a recording says if there are none."""
+"""Ends of the schema names of event channels. With such a channel, no messages means no events."""
 
 
 def told_events(kind: str) -> str:
-    """The statement for the traces that record events of a kind: there is one, or a channel for them."""
+    """Return SQL for the traces that record events of a kind: they have an event or a channel."""
     events = Select(['"trace_id"'], ['"event"'], [f'"kind" = {literal(kind)}'])
     if kind not in EVENT_SCHEMAS:
         return events.text()
@@ -495,7 +497,7 @@ def told_events(kind: str) -> str:
 
 
 def recorded_events(schemas: Iterable[str]) -> frozenset[str]:
-    """Kinds of events that a recording with channels of some schemas records."""
+    """Return the kinds of events recorded by channels with the given schemas."""
     names = tuple(schemas)
     return frozenset(k for k, end in EVENT_SCHEMAS.items() if any(n.endswith(end) for n in names))
 
@@ -514,11 +516,11 @@ Leaf = (
     | BlockValue
     | GroupKey
 )
-"""What an expression is made of, as far as a statement must bring it as a column."""
+"""Leaves of an expression that a statement must provide as columns."""
 
 
 def expression_text(expression: Bound, leaf: Callable[[Leaf], str], values: BoundValues) -> str:
-    """An expression; ``leaf`` gives the text of the columns in it."""
+    """Return the SQL of an expression. ``leaf`` returns the SQL of each leaf."""
     match expression:
         case Value():
             return _value(expression, values)
@@ -562,7 +564,7 @@ def _operation(operation: Operation, leaf: Callable[[Leaf], str], values: BoundV
 def _compared(
     operand: Bound, operation: Operation, leaf: Callable[[Leaf], str], values: BoundValues
 ) -> str:
-    """One side of a comparison: a column of the vocabulary is compared with its words as it is."""
+    """Return the SQL of one side of a comparison. A vocabulary column needs no cast."""
     closed = all(
         (isinstance(o, Value) and o.closed) or (isinstance(o, NodeAttribute) and o.attribute.values)
         for o in operation.operands
@@ -588,7 +590,7 @@ def _membership(
 
 
 def leaves(expression: Bound) -> Iterable[Leaf]:
-    """The columns that an expression is made of."""
+    """Yield the leaves of an expression that need a column."""
     match expression:
         case Value() | Choices() | LabelTest() | GroupKey() | Tense() | SignalCall():
             return
@@ -605,14 +607,14 @@ def leaves(expression: Bound) -> Iterable[Leaf]:
 
 
 def columns_of(nodes: frozenset[str], edges: frozenset[str] = frozenset()) -> list[str]:
-    """Columns of the relations here that bind nodes and edges."""
+    """Return the quoted columns that bind the given nodes and edges."""
     return [quoted(f"{key}.id") for key in sorted(nodes)] + [
         quoted(f"{key}.type") for key in sorted(edges)
     ]
 
 
 def column_of(leaf: Leaf) -> str:
-    """The name of the column of a value."""
+    """Return the column name of a leaf."""
     match leaf:
         case NodeValue(node=owner):
             name = "id"
@@ -639,16 +641,16 @@ def column_of(leaf: Leaf) -> str:
 
 
 def _as_column(attribute: Attribute) -> str:
-    """The name of an attribute; columns whose names differ in case alone are the same."""
+    """Return the column name of an attribute. Names that differ only in case get distinct columns."""
     own = attribute.unit is DisplayUnit.own and attribute.name != attribute.name.lower()
     return attribute.name.encode().hex() if own else attribute.name
 
 
 def edge_table(edge: Edge, src: str, dst: str) -> tuple[str, dict[str, str]]:
-    """The table with the attributes of an edge, and its columns for the ends with the nodes that they must be.
+    """Return the table with the attributes of an edge, and the columns of its two ends.
 
-    Of an ``isIn`` edge the ends are an entity, whose id is 0 or above, and a lane, whose id is below. A gap is
-    kept once, with who follows first.
+    The ends of an ``isIn`` edge are an entity, with an id of 0 or above, and a lane, with a negative id. A
+    gap is stored once, with the follower first.
     """
     if "isIn" in edge.relations:
         ends = (f"greatest({src}, {dst})", f"least({src}, {dst})") if edge.both else (src, dst)
@@ -658,13 +660,13 @@ def edge_table(edge: Edge, src: str, dst: str) -> tuple[str, dict[str, str]]:
 
 
 def lane_text(leaf: Leaf, alias: str) -> str:
-    """The value of an attribute of an edge, whose row of :func:`edge_table` stands under an alias."""
+    """Return the SQL of an edge attribute, from a row of :func:`edge_table`."""
     assert isinstance(leaf, EdgeAttribute)  # noqa: S101 - the condition was filed so
     return attribute_text(leaf.attribute, Aliases(state=alias))
 
 
 def is_position(leaf: Leaf) -> bool:
-    """Tell whether a value is stored about the trace's origin."""
+    """True if a value is a coordinate, stored relative to the origin of the trace."""
     return isinstance(leaf, NodeAttribute) and leaf.attribute.unit in {
         DisplayUnit.east,
         DisplayUnit.north,
@@ -673,19 +675,19 @@ def is_position(leaf: Leaf) -> bool:
 
 
 def is_constant(leaf: Leaf) -> bool:
-    """Tell whether a value of an entity never changes."""
+    """True if the value never changes for an entity."""
     if not isinstance(leaf, NodeAttribute):
         return False
     return Home.entity in leaf.attribute.columns or leaf.attribute.unit is DisplayUnit.label
 
 
 def among(column: str, numbers: list[int]) -> str:
-    """Tell whether a column is one of some numbers of ours."""
+    """Return the SQL condition that a column is in a list of integers."""
     return f"({column}) IN ({', '.join(map(str, numbers))})" if numbers else "FALSE"
 
 
 def node_text(condition: Bound, node: str, at: Aliases, values: BoundValues) -> str:
-    """A condition on one node, given the column of its id and where its values stand."""
+    """Return the SQL of a condition on one node, from its id column and table aliases."""
 
     def leaf(found: Leaf) -> str:
         if isinstance(found, NodeAttribute) and found.attribute.unit is not DisplayUnit.binding:
@@ -698,7 +700,7 @@ def node_text(condition: Bound, node: str, at: Aliases, values: BoundValues) -> 
 def bound_text(
     condition: Bound, nodes: Mapping[str, str], edges: Mapping[str, str], values: BoundValues
 ) -> str:
-    """A condition on ids of nodes and relations of edges, given their columns."""
+    """Return the SQL of a condition on node ids and edge relations, from their columns."""
 
     def leaf(found: Leaf) -> str:
         match found:
@@ -713,7 +715,7 @@ def bound_text(
 
 
 def trace_text(condition: Bound, trace: str, values: BoundValues) -> str:
-    """A condition on the trace alone, given the column of its id."""
+    """Return the SQL of a condition on the trace, from its id column."""
     select = Select(['"t"."trace_id"'], ['"trace" AS "t"'])
     select.join('"map" AS "m"', ['"m"."map_id" = "t"."map_id"'], "LEFT JOIN")
 

@@ -1,4 +1,4 @@
-"""Calls in expressions: functions of entities and numbers, predicates, and what is counted of all matches."""
+"""Binding of calls: functions of entities and numbers, predicates, and aggregates."""
 
 from __future__ import annotations
 
@@ -51,19 +51,19 @@ _LANE_SPEED: Final = (
     f"{_IN_LANE}@.vx * cos(radians(@.heading - at.heading_error))"
     " + @.vy * sin(radians(@.heading - at.heading_error))}"
 )
-"""Speed along the lane: below 0 of an entity that reverses, or drives against the lane."""
+"""Speed along the lane; negative for an entity that reverses or drives against the lane."""
 _LANE_HALF: Final = (
     f"{_IN_LANE}@.length * abs(cos(radians(at.heading_error)))"
     " + @.width * abs(sin(radians(at.heading_error)))} / 2"
 )
-"""Half the extent of a footprint along the lane."""
+"""Half the length of a footprint along the lane."""
 _ALONG_LANES: Final = """DEFINE PREDICATE ttc_lane(a, b) AS
   CASE WHEN lane_dist(a, b) > 0 AND {speeds} >= 0.000001
   THEN max(lane_dist(a, b) - {halves}, 0) / ({speeds}) END""".format(
     speeds=" - ".join(_LANE_SPEED.replace("@", one) for one in "ab"),
     halves=" - ".join(_LANE_HALF.replace("@", one) for one in "ab"),
 )
-"""It is no column, for it is made of what is looked up, and of attributes."""
+"""Defined as a predicate, not as a column, because it combines table look-ups and attributes."""
 FUNCTIONS: Final = frozenset(
     {
         *(*PAIR_FUNCTIONS, *RECORDED, TTC_LANE, *OF_ONE, *NUMERIC, *EXTREMES, *OF_TWO),
@@ -72,18 +72,18 @@ FUNCTIONS: Final = frozenset(
 )
 
 MAX_CALLS: Final = 30
-"""Deepest nesting of predicates."""
+"""Deepest nesting of predicate calls."""
 
 
 def call(e: s.Call, names: SymbolTable) -> b.Bound:
-    """A call of a function or of a predicate.
+    """Bind a call of a function or predicate.
 
     Raises
     ------
     QueryNameError
-        There is none of that name.
+        Unknown function or predicate.
     QueryError
-        Its arguments do not fit.
+        Invalid arguments.
     """
     name = normalize_name(e.name)
     if e.distinct and not is_aggregate(e):
@@ -111,7 +111,7 @@ def call(e: s.Call, names: SymbolTable) -> b.Bound:
 
 
 def _refuse_aggregate(e: s.Call, names: SymbolTable) -> NoReturn:
-    """Refuse what is counted of all matches where one match is spoken of."""
+    """Reject an aggregate in an expression about a single match."""
     word = e.name.upper()
     if names.aggregated:
         names.session.refuse("what is counted of all matches cannot stand in another", e.span)
@@ -127,7 +127,7 @@ def _refuse_aggregate(e: s.Call, names: SymbolTable) -> NoReturn:
 
 
 def _standard(name: str, e: s.Call, names: SymbolTable) -> b.Bound:
-    """A predicate of the standard library, which is read when it is needed."""
+    """Bind a predicate of the standard library, which is parsed on first use."""
     found = predicates().get(name)
     if found is None:
         defined = [*names.session.predicates.values(), *predicates().values()]
@@ -139,7 +139,7 @@ def _standard(name: str, e: s.Call, names: SymbolTable) -> b.Bound:
 
 
 def _no_function(name: str) -> str | None:
-    """Return a hint for a name that is an attribute, a relation or a sequence; ``None``: no idea."""
+    """Suggest an attribute, relation or sequence for an unknown function name, or None."""
     word = normalize_name(name)
     if (said := said_of("functions", name)) is not None:
         return said
@@ -163,7 +163,7 @@ def _expect(e: s.Call, low: int, high: int, names: SymbolTable) -> None:
 
 
 def _signature(name: str) -> str | None:
-    """Return the signature and the meaning of a function of two entities or of a library predicate."""
+    """Return the signature and meaning of a two-entity function or library predicate."""
     if name in PAIR_NAMES:
         function = PAIR_NAMES[name]
         about = PAIR_FUNCTIONS.get(function) or RECORDED[function]
@@ -202,7 +202,7 @@ def _ttc_lane(e: s.Call, names: SymbolTable) -> b.Bound:
     match parse(_ALONG_LANES):
         case (s.Define(body=s.Case() as body),):
             bound = names.body(meanings).bind(body)
-            # Without a map it is NULL, as lane_dist is: no trace is left out for it.
+            # Without a map the value is NULL, as for lane_dist. So traces without a map are not left out.
             relations.intersection_update(before)
             return bound
         case other:
@@ -210,7 +210,7 @@ def _ttc_lane(e: s.Call, names: SymbolTable) -> b.Bound:
 
 
 def _refuse_sort(e: s.Call, names: SymbolTable) -> None:
-    """Refuse ``lane_dist(e, junction)`` and ``next junction``, as one writes before one has seen the page."""
+    """Reject ``lane_dist(e, junction)`` with a hint that names the right function."""
     one, other = e.arguments
     if isinstance(other, s.Temporal) and other.word == "NEXT":
         (other,) = other.operands
@@ -307,7 +307,7 @@ def _type(e: s.Call, names: SymbolTable) -> b.EdgeRelation:
 
 
 def _path_function(e: s.Call, names: SymbolTable) -> b.Bound:
-    """``nodes(p)``, which is the value of a path, and ``length(p)``."""
+    """Bind ``nodes(p)``, the list of nodes of a path, or ``length(p)``."""
     _expect(e, 1, 1, names)
     found = names.bind(e.arguments[0])
     if not b.is_path(found):
@@ -343,18 +343,18 @@ def _after_in(e: s.Call, names: SymbolTable) -> b.Bound:
     )
 
 
-# What is recorded as having happened ------------------------------------------------------------------
+# Recorded events --------------------------------------------------------------------------------------
 
 
 def happens(e: s.HappensExpression, names: SymbolTable) -> b.Happened:
-    """Whether the recording, or a table of a user's own, says that something has happened in the frame.
+    """Bind ``HAPPENS``: a test for an event in the recording or in a user table.
 
     Raises
     ------
     QueryNameError
-        There are no such events, and no such table.
+        Unknown event kind and unknown table.
     QueryError
-        It does not happen to so many, or not to such nodes.
+        Wrong number or kind of nodes.
     """
     session, wanted = names.session, normalize_name(e.kind)
     kind = next((one for one in EVENT_KINDS if normalize_name(one) == wanted), None)
@@ -378,7 +378,7 @@ def happens(e: s.HappensExpression, names: SymbolTable) -> b.Happened:
 
 
 def _no_event(e: s.HappensExpression) -> str | None:
-    """Return a hint for what is no event, but may be told of frames otherwise; ``None``: no idea."""
+    """Suggest a condition for an unknown event name, or None."""
     word = normalize_name(e.kind)
     if word in predicates() or relation_named(e.kind) or word in map(normalize_name, FUNCTIONS):
         called = ", ".join(a.name if isinstance(a, s.Variable) else "a" for a in e.arguments)
@@ -390,7 +390,7 @@ def _no_event(e: s.HappensExpression) -> str | None:
 
 
 def _to_whom(e: s.HappensExpression, argument: s.Expression, names: SymbolTable) -> str:
-    """The key of a node to whom something happens."""
+    """Return the key of an entity that an event involves."""
     found = names.bind(argument)
     if not isinstance(found, b.NodeValue):
         names.session.refuse(
@@ -408,11 +408,11 @@ def _to_whom(e: s.HappensExpression, argument: s.Expression, names: SymbolTable)
 
 
 _WHOM: Final = (("node_id", "other"), ("ident", "other_ident"), ("src", "dst"))
-"""Columns of a table of a user's own that say to whom something happens: node ids, or the simulator's ids."""
+"""Columns of a user table with the entities of an event: node ids, or simulator ids."""
 
 
 def _columns_of(table: TableFacts, e: s.HappensExpression, names: SymbolTable) -> tuple[str, ...]:
-    """The columns that say to whom what a table tells of happens; an empty one if nobody is asked for."""
+    """Return the columns of a user table with the entities of an event. Without entities: one empty name."""
     if not table.joins:
         names.session.refuse(
             f"the rows of {table.name} belong to no frames",

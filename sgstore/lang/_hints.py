@@ -1,4 +1,4 @@
-"""Hints for mistakes: syntax of other languages, and unknown names. What they say stands in ``hints.toml``."""
+"""Hints for syntax from other languages and for unknown names. The texts are in ``hints.toml``."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 
 LOOK_BACK: Final = 400
-"""So many characters before the unexpected part are looked at; a longer part is no mistake that is known."""
+"""Number of characters checked before the unexpected part. A longer part is not a known mistake."""
 
 MANY: Final = 24
-"""So many names are listed in a hint."""
+"""Largest number of names in a hint."""
 
 
 @cache
@@ -39,13 +39,13 @@ def _tables() -> dict[str, Any]:
 
 @cache
 def _words(table: str, of: str) -> Mapping[str, str]:
-    """Words, folded, and the name or the sentence that they stand under in a table."""
+    """Return the entries of a hint table by folded word."""
     told = _tables()[table][of].items()
     return {normalize_name(w.replace(" ", "_")): meant for meant, words in told for w in words}
 
 
 def said_of(of: str, word: str) -> str | None:
-    """Return the hint for a word of other languages in place of one of these; ``None``: no idea.
+    """Return the hint for a word from another language, or None.
 
     Parameters
     ----------
@@ -60,11 +60,11 @@ def said_of(of: str, word: str) -> str | None:
 
 
 def places(names: Container[str]) -> frozenset[str]:
-    """Return the kinds of a place in a text, by the terminals that may stand there.
+    """Return the kinds of a place in a query, derived from the terminals allowed there.
 
-    ``edge`` (or the end of a pattern), ``value`` (or a condition), ``operator`` (behind a value), ``time``
-    (a length of it), ``number``, ``label``, ``name``, ``within`` an edge, ``start`` (of a statement), ``comma``
-    where one may stand, ``node`` where its bracket may, ``part`` of a node.
+    The kinds are ``edge`` (or the end of a pattern), ``value`` (or a condition), ``operator`` (after a
+    value), ``time`` (a duration), ``number``, ``label``, ``name``, ``within`` (inside an edge), ``start`` (of
+    a statement), ``comma``, ``node`` (its bracket) and ``part`` (of a node).
     """
     value = "STRING" in names and "NULL" in names
     said = {
@@ -98,29 +98,29 @@ _PREFIXES: Final = (
 _ODD: Final = {
     **dict.fromkeys("→⇒⟶", "->"),
     **dict.fromkeys("←⇐⟵", "<-"),
-    **dict.fromkeys("–—−‐", "-"),  # noqa: RUF001 - what is meant
+    **dict.fromkeys("–—−‐", "-"),  # noqa: RUF001 - intended
     **dict.fromkeys("‘’‚´", "'"),  # noqa: RUF001
     **dict.fromkeys("“”„«»", '"'),
     **dict(zip("≥≤≠∈∧∨¬", (">=", "<=", "<>", "IN", "AND", "OR", "NOT"), strict=True)),  # noqa: RUF001
     **dict(zip("×÷∞…", ("*", "/", "INF", ".."), strict=True)),  # noqa: RUF001
 }
-"""Characters that look like a sign of the language, and the sign."""
+"""Characters that look like a sign of the language, with that sign."""
 
 
 def slip_hint(
     text: str, start: int, end: int, at: frozenset[str], words: Iterable[str]
 ) -> str | None:
-    """Return a hint for an unexpected part of a text; ``None``: no idea.
+    """Return a hint for an unexpected part of a query, or None.
 
     Parameters
     ----------
     text : str
     start, end : int
-        The part.
+        Start and end of the unexpected part.
     at : frozenset of str
-        What kind of place it is: :func:`places`.
+        Kinds of the place: :func:`places`.
     words : iterable of str
-        Keywords that may stand there.
+        Keywords allowed there.
     """
     found = text[start:end]
     if hint := _character(found, at):
@@ -138,7 +138,7 @@ def slip_hint(
 
 
 def _looked(table: str, before: str, text: str, end: int, at: frozenset[str]) -> str | None:
-    """The hint of the first row of a table that fits to what stands before the end, and behind it."""
+    """Return the hint of the first table row that matches the text before and after a position."""
     flags = re.IGNORECASE | re.DOTALL
     for looks, hint, *where in _tables()[table]:
         place, then = (*where, "", "")[:2]
@@ -151,7 +151,7 @@ def _looked(table: str, before: str, text: str, end: int, at: frozenset[str]) ->
 
 
 def _character(found: str, at: frozenset[str]) -> str | None:
-    """A hint for a character that no text of the language has, or has elsewhere only."""
+    """Return a hint for a character that is not allowed, or not allowed here."""
     if found in {"'", '"'}:
         return "the text in quotes has no end"
     if found[:1] in {"'", '"'}:
@@ -174,7 +174,7 @@ def _unknown_letter(found: str, at: frozenset[str]) -> str | None:
 
 
 def _like(word: str, keywords: Iterable[str]) -> str | None:
-    """The keyword that a word was meant to be, if it begins as that does."""
+    """Return the keyword most similar to a word, if both start with the same letter."""
     like = (
         suggestion(word.upper(), [w for w in keywords if w.isalpha()]) if word.isalpha() else None
     )
@@ -182,7 +182,7 @@ def _like(word: str, keywords: Iterable[str]) -> str | None:
 
 
 def _joined(found: str, before: str, at: frozenset[str]) -> str | None:
-    """A hint for a word that stands behind a value: what is misspelt before it, or missing in between."""
+    """Return a hint for a word directly after a value: a misspelt or a missing word."""
     last = re.search(r"(\w+)\s*$", before)
     if last and (like := _like(last[1], _PREFIXES)):
         return f"did you mean {like}?"
@@ -202,15 +202,15 @@ _WORDS: Final = frozenset(
 
 
 def hint_at(name: str, known: Iterable[str]) -> str | None:
-    """Return a hint for an unknown name: the most similar one, or else all that are known.
+    """Return a hint for an unknown name: the most similar name, or all known names.
 
-    Names in an order keep it, so that what is common stands first; a set is sorted.
+    A list keeps its order, so that common names can come first. A set is sorted.
     """
     names = list(known) if isinstance(known, list | tuple) else sorted(known, key=str.lower)
     others = (_words("names", of).get(normalize_name(name)) for of in _tables()["names"])
     other = next((word for word in others if word and word.split(", ")[0] in names), None)
     like = suggestion(name, names)
-    if like and len(like) < 3 < len(name):  # two letters are like too much
+    if like and len(like) < 3 < len(name):  # two letters are similar to too many names
         like = None
     like = other or like or _short_for(name, names)
     if like:
@@ -220,22 +220,22 @@ def hint_at(name: str, known: Iterable[str]) -> str | None:
 
 
 def _short_for(name: str, names: list[str]) -> str | None:
-    """A name that is the beginning of another one, and not by chance."""
+    """Return the longest known name that the given name starts with."""
     whole = normalize_name(name)
     found = [n for n in names if len(n) >= 3 and whole.startswith(normalize_name(n))]
     return max(found, key=len, default=None)
 
 
 def bracket_hint(text: str, position: int, found: str) -> str | None:
-    """Return a hint for an unmatched bracket: where it was opened, or that there is none to close.
+    """Return a hint for an unmatched bracket, with the place where it was opened.
 
     Parameters
     ----------
     text : str
     position : int
-        Where what was not expected begins.
+        Start of the unexpected part.
     found : str
-        What that is; empty at the end.
+        The unexpected part; empty at the end of the text.
     """
     opened: list[int] = []
     for part in _BRACKETS.finditer(text, 0, position):
@@ -256,22 +256,22 @@ def bracket_hint(text: str, position: int, found: str) -> str | None:
 _BRACKETS: Final = re.compile(
     r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|/\*(?:.|\n)*?\*/|[()\[\]{}]"""
 )
-"""Brackets, and what brackets may stand in that do not count."""
+"""Brackets, and texts and comments, whose brackets do not count."""
 
 _CLOSES: Final = {")": "(", "]": "[", "}": "{"}
 _EXCERPT: Final = 24
 
 
 def variable_hint(name: str, visible: Iterable[str], elsewhere: bool) -> str | None:  # noqa: FBT001
-    """Return a hint for an unknown variable: an attribute, a text, the time; ``None``: no idea.
+    """Return a hint for an unknown variable, such as an attribute or a text without quotes, or None.
 
     Parameters
     ----------
     name : str
     visible : iterable of str
-        Variables that may be used.
+        Variables allowed here.
     elsewhere : bool
-        Whether another part of the query binds one of that name.
+        True if another part of the query binds this name.
     """
     if elsewhere:
         return "what a block, or one of several steps, binds is known there only: bind it in MATCH"
@@ -291,14 +291,14 @@ def variable_hint(name: str, visible: Iterable[str], elsewhere: bool) -> str | N
 
 
 def condition_hint(found: Type, written: str) -> str | None:
-    """Return a hint for a value that stands in place of a condition.
+    """Return a hint for a value in place of a condition, or None.
 
     Parameters
     ----------
     found : Type
-        Of the value.
+        Type of the value.
     written : str
-        It, as it is written.
+        Text of the value.
     """
     if len(written) > _EXCERPT or found is Type.list:
         written = "…"
@@ -312,13 +312,13 @@ def condition_hint(found: Type, written: str) -> str | None:
 
 
 def comparison_hint(left: Type, right: Type, texts: Iterable[object]) -> str | None:
-    """Return a hint for a comparison of values of two types.
+    """Return a hint for a comparison of values of different types, or None.
 
     Parameters
     ----------
     left, right : Type
     texts : iterable
-        Texts that stand in the comparison as they are.
+        Constants in the comparison.
     """
     types = {left, right}
     if types == {Type.number, Type.text}:

@@ -1,11 +1,13 @@
-"""The horizon of a check: how far around the ego a trace must know the world, so that its verdict is certain.
+"""Horizon of a check: the range around the ego that a trace must cover for a certain verdict.
 
-Who is not known is in no binding. Of ``FORALL (v:Vehicle) ALWAYS dist(ego, v) > 5`` only vehicles up to 5 m
-count, so a trace that knows 50 m around the ego can answer. ``FORALL (v:Vehicle) ALWAYS v.speed < 50`` is about
-all vehicles: if one was left out, it may not be true, but it is false if one that is known is too fast.
+Unknown entities are in no binding. In ``FORALL (v:Vehicle) ALWAYS dist(ego, v) > 5`` only vehicles within 5 m
+matter, so a trace that covers 50 m around the ego is sufficient. ``FORALL (v:Vehicle) ALWAYS v.speed < 50``
+is about all vehicles. If vehicles were left out, it cannot be proved true, but it is false if a known vehicle
+is too fast.
 
-A condition bounds the place of an entity where it cannot hold farther away: a comparison of a distance, of a
-time to meet (by the greatest speed in the trace), of a safe distance; a relation that ends at some distance.
+Some conditions cannot hold beyond a distance, so they bound the position of an entity: a comparison of a
+distance, of a time to collision (with the greatest speed in the trace) or of a safe distance, and a relation
+with a limited range.
 """
 
 from __future__ import annotations
@@ -26,28 +28,28 @@ if TYPE_CHECKING:
 Interval = tuple[float, float]
 
 BODY: Final = 10.0
-"""Half lengths of two bodies, by which their centres are farther apart than their edges; m."""
+"""Sum of the half lengths of two bodies: the extra distance of centres compared with edges; m."""
 FASTEST: Final = 150.0
-"""What is said to be faster is not known; m/s."""
+"""Greatest valid speed. Faster speeds count as unknown; m/s."""
 _FAR: Final = 200.0 + BODY
-"""How far distances along the lanes are known; m."""
+"""Largest known distance along lanes; m."""
 WAITING: Final = 200.0
-"""How far ahead a light or sign of its lane is at most that somebody has to mind; m."""
+"""Largest distance to a relevant light or sign of the lane ahead; m."""
 LINKS: Final = dict.fromkeys(PROXIMITY, 25.0 + BODY) | {
     **dict.fromkeys(("leads", "follows"), 100.0 + BODY),
     "overlaps": 2 * BODY,
 }
-"""Relations that end at some distance, by the usual settings; m."""
+"""Relations with a limited range, with the range in the default settings; m."""
 
 
 @dataclass(frozen=True, slots=True)
 class Horizon:
-    """How far the world must be known; m.
+    """Range around the ego that a trace must cover; m.
 
     Attributes
     ----------
     true, false : float
-        So that a check that is true, or false, of what is known is so of the whole world.
+        Range with which a true, or false, verdict for the known entities is valid for the whole world.
     """
 
     true: float = 0.0
@@ -56,16 +58,16 @@ class Horizon:
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """Where an entity can be if something holds.
+    """Bounds on the position of an entity relative to the ego.
 
     Attributes
     ----------
     away : float
-        The greatest distance from the ego; m.
+        Largest distance from the ego; m.
     along : float
-        The same along the axis of the ego, which is one for who is in its lane, or in one beside it.
+        Largest distance along the axis of the ego; m. Valid for entities in its lane or a neighbouring lane.
     lanes : bool
-        Whether lanes join it to the ego.
+        True if the entity is connected to the ego by lanes.
     """
 
     away: float = math.inf
@@ -74,29 +76,29 @@ class _Place:
 
     @property
     def reach(self) -> float:
-        """The greatest distance from the ego; m."""
+        """Largest distance from the ego; m."""
         return min(self.away, self.along) if self.lanes else self.away
 
     def both(self, other: _Place) -> _Place:
-        """Where it can be if the one holds and the other, too."""
+        """Return the bounds if both conditions hold."""
         lanes = self.lanes or other.lanes
         return _Place(min(self.away, other.away), min(self.along, other.along), lanes)
 
     def either(self, other: _Place) -> _Place:
-        """Where it can be if one of the two holds."""
+        """Return the bounds if one of two conditions holds."""
         lanes = self.lanes and other.lanes
         away = max(self.reach, other.reach)
         return _Place(away, max(self.along, other.along), lanes)
 
 
 def horizon(check: BoundCheck, speed: float = FASTEST) -> Horizon:
-    """How far a check looks around the ego.
+    """Return the range around the ego that a check depends on.
 
     Parameters
     ----------
     check : BoundCheck
     speed : float
-        That nothing in the trace exceeds; m/s.
+        Upper limit of all speeds in the trace; m/s.
     """
     egos = {key: 0.0 for key, node in check.scope.nodes.items() if not node.kinds.other}
     asked = _Looking(egos, speed)
@@ -121,7 +123,7 @@ def horizon(check: BoundCheck, speed: float = FASTEST) -> Horizon:
 
 
 def spoken_kinds(check: BoundCheck) -> tuple[frozenset[str], frozenset[str]]:
-    """Kinds of nodes that a check may wrongly be true for want of, and those that it may wrongly be false for.
+    """Return the kinds whose missing nodes can make a check wrongly true, and wrongly false.
 
     Parameters
     ----------
@@ -148,7 +150,7 @@ def _farther(found: Horizon, reach: float, *, true: bool, false: bool) -> Horizo
 
 @dataclass(frozen=True, slots=True)
 class _Missed:
-    """A node in braces: its kinds, its reach, and whether a check may be true, or false, for want of it."""
+    """Node in braces with its kinds and reach, and the verdicts that are wrong if it is missing."""
 
     kinds: frozenset[str]
     reach: float
@@ -157,13 +159,13 @@ class _Missed:
 
     @property
     def either(self) -> _Missed:
-        """The same where it is not known which."""
+        """Copy for the case that the affected verdict is unknown."""
         return replace(self, true=True, false=True)
 
 
 @dataclass(slots=True)
 class _Looking:
-    """How far variables can be from the ego, and how fast things are, while a check is looked at."""
+    """Distances of variables from the ego, and the greatest speed, for the analysis of a check."""
 
     known: dict[str, float]
     speed: float
@@ -173,9 +175,9 @@ class _Looking:
     def blocks(  # noqa: C901, PLR0912 - a case each
         self, formula: Bound, *, up: bool = True
     ) -> Iterable[_Missed]:
-        """Return the nodes in braces.
+        """Yield the nodes in the blocks of a formula.
 
-        ``up``: whether the formula makes the whole true where it is.
+        ``up``: true if a true formula supports a true verdict.
         """
         match formula:
             case b.Operation("NOT", (one,)):
@@ -204,7 +206,7 @@ class _Looking:
                             yield one.either
 
     def of_block(self, block: b.BlockValue, *, up: bool) -> Iterable[_Missed]:
-        """Return the same of a block; who is missed makes ``EXISTS`` false and ``COUNT`` less."""
+        """Yield the nodes of a block. A missing node makes ``EXISTS`` false and ``COUNT`` smaller."""
         scope = block.scope
         for key, node in scope.nodes.items():
             if node.kinds.other:
@@ -220,7 +222,7 @@ class _Looking:
     # Where an entity can be ----------------------------------------------------------------------
 
     def in_scope(self, scope: Scope, key: str) -> _Place:
-        """Where a node of a pattern can be, or one that a block speaks of, if there is a match."""
+        """Return the position bounds of a node of a pattern or block, if there is a match."""
         found = _Place()
         for part in scope.where:
             found = found.both(self.place(part, key, wanted=True))
@@ -239,7 +241,7 @@ class _Looking:
     def place(  # noqa: PLR0911 - a case each
         self, formula: Bound, key: str, *, wanted: bool
     ) -> _Place:
-        """Where a variable can be if a formula is true, or false, in some frame."""
+        """Return the position bounds of a variable for which a formula is true, or false, in a frame."""
         match formula:
             case b.Operation("NOT", (one,)):
                 return self.place(one, key, wanted=not wanted)
@@ -263,7 +265,7 @@ class _Looking:
             case b.BlockValue(word="EXISTS", scope=scope) if wanted and key in scope.outer:
                 return self.in_scope(scope, key)
             case b.Value(value=value) if value is not wanted and value is not None:
-                return _Place(0.0, 0.0)  # which never is
+                return _Place(0.0, 0.0)  # the constant never has the wanted value
             case _:
                 return _Place()
 
@@ -272,7 +274,7 @@ class _Looking:
         return found.both(self._measured(_MIRRORED[word], other, one, key))
 
     def _measured(self, word: str, one: Bound, other: Bound, key: str) -> _Place:
-        """Where a variable can be if a number of it and the ego compares so with another."""
+        """Return the position bounds of a variable from a comparison of a pair number."""
         whole = isinstance(one, b.Operation) and one.word == "abs"
         pair = one.operands[0] if isinstance(one, b.Operation) and whole else one
         if not isinstance(pair, b.PairNumber) or key not in {pair.a, pair.b}:
@@ -310,7 +312,7 @@ def _any(places: list[_Place]) -> _Place:
 
 
 def _joined(scope: Scope, key: str, known: Mapping[str, float]) -> bool:
-    """Tell whether edges of a pattern join a node with one that is near the ego, by way of lanes."""
+    """True if a pattern connects a node by lanes to a node near the ego."""
     reached, grown = {key}, True
     while grown:
         fresh = {
@@ -329,7 +331,7 @@ _COMPLEMENT: Final = {"<": ">=", "<=": ">", ">": "<=", ">=": "<", "=": "<>", "<>
 
 
 def _safe(margin: float, speed: float) -> float:
-    """The greatest safe distance of RSS, of two who come towards one another; m."""
+    """Return the largest RSS safe distance for oncoming vehicles; m."""
     fast = speed + 3.5
     return margin + 2 * (speed + 1.75) + fast * fast / 6 + fast * fast / 8 + BODY
 
@@ -344,17 +346,17 @@ _SMALL: Final[Mapping[str, Callable[[float, float], float]]] = {
     "ttc_mild": lambda value, speed: 2 * speed * value + 4 * value * value + BODY,
     "rss_margin": _safe,
 }
-"""Numbers that are small of who is near alone: how far one can be whose number is at most so large."""
+"""Numbers that are small only for near entities: the largest distance for a given value."""
 
 _BRAKING: Final = {"a_long_req": -1.0, "drac": 1.0, "btn": 11.5}
-"""Numbers that are large only of who is near: the deceleration that 1 of them is; m/s²."""
+"""Numbers that are large only for near entities: the deceleration for a value of 1; m/s²."""
 
 
-# What values can be ------------------------------------------------------------------------------
+# Ranges of values ------------------------------------------------------------------------------
 
 
 def bounds(value: Bound, speed: float) -> Interval:
-    """The least and the greatest that a number can be, given what nothing in the trace is faster than.
+    """Return the smallest and largest possible value of a number, for a speed limit of the trace.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Node kinds in tables, and kinds that conditions imply."""
+"""Kinds of nodes in tables, and kinds implied by conditions."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 
 _FEW: Final = 4
-"""Most words that DuckDB compares with one after the other; of more it makes a table, and joins that."""
+"""Longest ``IN`` list that DuckDB compares word by word. It turns longer lists into a table and joins it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """Kinds of the nodes that a variable may be bound to, by the place that holds them."""
+    """Kinds of the nodes that a variable may be bound to, grouped by the table that stores them."""
 
     moving: frozenset[str]
     fixed: frozenset[str]
@@ -33,7 +33,10 @@ class Profile:
 
     @classmethod
     def of(cls, kinds: Kinds, catalog: Catalog) -> Profile:
-        """The profile of nodes of some kinds; what occurs nowhere is taken to move or to be of the map."""
+        """Return the profile for a set of kinds.
+
+        Unused entity kinds count as moving, other unused kinds as mapped.
+        """
         moving = kinds.every & catalog.moving
         fixed, mapped = kinds.other & catalog.fixed, kinds.other & catalog.mapped
         if not moving | fixed | mapped:
@@ -43,16 +46,16 @@ class Profile:
 
     @property
     def kinds(self) -> frozenset[str]:
-        """All kinds that they may be of."""
+        """All kinds of the profile."""
         return self.moving | self.fixed | self.mapped
 
     @property
     def places(self) -> int:
-        """In how many places they live."""
+        """Number of tables that may store the nodes."""
         return sum(map(bool, (self.moving, self.fixed, self.mapped)))
 
     def has(self, home: Home) -> bool:
-        """Tell whether values that live in a home may be theirs."""
+        """True if the nodes may have values stored in the given home."""
         kinds = {
             Home.state: self.moving,
             Home.entity: self.moving | self.fixed,
@@ -63,9 +66,9 @@ class Profile:
 
 
 def homes_of(attribute: Attribute, profile: Profile) -> set[Home]:
-    """The homes of an attribute that must be joined for nodes that live in some places.
+    """Return the homes to join for an attribute of nodes with a given profile.
 
-    Of what moves, a state is there anyway, so a constant that states repeat is taken from there.
+    The state of a moving entity is joined anyway. So a constant that states repeat is read from the state.
     """
     label = attribute.unit is DisplayUnit.label
     homes = {Home.entity, Home.map} if label else set(attribute.columns)
@@ -75,9 +78,9 @@ def homes_of(attribute: Attribute, profile: Profile) -> set[Home]:
 
 
 def kind_conditions(kinds: Kinds, kind: str, ego: str | None, held: frozenset[str]) -> list[str]:
-    """Conditions on a column of kinds and one of the ego's mark (``None``: never the ego).
+    """Return SQL conditions on a kind column and an ego column. ``None`` means never the ego.
 
-    ``held`` are all kinds that the column has: a condition that they all meet is left out.
+    ``held`` are all kinds in the column. A condition that all of them meet is omitted.
     """
     if ego is None:
         return _among(kinds.other, kind, held)
@@ -100,7 +103,7 @@ def _among(kinds: frozenset[str], column: str, held: frozenset[str]) -> list[str
 
 
 def _one_of(column: str, words: list[str], others: Sequence[str] = ()) -> str:
-    """The condition that a column is one of some words; ``others`` are all else that it may be, if known."""
+    """Return the condition that a column is one of some words. ``others`` are the other possible words."""
     if len(words) > _FEW >= len(others) > 0:
         return " AND ".join(f"{column} <> {literal(word)}" for word in others)
     if len(words) == 1:
@@ -111,9 +114,9 @@ def _one_of(column: str, words: list[str], others: Sequence[str] = ()) -> str:
 def edge_conditions(
     catalog: Catalog, scope: Scope, edge: Edge, alias: str, *, moving: bool, swapped: bool = False
 ) -> list[str]:
-    """Conditions on the relation and the kinds of a row of ``edge`` (``moving``) or of ``map_edge``.
+    """Return SQL conditions on relation and kinds for a row of ``edge`` or ``map_edge``.
 
-    ``swapped``: the row runs from the edge's ``dst`` to its ``src``.
+    ``moving`` selects the table ``edge``. ``swapped``: the row runs from ``dst`` to ``src`` of the edge.
     """
     table = catalog.edges if moving else catalog.map_edges
     held = [triple for triple in table if triple[0] in edge.relations]
@@ -123,7 +126,7 @@ def edge_conditions(
         conditions += [_one_of(f'{alias}."relation"', relations)]
     ends = (edge.dst, edge.src) if swapped else (edge.src, edge.dst)
     sides = [(1, "src", ends[0]), (2, "dst", ends[1])]
-    # What one end is says something of the other; mostly all there is to say, if that is the ego.
+    # The kind of one end restricts the other end. The ego end restricts most, so it is handled first.
     for side, end, key in sorted(sides, key=lambda one: scope.kinds(one[2]).one_a_frame):
         conditions += kind_conditions(
             scope.kinds(key),
@@ -136,19 +139,20 @@ def edge_conditions(
 
 
 def alias_of(edge: Edge) -> str:
-    """Return the alias of an edge in a statement: its key, and its relation if it has only one."""
+    """Return the SQL alias of an edge: its key, plus its relation if it has only one."""
     return (
         f"{edge.key}:{next(iter(edge.relations))}" if len(edge.relations) == 1 else f"{edge.key}:"
     )
 
 
-# What conditions say of kinds of nodes: numbers of pairs are of entities, and what is compared is known ----
+# Kinds implied by comparisons of pair numbers -----------------------------------------------------
 
 
 def entities_of_pairs(scope: Scope, _: Catalog) -> Scope:
-    """Nodes whose pair is compared are entities: of others the number is unknown, and a comparison never true.
+    """Restrict nodes to entities if a condition compares a number of their pair.
 
-    Else a node without a label would be tried with every part of the map around.
+    For other kinds of nodes the number is unknown, so the comparison is never true. Without this restriction,
+    a node without a label would be tried with every part of the map.
     """
     nodes = dict(scope.nodes)
     for condition in scope.where:
@@ -161,7 +165,7 @@ def entities_of_pairs(scope: Scope, _: Catalog) -> Scope:
 
 
 def on_lanes() -> frozenset[str]:
-    """The kinds of what lies on lanes: entities, and parts of the map."""
+    """Return the kinds of nodes that lie on lanes: entities, and parts of the map."""
     return entity_kinds() | _ON_LANES
 
 
@@ -169,7 +173,7 @@ _ON_LANES: Final = frozenset({"lane", "road", "junction", "roundabout", "crosswa
 
 
 def _needed(expression: Bound) -> Iterator[PairNumber]:
-    """The numbers of pairs without which an expression is unknown."""
+    """Yield the pair numbers that must be known for the expression to be known."""
     match expression:
         case PairNumber():
             yield expression

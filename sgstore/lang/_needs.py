@@ -1,10 +1,11 @@
-"""Needs: values that a trace must know to answer a question.
+"""Needs of a query or check: values that a trace must know to answer it.
 
-``in_range(a, b)`` asks whether the relations of a pair were computed at all.
+``in_range(a, b)`` is true if the relations of a pair were computed.
 
-A scene graph relates the pairs that the settings of its trace name: the ego with what is in range, what moves
-with what is near. Of such a pair a missing edge says that the relation does not hold; of any other it says
-nothing. ``in_range(a, b)`` is written in terms of distances and labels, so it is answered wherever these are.
+A scene graph relates only the pairs selected by the settings of its trace: the ego and entities in range,
+moving entities and entities near them. For such a pair, a missing edge means that the relation does not hold.
+For any other pair, it means nothing. ``in_range(a, b)`` is expressed by distances and labels, so it is known
+wherever these are known.
 """
 
 from __future__ import annotations
@@ -67,18 +68,18 @@ def in_range(a: str, b: str, traces: Iterable[TraceFacts]) -> Bound:
     a, b : str
         Keys of the nodes.
     traces : iterable of TraceFacts
-        Those that are asked.
+        Traces to search.
 
     Returns
     -------
     Bound
-        False of what is no entity; unknown in traces whose settings are not known.
+        False for nodes other than entities; unknown in traces with unknown settings.
     """
     return in_traces(scopes_of(traces), lambda reach: related(a, b, reach))
 
 
 def scopes_of(traces: Iterable[TraceFacts]) -> b.Scopes:
-    """Return which pairs are related in some traces: each way once, with the ids of its traces."""
+    """Group traces by the scope of their relations: each scope with the ids of its traces."""
     of: dict[RelationScope | None, list[int]] = {}
     for trace in traces:
         of.setdefault(trace.reach, []).append(trace.trace_id)
@@ -86,7 +87,7 @@ def scopes_of(traces: Iterable[TraceFacts]) -> b.Scopes:
 
 
 def in_traces(scopes: b.Scopes, condition: Callable[[RelationScope | None], Bound]) -> Bound:
-    """Return a condition that is another one in traces with other settings."""
+    """Combine conditions that depend on the relation scope of a trace."""
     if len(scopes) < 2:
         return condition(next(reach for reach, _ in scopes))
     number = TraceAttribute(TRACE_ATTRIBUTES["id"], Type.number)
@@ -94,7 +95,7 @@ def in_traces(scopes: b.Scopes, condition: Callable[[RelationScope | None], Boun
 
 
 def related(a: str, b: str, reach: RelationScope | None) -> Bound:
-    """Return the condition that the relations of two nodes were computed with some settings."""
+    """Return the condition that the relations of two nodes were computed under given settings."""
     if reach is None:
         return Value(None, Type.boolean)
     ego = any_of(LabelTest(node, ego_kinds()) for node in (a, b))
@@ -116,7 +117,7 @@ def related(a: str, b: str, reach: RelationScope | None) -> Bound:
 
 
 def _listed(a: str, b: str, kinds: Iterable[tuple[str, ...]]) -> list[Bound]:
-    """Return the condition that two nodes have labels that are listed; none where none are."""
+    """Return the condition that two nodes have a listed pair of labels. An empty list gives no condition."""
     listed = [
         all_of(LabelTest(a, _labelled(one)), LabelTest(b, _labelled(other)))
         for pair in kinds
@@ -126,14 +127,14 @@ def _listed(a: str, b: str, kinds: Iterable[tuple[str, ...]]) -> list[Bound]:
 
 
 def bounded(a: str, b: str, names: Iterable[str], reach: RelationScope) -> Bound:
-    """Return the condition that two entities have one of some relations that end at some distance.
+    """Return the condition that two entities have one of the given distance relations.
 
     Parameters
     ----------
     a, b : str
         Keys of the nodes.
     names : iterable of str
-        Rungs of the settings, and ``overlaps``.
+        Distance relations of the settings, and ``overlaps``.
     reach : RelationScope
         The settings.
     """
@@ -152,7 +153,7 @@ def bounded(a: str, b: str, names: Iterable[str], reach: RelationScope) -> Bound
 
 
 def _touch(a: str, b: str, reach: RelationScope) -> Bound:
-    """Return the condition that two bodies touch, of which one moves."""
+    """Return the condition that two bodies touch and at least one of them moves."""
     solid = [inverse(LabelTest(node, _SIGNAL)) for node in (a, b)]
     moves = any_of(inverse(_still(node)) for node in (a, b))
     ego = [] if reach.within > 0 else [any_of(LabelTest(node, ego_kinds()) for node in (a, b))]
@@ -173,7 +174,7 @@ def _labelled(label: str) -> Kinds:
 
 
 def _up_to(a: str, b: str, bound: float, reach: RelationScope) -> Bound:
-    """Return the condition that two nodes are no further apart; a node without a place is near nothing."""
+    """Return the condition that two nodes are within a distance. A node without position is near nothing."""
     limit = Value(bound, Type.number)
     if reach.between == "origins":
         return any_of(
@@ -186,7 +187,7 @@ def _up_to(a: str, b: str, bound: float, reach: RelationScope) -> Bound:
 
 
 def _between_origins(a: str, b: str) -> Iterable[tuple[list[Bound], Bound]]:
-    """Distances of origins, and of what they are: that of a vehicle that moves lies on the ground."""
+    """Yield distances of origins with their conditions. The origin of a moving vehicle is on the ground."""
     for low_a in (True, False):
         for low_b in (True, False):
             tests = [_lies_low(a, yes=low_a), _lies_low(b, yes=low_b)]
@@ -235,19 +236,19 @@ def _of(word: str, *operands: Bound) -> Bound:
     return Operation(word, operands, Type.number)
 
 
-# What a trace must know so that it can answer a question at all ---------------------------------
-# A condition that is unknown is not true, and false where time begins. So of a trace that has no ego
-# ``ALWAYS ego.speed < 20`` would be false, and of one that never tells a speed, too. Such a trace cannot
-# answer: it is left out, and its verdict is unknown. What a question *needs* is told here: that the ego is
-# there, and that what is measured of its variables is known of any of them in any frame.
+# Needs of questions -----------------------------------------------------------------------------------
+# An unknown condition is not true, and inside temporal operators it is false. So ``ALWAYS ego.speed < 20``
+# would be false for a trace without an ego or without speeds. Such a trace cannot answer: it is left out, and
+# its verdict is unknown. This section finds the *needs* of a question: that there is an ego, and that
+# measured attributes of its variables are known at least once.
 #
-# Only what is measured counts. Of an attribute whose absence says something itself (a lane without ``turn``
-# is in no junction, a car without ``special`` is an ordinary one), nothing is unknown. What stands in
-# ``known``, ``IS NULL``, ``coalesce`` and ``CASE`` says what is to be done without it, and variables of blocks
-# are asked to exist.
+# Only measured attributes count. Some attributes have a meaning even if they are absent (a lane without
+# ``turn`` is not in a junction, a car without ``special`` is an ordinary car); these are never unknown.
+# ``known``, ``IS NULL``, ``coalesce`` and ``CASE`` handle missing values themselves. Variables of blocks must
+# only exist.
 
 MOTION: Final = frozenset({"speed", "vx", "vy", "vz", "accel", "ax", "ay", "az", "yaw_rate"})
-"""What nothing has that never moves."""
+"""Attributes that static nodes do not have."""
 
 MEASURED: Final = MOTION | {
     *("heading", "pitch", "roll", "length", "width", "height"),
@@ -255,28 +256,29 @@ MEASURED: Final = MOTION | {
     *("speed_limit", "curvature"),
     *VEHICLE_LIGHTS,
 }
-"""Attributes of nodes that are unknown where nobody told them."""
+"""Measured attributes of nodes, which are unknown if the recording does not have them."""
 
 _TELLS: Final = frozenset({"IS NULL", "IS NOT NULL", "coalesce", "case"})
-"""What is known even of what is not."""
+"""Operators with a known value for unknown operands."""
 
 
 @dataclass(frozen=True, slots=True)
 class Need:
-    """Something that a trace must know.
+    """Fact that a trace must know.
 
     Attributes
     ----------
     node : str
-        The variable; empty: the frame.
+        The variable; empty for the frame.
     kinds : Kinds or None
-        What it may be.
+        Kinds that the node may have.
     attribute : Attribute or None
-        That must be known of it in some frame, if there is one; ``None``: that there is one.
+        Attribute that must be known in at least one frame, if such a node exists. ``None`` means that the
+        node must exist.
     event : str
-        The kind of event that it must tell of; else empty.
+        Kind of event that must be recorded; otherwise empty.
     lanes : str
-        What its map must tell of lanes: ``ways``, ``curvature``, ``slope``; else empty.
+        Lane data that the map must have: ``ways``, ``curvature`` or ``slope``; otherwise empty.
     """
 
     node: str
@@ -287,12 +289,12 @@ class Need:
 
     @property
     def is_ego(self) -> bool:
-        """Whether it is that there is an ego."""
+        """True if the need is that an ego exists."""
         return self.attribute is None and not self.event and not self.lanes
 
     @property
     def reason(self) -> str:
-        """Message about a trace that does not meet it."""
+        """Message about a trace that does not meet the need."""
         if self.lanes:
             return (
                 "it has no map with heights" if self.lanes == "slope" else "it has no map of lanes"
@@ -306,7 +308,7 @@ class Need:
 
 
 def of_check(check: BoundCheck) -> tuple[Need, ...]:
-    """Return the needs of a check; none with ``USING UNKNOWN false``."""
+    """Return the needs of a check. The result is empty with ``USING UNKNOWN false``."""
     if check.unknown_is_false:
         return ()
     nodes = check.scope.nodes
@@ -318,7 +320,7 @@ def of_check(check: BoundCheck) -> tuple[Need, ...]:
 
 
 def not_computed(check: BoundCheck, facts: TraceFacts) -> str:
-    """Return the reason if relations that a check asks for were not computed in a trace, or an empty text."""
+    """Return a message about relations of a check that a trace lacks, or an empty text."""
     if check.unknown_is_false:
         return ""
     missing = check.relations - facts.answers
@@ -329,7 +331,7 @@ def not_computed(check: BoundCheck, facts: TraceFacts) -> str:
 
 
 def _of_entities(expression: Bound) -> frozenset[str]:
-    """Return the relations that an expression asks for of entities."""
+    """Return the relations that an expression uses between entities."""
     found: set[str] = set()
     for part in b.walk(expression):
         match part:
@@ -349,9 +351,9 @@ def _of_entities(expression: Bound) -> frozenset[str]:
 
 
 def of_query(query: b.Query) -> tuple[Need, ...]:
-    """Return the needs of a query: what a trace must know so that something can be found in it.
+    """Return the needs of a query: the facts that a trace must know to have a match.
 
-    Where one of several conditions is enough (``OR``), and no time is looked at, what all of them need counts.
+    For an ``OR`` without temporal operators, only needs common to all its conditions count.
     """
     if query.unknown_is_false:
         return ()
@@ -364,7 +366,7 @@ def of_query(query: b.Query) -> tuple[Need, ...]:
     every = tuple(range(len(steps)))
     ways = [way.steps for way in query.ways] if query.steps else [every]
     found = set.intersection(*(set[Need]().union(*(needs[n] for n in way)) for way in ways))
-    # One ego is as good as another.
+    # All ego needs of the same kinds are equivalent, so one is sufficient.
     egos = {need.kinds: need for need in found if need.is_ego}
     others = {need for need in found if not need.is_ego}
     return _ordered(others | {*egos.values()})
@@ -387,7 +389,7 @@ def _of_each(
 def _needed(  # noqa: C901, PLR0911, PLR0912 - a case each
     expression: b.Bound, nodes: Mapping[str, b.Node], *, strict: bool
 ) -> set[Need]:
-    """Return the needs of an expression; ``strict``: of all its parts, even if fewer were enough."""
+    """Return the needs of an expression. If ``strict``, all its parts count, even in an ``OR``."""
 
     def of_node(key: str, name: str) -> set[Need]:
         if key not in nodes or name not in MEASURED:
@@ -410,12 +412,12 @@ def _needed(  # noqa: C901, PLR0911, PLR0912 - a case each
         case b.NodeAttribute(node=node, attribute=attribute):
             return of_node(node, attribute.name)
         case b.PairNumber(function=function, a=one, b=other):
-            if function in RECORDED:  # it is unknown where it needs more than the trace has
+            if function in RECORDED:  # unknown if it needs more than the trace has
                 return set()
             told = function if function in COURSES else "ways"
             of_map = {Need("", None, None, lanes=told)} if function in WAYS else set[Need]()
             of_two = zip((one, other), columns_needed(function), strict=True)
-            # Both parts of a velocity are known, or none, and of an acceleration.
+            # Both components of a velocity or an acceleration are known, or neither is.
             return of_map | {
                 need
                 for node, parts in of_two

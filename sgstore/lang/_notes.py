@@ -1,7 +1,7 @@
-"""Notes on texts that a query compares with attributes, and that the store has not.
+"""Notes on texts in a query that no attribute value of the store equals.
 
-A misspelt name finds nothing, and silently. So whoever asks is told which texts are no value that the store
-has, and which is the nearest. The compiler says what is compared; who has the store asks it.
+A misspelt name finds nothing, without an error. So the notes list the texts that are not values in the store,
+each with the nearest value. The compiler finds the comparisons. The caller looks the texts up in the store.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ _TEXTS_OF: Final[dict[str, tuple[tuple[str, ...], ...]]] = {
     "trace.ego": (("ego", "trace"),),
     "trace.map": (("name", "map"),),
 }
-"""Where attributes stand whose values are texts of the recordings': column, table, and which of its rows."""
+"""Places of attributes with texts from recordings: column, table, and condition on its rows."""
 
 Compared = tuple[str, str]
-"""An attribute, and a text that it is compared with."""
+"""Attribute, and a text that it is compared with."""
 
 
 def compared_in_query(query: b.Query) -> list[Compared]:
-    """Return the comparisons with texts in a bound query, each once."""
+    """Return the comparisons with texts in a bound query, without duplicates."""
     returned = [column.value for column in query.result.columns]
     found = list(_comparisons(returned, query.scope))
     for scope in () if query.steps else query.patterns:
@@ -58,7 +58,7 @@ def compared_in_query(query: b.Query) -> list[Compared]:
 
 
 def compared_in_check(check: BoundCheck) -> list[Compared]:
-    """Return the comparisons with texts in a bound check, each once."""
+    """Return the comparisons with texts in a bound check, without duplicates."""
     values = [check.formula, *(one.where for one in check.quantifiers if one.where is not None)]
     values += [check.reset] if check.reset is not None else []
     return list(dict.fromkeys(_comparisons([*values, *check.scope.where], check.scope)))
@@ -96,7 +96,7 @@ def _texts(attribute: b.Bound, values: Iterable[b.Bound], scope: b.Scope) -> Ite
 
 
 def _type_of(kinds: b.Kinds) -> str:
-    """Return the attribute that ``type`` means for nodes of some kinds."""
+    """Return the attribute that ``type`` means for nodes of the given kinds."""
     if "lane" not in kinds.every:
         return "type_name"
     return "type" if kinds.every & entity_kinds() else "lane_type"
@@ -105,17 +105,17 @@ def _type_of(kinds: b.Kinds) -> str:
 def notes_on(
     compared: Iterable[Compared], query: str, parameters: Mapping[str, object], ask: Ask
 ) -> tuple[str, ...]:
-    """Return notes about texts that no value of a store is equal to.
+    """Return notes about texts in a query that no value of the store equals.
 
     Parameters
     ----------
     compared : iterable of (str, str)
     query : str
-        What was asked. Only texts that stand in it or in a parameter are spoken of: the predicates of the
-        library name values, such as types of lanes, that few stores have.
+        Text of the query. Notes cover only texts that occur in it or in a parameter. The predicates of the
+        library name values, such as lane types, that few stores have.
     parameters : mapping
     ask : function
-        Gives the rows of a statement with its values.
+        Function that runs a statement with its values and returns the rows.
     """
     written = f"{query} {[*parameters.values()]}"
     return tuple(
@@ -144,7 +144,7 @@ def _note(name: str, text: str, ask: Ask) -> str:
 
 
 def _all_values(name: str) -> str:
-    """All values of an attribute."""
+    """Return SQL for all values of an attribute."""
     places = (
         Select([f'{column} AS "value"'], [table], [f"({column}) IS NOT NULL", *where])
         for column, table, *where in _TEXTS_OF[name]

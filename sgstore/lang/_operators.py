@@ -1,8 +1,8 @@
-"""Operators and functions of values: each declared once, for SQL, for one binding and for columns.
+"""Operators and functions of values, each declared once for SQL, single bindings and columns.
 
-An operand may be unknown. Most operators are *strict*: their value is unknown where one of their operands is,
-so they are written for known values only. Logic, tests of ``NULL``, ``coalesce`` and ``IN`` have rules of their
-own.
+An operand may be unknown. Most operators are *strict*: if an operand is unknown, the value is unknown. So
+they are written for known values only. Logic, tests of ``NULL``, ``coalesce`` and ``IN`` have their own
+rules.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Values of many bindings or frames at once, and where they are known.
+    """Values for many bindings or frames, with a mask of the known values.
 
     Attributes
     ----------
     values : array or scalar
-        (N,) or (B, F); of length 1 in an axis, or a scalar, for what is the same everywhere. Meaningless where
-        it is not known.
+        Array of shape (N,) or (B, F). An axis of length 1, or a scalar, means a constant value. Entries that
+        are not known are not valid.
     known : bool or array of bool
-        ``True`` where nothing is unknown.
+        Mask of known values; ``True`` means that all values are known.
     """
 
     values: Any
@@ -43,23 +43,23 @@ class Column:
 
     @property
     def flags(self) -> Bools:
-        """The values as truths."""
+        """Values as booleans."""
         return np.asarray(self.values, np.bool_)
 
     @property
     def true(self) -> Any:
-        """Mask where it is true; unknown is not."""
+        """Mask of entries that are known and true."""
         return self.flags if self.known is True else self.known & self.flags
 
     @property
     def false(self) -> Any:
-        """Mask where it is false; unknown is not."""
+        """Mask of entries that are known and false."""
         flags = np.logical_not(self.flags)
         return flags if self.known is True else self.known & flags
 
 
 def all_known(columns: Iterable[Column]) -> Any:
-    """Return the mask where all of some columns are known; ``True``: everywhere."""
+    """Return the mask of entries that are known in all columns. ``True`` means all entries."""
     found: Any = True
     for column in columns:
         if column.known is not True:
@@ -69,20 +69,20 @@ def all_known(columns: Iterable[Column]) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Operator:
-    """An operator in each engine.
+    """Operator or function, implemented for each engine.
 
     Attributes
     ----------
     sql : function
-        Its SQL, given that of its operands.
+        Function from the SQL of the operands to the SQL of the operator.
     one : function
-        The function of its value for one binding, given those of its operands.
+        Function that combines operand functions into a function of one binding.
     columns : function
-        Its values, given those of its operands.
+        Function from the columns of the operands to the column of values.
     infix : bool
-        Whether it is written between its operands.
+        True if the operator is written between its operands.
     strict : bool
-        Whether it is unknown where one of its operands is.
+        True if the value is unknown whenever an operand is unknown.
     """
 
     sql: SqlOf
@@ -92,21 +92,21 @@ class Operator:
     strict: bool = False
 
 
-# SQL: a call takes its operands as they are, all else takes them in brackets where they need them ----
+# SQL: operands are put in brackets where needed, except in calls ----------------------------------
 
 _WHOLE: Final = re.compile(r"""\$\d+|\w+|"[^"]*"(\."[^"]*")*|'[^']*'""")
-"""A placeholder, a word or a number, a column, a text: what needs no brackets."""
+"""Text without need of brackets: a placeholder, a word, a number, a column or a string."""
 
 _BRACKETS: Final = re.compile(r"""(?:"[^"]*"|'[^']*'|[^"'()])*([()])""")
 
 
 def operand_text(text: str) -> str:
-    """Return a text that can stand beside any operator: in brackets, unless it is one word or one call."""
+    """Return SQL that is safe as an operand: in brackets, unless it is one word or one call."""
     return text if _WHOLE.fullmatch(text) or _is_call(text) else f"({text})"
 
 
 def _is_call(text: str) -> bool:
-    """Tell whether a text is in brackets already, perhaps with the name of a function before them."""
+    """True if SQL is in brackets already, optionally after the name of a function."""
     if not re.match(r"\w*\(", text):
         return False
     depth = 0
@@ -118,9 +118,9 @@ def _is_call(text: str) -> bool:
 
 
 def _sql(form: str | SqlOf) -> SqlOf:
-    """The function of the SQL of an operator, given its form.
+    """Return the function that builds the SQL of an operator from a template.
 
-    ``abs(...)`` is a call, ``(... AND ...)`` stands between all operands, ``{0} = {1}`` has a place for each.
+    ``abs(...)`` is a call, ``(... AND ...)`` joins all operands, ``{0} = {1}`` has a place for each operand.
     """
     if not isinstance(form, str):
         return form
@@ -134,24 +134,23 @@ def _sql(form: str | SqlOf) -> SqlOf:
 
 
 def _odd(parts: Sequence[str]) -> str:
-    """Unknown if one part is, as <> is."""
+    """Return the SQL of an ``XOR``. The value is unknown if an operand is unknown, as with ``<>``."""
     return reduce(lambda left, right: f"({left} <> {right})", map(operand_text, parts))
 
 
 def _where(part: str, condition: str) -> str:
-    """SQL of a value where a condition on it (``v``) is true, else NULL.
+    """Return the SQL of a value if a condition on it (``v``) is true, otherwise NULL.
 
-    The value stands there once: of operators in one another that named theirs twice the text would grow beyond
-    all bounds.
+    The value is written only once. Otherwise, the text of nested operators would grow exponentially.
     """
     return f"list_filter([{part}], lambda v: {condition})[1]"
 
 
 def _not_zero(part: str) -> str:
-    """SQL of a divisor: NULL where it is zero.
+    """Return the SQL of a divisor, with NULL instead of zero.
 
-    ``nullif`` is the faster one, and a macro that plans its argument twice: of those in one another only the
-    innermost may be one.
+    ``nullif`` is faster, but it is a macro that plans its argument twice. So only the innermost of several
+    nested divisors uses it.
     """
     return _where(part, "v <> 0") if "nullif(" in part else f"nullif({part}, 0)"
 
@@ -196,10 +195,10 @@ def _strict(
     infix: bool = False,
     partial: bool = False,
 ) -> Operator:
-    """An operator that is unknown where one of its operands is.
+    """Return an operator that is unknown if one of its operands is unknown.
 
-    Unless it is ``partial``, it has a value wherever they are known. If it is, ``one`` gives ``None`` where it
-    has none, and ``columns`` gives values and where it has them.
+    Without ``partial``, the operator has a value for all known operands. With ``partial``, ``one`` returns
+    ``None`` for a missing value, and ``columns`` returns the values and a mask of valid values.
     """
 
     def of_one(parts: Sequence[Callable[[Any], Any]]) -> Callable[[Any], Any]:
@@ -264,7 +263,7 @@ def _sign(a: float) -> int:
 
 
 def _finite(function: Callable[..., float]) -> Callable[..., float | None]:
-    """A function of :mod:`math` that has no value (``None``) where that is no finite number."""
+    """Wrap a function of :mod:`math` so that it returns ``None`` instead of a non-finite number."""
 
     def one(*values: float) -> float | None:
         try:
@@ -277,9 +276,9 @@ def _finite(function: Callable[..., float]) -> Callable[..., float | None]:
 
 
 def _each(one: Callable[..., float | None]) -> Callable[..., Any]:
-    """The columns of a function that is computed of each value by itself.
+    """Return a column function that computes each value separately.
 
-    numpy's own functions differ in the last bit from those of the C library, which Python and the database use.
+    Functions of numpy differ in the last bit from the C library, which Python and the database use.
     """
 
     def of_columns(*values: Any) -> tuple[Any, Any]:
@@ -293,13 +292,13 @@ def _each(one: Callable[..., float | None]) -> Callable[..., Any]:
 
 
 def _computed(sql: str, function: Callable[..., float]) -> Operator:
-    """An operator that is a function of :mod:`math`, unknown where its value is no finite number."""
+    """Return an operator from a function of :mod:`math`. It is unknown if the result is not finite."""
     one = _finite(function)
     return _strict(sql, one, _each(one), partial=True)
 
 
 def _rounded(a: float) -> float:
-    """Halves go away from zero, as in SQL."""
+    """Round to an integer, with halves away from zero, as in SQL."""
     return math.copysign(math.floor(abs(a) + 0.5), a)
 
 
@@ -313,7 +312,7 @@ def _float32_columns(numbers: Any) -> tuple[Any, Any]:
 
 
 def microseconds(seconds: float) -> float:
-    """Round a time to whole microseconds; halves go away from zero."""
+    """Round a time in seconds to whole microseconds, with halves away from zero."""
     return _rounded(seconds * 1e6) / 1e6
 
 
@@ -330,7 +329,7 @@ def _greatest(*values: Any) -> Any:
 
 
 def _ufunc(name: str) -> Callable[..., Any]:
-    """A function of numpy by its name: most questions end without numpy, which takes long to import."""
+    """Return a numpy function by name, imported on first use because the import is slow."""
 
     def of_columns(*values: Any) -> Any:
         return getattr(np, name)(*values)
@@ -339,7 +338,7 @@ def _ufunc(name: str) -> Callable[..., Any]:
 
 
 def _of_texts(name: str) -> Callable[..., Any]:
-    """A function of texts of ``numpy.char`` by its name."""
+    """Return a text function of ``numpy.char`` by name."""
     return lambda *values: getattr(np.char, name)(*map(_texts, values))
 
 
@@ -372,7 +371,7 @@ def _ruled(
     *,
     infix: bool = False,
 ) -> Operator:
-    """An operator that is given unknown operands too; ``one`` asks for them one after the other."""
+    """Return an operator that also handles unknown operands. ``one`` reads its operands lazily."""
 
     def of_one(parts: Sequence[Callable[[Any], Any]]) -> Callable[[Any], Any]:
         return lambda at: one(part(at) for part in parts)
@@ -478,7 +477,7 @@ def _is_member_columns(parts: Sequence[Column]) -> Column:
     )
 
 
-# ``CASE``: its operands are condition and value of each branch, then what it is otherwise.
+# ``CASE``: the operands are condition and value of each branch, then the value of ``ELSE``.
 
 
 def _case(parts: Sequence[str]) -> str:
@@ -506,7 +505,7 @@ def _chosen_columns(parts: Sequence[Column]) -> Column:
         known = True
         if value.known is not True or found.known is not True:
             known = np.where(true, value.known, found.known)
-        # NULL has no type of its own.
+        # NULL has no type.
         one = found.values if value.known is False else value.values
         other = value.values if found.known is False else found.values
         found = Column(np.where(true, one, other), known)
@@ -621,7 +620,7 @@ ROUNDINGS: Final[Mapping[str, Callable[[float], float | None]]] = {
     "float32": float32,
     "microseconds": microseconds,
 }
-"""Operators that round a side of a comparison, in :mod:`~sgstore.lang._precision`; no query can name them."""
+"""Operators that round a side of a comparison, in :mod:`~sgstore.lang._precision`. Queries cannot use them."""
 
 INFIX: Final = frozenset(word for word, one in OPERATORS.items() if one.infix)
 
@@ -629,4 +628,4 @@ COMPILER_SQL: Final = {
     "name": _sql("{0} || ' ' || CAST({1} AS VARCHAR)"),
     "whose": _sql("CASE WHEN {0} IS NOT NULL THEN ({1}, {0}) END"),
 }
-"""SQL of operations that the compiler makes, and no query can say."""
+"""SQL of operations that only the compiler creates."""

@@ -1,12 +1,10 @@
-"""The parser: an LALR(1) table parser and its tables.
+"""Parser of the query language, with prepared LALR(1) tables.
 
-From ``grammar.lark`` to the tables that parse, once, so that a query does not pay for it.
+Lark needs about 200 ms to compute the tables of ``grammar.lark``. They are stored in ``grammar.json``, with
+the digest of the grammar, and load in 6 ms. If the file is missing or outdated, the tables are computed again
+in memory.
 
-Lark needs about 200 ms to read the grammar and work out its LALR(1) tables. They are plain data, so they
-are kept beside the grammar in ``grammar.json`` with the digest of the text they were made from, and load in
-6 ms. If the file is missing or stale, the tables are made again in memory: slower, never wrong.
-
-Written by ``python -m sgstore.lang._parse``; a test says so when it is due.
+``python -m sgstore.lang._parse`` writes the file. A test fails if the file is outdated.
 """
 
 from __future__ import annotations
@@ -37,13 +35,13 @@ _WORD: Final = re.compile(r"\w")
 
 @dataclass(frozen=True, slots=True)
 class Terminal:
-    """A terminal: what it looks like in a text.
+    """Terminal symbol of the grammar, with its literal or pattern.
 
     Attributes
     ----------
     name : str
     literal : str
-        In capitals; empty if it is a pattern.
+        Text in capitals; empty if the terminal is a pattern.
     pattern : re.Pattern or None
     priority : int
         Decides between terminals that match the same text.
@@ -55,7 +53,7 @@ class Terminal:
     priority: int
 
     def length_at(self, text: str, start: int) -> int:
-        """Return the length of the match at ``start``; 0: none. Words match as a whole."""
+        """Return the length of the match at ``start``, or 0 without a match. Words must match as a whole."""
         if self.pattern is None:
             end = start + len(self.literal)
             length = len(self.literal) if text[start:end].upper() == self.literal else 0
@@ -69,20 +67,20 @@ class Terminal:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """A rule of the grammar, as it is reduced.
+    """Grammar rule, as the parser reduces it.
 
     Attributes
     ----------
     origin, name : str
-        The symbol that it makes, and the name of what is built.
+        The symbol that the rule produces, and the name of the builder.
     size : int
         Number of symbols.
     keep : tuple of bool
-        Whether each symbol is a child of what is built.
+        For each symbol: true if it is passed to the builder as a child.
     absent : tuple of int
-        How many absent children stand before each symbol and after the last; empty if none do.
+        Number of absent children before each symbol and after the last; empty if there are none.
     inline : bool
-        Whether an only child stands for itself.
+        True if a single child is returned without a builder.
     """
 
     origin: str
@@ -95,7 +93,7 @@ class Rule:
 
 @dataclass(frozen=True, slots=True)
 class Tables:
-    """An LALR(1) parser as data.
+    """Tables of an LALR(1) parser.
 
     Attributes
     ----------
@@ -104,7 +102,7 @@ class Tables:
     states : tuple of dict
         For each state, symbol → action: ``n >= 0`` goes to state n, ``-1 - n`` reduces rule n.
     start, end : int
-        The first state, and the one that has seen everything.
+        The first state and the final state.
     """
 
     terminals: dict[str, Terminal]
@@ -116,7 +114,7 @@ class Tables:
 
 @cache
 def tables() -> Tables:
-    """The tables of the grammar that is shipped."""
+    """Return the tables of the bundled grammar."""
     folder = resources.files("sgstore.lang")
     grammar = folder.joinpath(GRAMMAR).read_text(encoding="utf-8")
     kept = folder.joinpath(TABLES)
@@ -127,14 +125,14 @@ def tables() -> Tables:
 
 
 def keywords() -> list[str]:
-    """Words of the language that are written in capitals, in the order of the alphabet."""
+    """Return the keywords of the language in alphabetical order."""
     terminals = tables().terminals.values()
     written = [one.pattern.pattern if one.pattern else one.literal for one in terminals]
     return sorted({word for text in written for word in re.findall("[A-Z]{2,}", text)})
 
 
 def made_from(grammar: str) -> dict[str, Any]:
-    """The tables of a grammar as plain data, fit for JSON; the same text gives the same tables."""
+    """Return the tables of a grammar as JSON data. The same grammar always gives the same tables."""
     from lark import Lark
     from lark.grammar import Rule as LarkRule
     from lark.lexer import TerminalDef
@@ -172,7 +170,7 @@ def made_from(grammar: str) -> dict[str, Any]:
 
 
 def _walk(states: dict[int, dict[str, int]], start: int) -> dict[int, int]:
-    """States in an order that depends on the grammar only; lark's own numbers change from run to run."""
+    """Return new state numbers that depend only on the grammar. The numbers of lark change from run to run."""
     order = {start: 0}
     waiting = [start]
     while waiting:
@@ -236,7 +234,7 @@ def _digest(grammar: str) -> str:
 
 
 def text_of(plain: dict[str, Any]) -> str:
-    """The tables as JSON, one state a line."""
+    """Return the tables as JSON text, with one state on each line."""
     states = ",\n".join(json.dumps(state, separators=(",", ":")) for state in plain["states"])
     rest = {key: value for key, value in plain.items() if key != "states"}
     return f'{json.dumps(rest, separators=(",", ":"))[:-1]},\n"states":[\n{states}\n]}}\n'
@@ -249,14 +247,14 @@ if __name__ == "__main__":
 
 
 # Text → syntax tree: an LALR(1) parser that runs the tables of ``grammar.lark`` -----------------
-# The lexer is led by the parser: of the terminals that may stand at a place it takes the longest, so that a
-# word is a keyword only where a keyword may stand. What may stand there is also what an error message says.
+# The parser guides the lexer: the lexer takes the longest of the terminals allowed at a place. So a word is a
+# keyword only where a keyword is allowed. Error messages list the same allowed terminals.
 
 MAX_LENGTH: Final = 100_000
-"""Longest text that is parsed; characters."""
+"""Longest text that the parser accepts; characters."""
 
 MAX_DEPTH: Final = 200
-"""Deepest stack of the parser, so that nesting is bounded before anything recurses."""
+"""Largest stack of the parser. It limits nesting before any recursion."""
 
 _END: Final = "$END"
 _BLANK: Final = re.compile(r"\s+")
@@ -268,7 +266,7 @@ _NEXT: Final = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """A terminal as it was read."""
+    """Token read from the text."""
 
     name: str
     text: str
@@ -285,18 +283,18 @@ class _StackEntry:
 
 
 def parse(text: str) -> tuple[Statement, ...]:
-    """The statements of a text; those of the last short ones are remembered.
+    """Return the statements of a text. The results for recent short texts are cached.
 
     Raises
     ------
     QuerySyntaxError
-        The text is not a sentence of the language.
+        The text does not match the grammar.
     """
     return _parsed_once(text) if len(text) <= _SHORT else _parsed(text)
 
 
 _SHORT: Final = 4_000
-"""Longest text whose statements are remembered; characters."""
+"""Longest text whose statements are cached; characters."""
 
 
 @lru_cache(maxsize=64)
@@ -320,21 +318,21 @@ def _parsed(text: str) -> tuple[Statement, ...]:
 
 
 def joined(texts: Sequence[str]) -> str:
-    """The statements of several texts as one text, which one text alone is already.
+    """Join the statements of several texts into one text. A single text is returned unchanged.
 
     Raises
     ------
     QuerySyntaxError
-        One of them is not a sentence of the language.
+        One of the texts does not match the grammar.
     """
     if len(texts) == 1:
         return texts[0]
     written = (text[s.span.start : s.span.end] for text in texts for s in parse(text))
-    return "\n;\n".join(written)  # on lines of their own, as a statement may end in a comment
+    return "\n;\n".join(written)  # on separate lines, because a statement may end in a comment
 
 
 def _read(machine: Tables, stack: list[_StackEntry], text: str, position: int) -> Token:
-    """The next token of those that may stand after the stack."""
+    """Return the next token that is allowed after the stack."""
     actions = machine.states[stack[-1].state]
     allowed = [machine.terminals[name] for name in actions if name in machine.terminals]
     while True:
@@ -343,7 +341,7 @@ def _read(machine: Tables, stack: list[_StackEntry], text: str, position: int) -
         best = max(allowed, key=partial(_rank, text, position), default=None)
         edge = _reads_as_edge(text, position, actions)
         comment = None if edge else _COMMENT.match(text, position)
-        # Between nodes two dashes are an edge; in an expression they begin a comment.
+        # Between nodes, two dashes are an edge. In an expression, they begin a comment.
         signs = comment is not None and best is not None and best.name == "SIGN"
         if best and not signs and (length := best.length_at(text, position)):
             span = TextSpan(position, position + length)
@@ -357,7 +355,7 @@ def _read(machine: Tables, stack: list[_StackEntry], text: str, position: int) -
 
 
 def _reads_as_edge(text: str, position: int, actions: Mapping[str, int]) -> bool:
-    """Tell whether two dashes are meant as an edge, so that the rest is not taken for a comment."""
+    """True if two dashes at this place are an edge, and not the start of a comment."""
     if text.startswith("-->", position):
         return True
     behind = text[position - 1 : position] == ")" or text.startswith("--[", position)
@@ -372,12 +370,12 @@ _CLOSING: Final = "RPAR"
 
 
 def _take(machine: Tables, stack: list[_StackEntry], token: Token, text: str) -> None:
-    """Reduce whatever ends before the token, then put it on the stack."""
+    """Reduce all rules that end before the token, then push the token."""
     before = [*stack]
     while True:
         action = machine.states[stack[-1].state].get(token.name)
         if action is None:
-            # What closes brackets around steps ends all that is open, even where there are none.
+            # A closing bracket reduces all open rules, even without an opening bracket.
             shown = before if token.name == _CLOSING else stack
             raise _unexpected(machine, shown, text, token.span.start)
         if action >= 0:
@@ -395,7 +393,7 @@ def _reduce(machine: Tables, stack: list[_StackEntry], rule: Rule, text: str) ->
     first = len(stack) - rule.size
     parts = stack[first:]
     del stack[first:]
-    end = stack[-1].span.end  # of what comes before, for a part that is empty
+    end = stack[-1].span.end  # the end of the previous part, used for an empty part
     span = TextSpan(parts[0].span.start, parts[-1].span.end) if parts else TextSpan(end, end)
     value = _built(rule, _children(rule, parts), span, text)
     state = machine.states[stack[-1].state][rule.origin]
@@ -403,7 +401,7 @@ def _reduce(machine: Tables, stack: list[_StackEntry], rule: Rule, text: str) ->
 
 
 def _children(rule: Rule, parts: list[_StackEntry]) -> list[Any]:
-    """Return the parts of a rule: without mere signs, repetitions spread out, absent parts as ``None``."""
+    """Return the children of a rule: no signs, flattened repetitions, ``None`` for absent parts."""
     children: list[Any] = []
     for index, part in enumerate(parts):
         if rule.absent:
@@ -452,7 +450,7 @@ _LATER: Final = frozenset(
     }
     | {"_ARROW", "_GROUP", "HAVING", "OPTIONAL", "PATH_NAME", "SKIP", "UNION", "WITH"}
 )
-"""What is not proposed, lest the list be long: what concerns time, and other words for what is proposed."""
+"""Terminals left out of suggestions to keep the list short: temporal words and synonyms."""
 
 _STARTS: Final = frozenset({"NUMBER", "STRING", "PARAM", "TRUTH", "NULL", "EXISTS"})
 _SAID: Final = {
@@ -475,7 +473,7 @@ _SAID: Final = {
     "BOUND": ("a bound such as [0s, 2s]",),
     _END: ("the end",),
 }
-"""Terminals in words."""
+"""Descriptions of terminals."""
 
 _MANY: Final = 8
 _LONGEST: Final = 40
@@ -496,7 +494,7 @@ def _unexpected(
 
 
 def _shown(found: str) -> str:
-    """Return a part of the text for a message, short and with all characters visible."""
+    """Return a part of the text for a message, shortened and with all characters visible."""
     if not found.isprintable():
         return " ".join(f"U+{ord(character):04X}" for character in found[:8])
     short = found if len(found) <= _LONGEST else f"{found[:_LONGEST]}…"
@@ -504,7 +502,7 @@ def _shown(found: str) -> str:
 
 
 def _leads_on(machine: Tables, stack: list[_StackEntry], name: str) -> bool:
-    """Tell whether the parser would accept the terminal after all reductions that it brings about."""
+    """True if the parser would accept the terminal after all pending reductions."""
     states = [entry.state for entry in stack]
     while (action := machine.states[states[-1]].get(name)) is not None:
         if action >= 0:
@@ -518,10 +516,10 @@ def _leads_on(machine: Tables, stack: list[_StackEntry], name: str) -> bool:
 
 
 def _listed(machine: Tables, names: list[str]) -> str:
-    """Return the expected terminals in words; operators, and beginnings of values, count as one."""
+    """Return the expected terminals in words. Operators are grouped, and so are starts of values."""
     left = set(names) - _LATER or set(names)
     said: list[str] = []
-    if "RETURN" in left:  # a second MATCH may stand wherever RETURN may
+    if "RETURN" in left:  # a second MATCH is allowed wherever RETURN is
         left -= {"MATCH"}
     if left >= _EDGES:
         said.append("an edge")

@@ -1,11 +1,11 @@
-"""Questions that are asked of parts of a collection, and statements that make one answer of theirs.
+"""Queries for the parts of a collection, and SQL that merges their answers.
 
-A trace is in one part. So rows, intervals and clips of the whole are those of the parts, and only their order,
-and how many are wanted, need a second look: each row comes with *hidden* columns, named ``:0``, ``:1``, …, by
-which one store would have ordered it. What is counted or summed is so in each part, group by group, and once
-more over the parts; what is to be distinct comes from each part as a set.
+A trace is in one part. So the rows, intervals and clips of the collection are those of its parts. Only their
+order and their number must be adjusted. Each row has *hidden* columns, named ``:0``, ``:1``, …, which hold
+the sort keys of a single store. Counts and sums are computed in each part, group by group, and then over the
+parts. Distinct values come from each part as a set.
 
-The statements speak of tables ``parts``, ``parts 1``, …, one for each question that a part is asked.
+The merging statements use the tables ``parts``, ``parts 1``, …, one for each query sent to the parts.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ if TYPE_CHECKING:
     from sgstore.lang._catalog import Triple
 
 PARTS: Final = "parts"
-"""The table with the answers to the first question; the others have a number behind it."""
+"""Table with the answers to the first query. The other tables have a number after this name."""
 
 LOG_TIME_COLUMN: Final = ":log_time_ns"
 
@@ -74,7 +74,7 @@ _LOG_TIME: Final = FrameAttribute(FRAME_ATTRIBUTES["logtimens"], Type.number)
 _TRACE_NAME: Final = TraceAttribute(TRACE_ATTRIBUTES["name"], Type.text)
 
 _WITNESSES: Final = 32
-"""Sets of triples and kinds that suffice for a match, which are remembered."""
+"""Largest number of remembered sets of triples and kinds that are sufficient for a match."""
 
 Terms = list[str]
 """Expressions of an ``ORDER BY``."""
@@ -82,16 +82,17 @@ Terms = list[str]
 
 @dataclass(frozen=True, slots=True)
 class Parted:
-    """A question as parts are asked it, and as their answers are merged.
+    """Queries sent to each part, and the merging of their answers.
 
     Attributes
     ----------
     queries : tuple of Query
-        Asked of each part; the answers to the first are the table ``parts``, to the second ``parts 1``, ….
+        Queries sent to each part. The answers to the first are in table ``parts``, to the second in ``parts
+        1``, ….
     columns : tuple of str
-        Of the merged rows.
+        Columns of the merged rows.
     merge : function
-        Given the catalog of the whole and the values of the statement: the statement over these tables.
+        Function from the catalog of the collection and the bound values to the merging statement.
     """
 
     queries: tuple[Query, ...]
@@ -99,7 +100,7 @@ class Parted:
     merge: Callable[[Catalog, BoundValues], str]
 
     def compiled(self, whole: Compiled) -> tuple[Compiled, ...]:
-        """The questions, compiled against the catalog that a query was compiled against."""
+        """Return the queries, compiled against the catalog of a compiled query."""
         found: list[Compiled] = []
         for query in self.queries:
             ready = query if query.steps else rewritten(query, whole.catalog)
@@ -107,30 +108,30 @@ class Parted:
         return tuple(found)
 
     def statement(self, catalog: Catalog) -> tuple[str, tuple[Any, ...]]:
-        """The statement that merges, with the values that it binds."""
+        """Return the merging SQL statement and the values that it binds."""
         values = BoundValues()
         text = self.merge(catalog, values)
         return text, tuple(values.items)
 
 
 def parted(compiled: Compiled, form: str = "rows", before: int = 0, after: int = 0) -> Parted:
-    """A query as parts of a collection are asked it.
+    """Return the queries for the parts of a collection, and the merging of their answers.
 
     Parameters
     ----------
     compiled : Compiled
-        Against the whole, or against a part: the questions are the same.
+        Query compiled against the collection or against a part. The result is the same.
     form : str
-        ``rows``: what the query asks for; ``apart``: the same, with columns that tell nodes of several traces
-        apart which have the same number; or, whatever ``RETURN`` says, ``frames``, ``intervals``, ``bound``
-        (intervals of bindings), ``clips`` or ``subgraphs``.
+        ``rows``: the result of the query; ``apart``: the same, with extra columns that distinguish nodes of
+        different traces with the same id. Other forms replace the ``RETURN``: ``frames``, ``intervals``,
+        ``bound`` (intervals of bindings), ``clips`` or ``subgraphs``.
     before, after : int
-        What is added to clips at both ends, unless the query says it; ns.
+        Time added to clips at both ends, unless the query has offsets; ns.
 
     Raises
     ------
     QueryError
-        No rule says how answers to it are merged.
+        No rule exists for merging the answers.
     """
     query = compiled.whole
     _refuse_strange(query.result)
@@ -166,17 +167,17 @@ MERGED: Final = frozenset(
         *("skip", "limit", "before", "after", "keyed"),
     }
 )
-"""What a :class:`Result` may say: how the answers of parts are merged is known of these."""
+"""Fields of :class:`Result` with a rule for merging the answers of parts."""
 
 SUMMED: Final = frozenset({"count", "sum", "min", "max", "avg"})
-"""Aggregates whose numbers of parts are merged."""
+"""Aggregates that are computed in each part and then merged."""
 
 LISTED: Final = frozenset({"stddev", "median", "percentile", "collect"})
-"""Aggregates for which parts give all the values."""
+"""Aggregates for which each part returns all values."""
 
 
 def _refuse_strange(result: Result) -> None:
-    """Refuse what no rule of merging speaks of: a new clause must not be answered wrongly."""
+    """Reject a result with a field that has no merging rule, to avoid wrong answers."""
     for one in fields(result):
         if one.name not in MERGED and getattr(result, one.name) != one.default:
             raise QueryError(
@@ -186,7 +187,7 @@ def _refuse_strange(result: Result) -> None:
 
 
 def _frames(query: Query) -> Query:
-    """A query for the frames that match with their log times; of limited rows, for the frame of each."""
+    """Return a query for the matching frames with log times. With ``LIMIT``: the frame of each row."""
     result, time = query.result, ReturnColumn(LOG_TIME_COLUMN, _LOG_TIME)
     if not result.chooses or result.form != "rows" or result.aggregated:
         return replace(query, result=Result(whole=False, framed=True, columns=(time,)))
@@ -207,20 +208,21 @@ def _intervals(query: Query, *, graphs: bool) -> Query:
 
 
 class Pruning:
-    """Tells of a query whether a part may have an answer, by the triples and kinds that it holds.
+    """Filter of the parts of a collection that may answer a query, by their triples and kinds.
 
-    It is the compiler's own narrowing: a pattern that becomes false for what a part holds has no match there.
+    The filter uses the narrowing of the compiler: a pattern that becomes false for the content of a part has
+    no match there.
 
     Parameters
     ----------
     compiled : Compiled
-        Against the whole.
+        Query compiled against the collection.
 
     Notes
     -----
-    Triples that no edge of the pattern may be change nothing about it. Without them most parts look alike, and
-    what was decided for one is decided for all of these. What is more never takes a match away, so a part that
-    has all that sufficed elsewhere is decided by one comparison.
+    Triples that no edge of the pattern can have are ignored. Then most parts look alike, and one decision is
+    valid for all of them. Extra content never removes a match. So one comparison accepts a part that has all
+    the content that was sufficient in another part.
     """
 
     def __init__(self, compiled: Compiled) -> None:
@@ -239,18 +241,18 @@ class Pruning:
         ]
 
     def matters(self, triple: Triple) -> bool:
-        """Tell whether an edge of the pattern may be such a triple."""
+        """True if an edge of the pattern can have this triple."""
         return any(True for of in self._edges for _ in possible(*of, (triple,)))
 
     def may_answer(self, held: frozenset[Triple], kinds: Sequence[frozenset[str]]) -> bool:
-        """Tell whether a part may have a match.
+        """True if a part may have a match.
 
         Parameters
         ----------
         held : frozenset of Triple
-            The triples that occur in the part, of those that matter.
+            The relevant triples that occur in the part.
         kinds : sequence of frozenset
-            Kinds that move, that are fixed, and those of the map.
+            Moving kinds, fixed kinds and map kinds of the part.
         """
         every = held.union(*kinds)
         known = self._known.get(every)
@@ -264,7 +266,7 @@ class Pruning:
         return known
 
     def _possible(self, every: frozenset[Any]) -> bool:
-        """Tell whether there may be a match where such triples and kinds occur."""
+        """True if a match is possible with these triples and kinds."""
         triples = [one for one in every if isinstance(one, tuple)]
         return any(
             all(s.where != (FALSE,) and kinds_left(s, triples, every) is not None for s in scopes)
@@ -272,7 +274,7 @@ class Pruning:
         )
 
     def _least(self, every: frozenset[Any]) -> frozenset[Any]:
-        """Triples and kinds without any of which there would be no match: who has them may have one."""
+        """Return a minimal set of triples and kinds with which a match is still possible."""
         for one in every:
             if self._possible(every - {one}):
                 every -= {one}
@@ -281,17 +283,17 @@ class Pruning:
 
 @dataclass(frozen=True, slots=True)
 class ClassQuestion:
-    """Classes of frames that a query speaks of, and that all parts have to tell.
+    """Frame classes used by a query, which must be collected from all parts.
 
     Attributes
     ----------
     abstraction : str
     dataset : str
-        Whose classes are wanted; empty: how many frames each class has, of all.
+        Dataset with the required classes. Empty means the number of frames of each class in all traces.
     traces : tuple of int
-        Those of the dataset.
+        Traces of the dataset.
     table : str
-        The table of single frames that it is; empty if it is one of traces.
+        Table of single frames of the dataset; empty for a dataset of traces.
     """
 
     abstraction: str
@@ -301,7 +303,7 @@ class ClassQuestion:
 
 
 def class_questions(asked: Query | BoundCheck) -> tuple[ClassQuestion, ...]:
-    """The classes of frames that a query or a check speaks of, bound against the whole; each once."""
+    """Return the frame classes that a query or a check uses, without duplicates."""
     if isinstance(asked, BoundCheck):
         values = [asked.formula, *(q.where for q in asked.quantifiers if q.where is not None)]
         values += [*asked.scope.where, *([] if asked.reset is None else [asked.reset])]
@@ -329,7 +331,7 @@ def _class_questions(values: Iterable[Bound]) -> Iterator[ClassQuestion]:
             yield ClassQuestion(column, dataset, attribute.traces, attribute.table)
 
 
-# Rows: in the order of the query, or else of traces, frames and bindings --------------------------
+# Rows: in the order of the query, otherwise ordered by trace, frame and binding --------------------------
 
 
 def _parted_rows(query: Query) -> Parted:
@@ -356,13 +358,13 @@ def _parted_rows(query: Query) -> Parted:
 
 
 Placed = tuple[Terms, Terms, str]
-"""Names of rows, the keys of their order, and the column of their frames."""
+"""Column names of rows, their sort keys, and the column of their frames."""
 
 
 def _chosen(result: Result, select: Select, placed: Placed, pers: tuple[Terms, Terms]) -> str:
-    """The rows of a statement that a query wants, in their order.
+    """Return the SQL for the sorted, sampled and limited rows of a statement.
 
-    ``pers``: the columns of whose values samples are taken, and those of whose values the first ones are.
+    ``pers``: the ``PER`` columns of ``SAMPLE`` and those of ``LIMIT … PER``.
     """
     (names, keys, frame), (per, top_per) = placed, pers
     tops = [f'":top {number}"' for number in range(len(top_per))]
@@ -381,9 +383,10 @@ def _chosen(result: Result, select: Select, placed: Placed, pers: tuple[Terms, T
 
 
 def _of_part(result: Result) -> Result:
-    """Columns that a part is asked for, so that all is there that the whole may choose.
+    """Return the result clause for a part, with enough rows for the final selection.
 
-    A sample of a part may have rows that the sample of the whole has not: so many rows of it are not enough.
+    A sample of one part can differ from the sample of the collection, so a limited number of its rows is not
+    enough.
     """
     if result.sample is not None:
         return replace(result, top=None, skip=0, limit=None)
@@ -395,9 +398,9 @@ def _of_part(result: Result) -> Result:
 
 
 def _bindings(query: Query, hidden: _Hidden) -> Terms:
-    """Order of rows of one frame: by the nodes and edges that a match is told apart by.
+    """Return sort keys for the rows of one frame: the nodes and edges that identify a match.
 
-    A store has relations in the order of its enumeration, and tells them as texts.
+    A store sorts relations by their enumeration, but returns them as texts.
     """
     roles = {"named"} if query.result.whole else {"named", "unnamed"}
     nodes = sorted(key for key, node in query.scope.nodes.items() if node.role in roles)
@@ -410,7 +413,7 @@ def _bindings(query: Query, hidden: _Hidden) -> Terms:
 
 
 def _per(result: Result, chosen: Sampling | None, hidden: _Hidden) -> Terms:
-    """The columns of whose values rows are chosen."""
+    """Return the columns that group the rows for ``SAMPLE`` or ``LIMIT … PER``."""
     if chosen is None or chosen.per is None:
         return []
     value = _value_of(result, chosen.per)
@@ -421,27 +424,27 @@ def _per(result: Result, chosen: Sampling | None, hidden: _Hidden) -> Terms:
 
 
 def _value_of(result: Result, per: Bound | str) -> Bound | str:
-    """The value of a column that is named, if it is one of the query's own."""
+    """Return the value of a named result column. Other values are returned unchanged."""
     if not isinstance(per, str):
         return per
     return next((column.value for column in result.columns if column.name == per), per)
 
 
 class _Hidden:
-    """Columns that rows have beside those that are shown."""
+    """Hidden columns of rows, in addition to the shown columns."""
 
     def __init__(self, first: int = 0) -> None:
         self.columns: list[ReturnColumn] = []
         self._numbers = count(first)
 
     def add(self, value: Bound) -> str:
-        """A column with a value; its name, quoted."""
+        """Add a hidden column with a value, and return its quoted name."""
         column = ReturnColumn(f":{next(self._numbers)}", value)
         self.columns.append(column)
         return quoted(column.name)
 
     def key(self, value: Bound | str) -> str:
-        """The column of a key, quoted: that of the result, if it is the name of one."""
+        """Return the quoted column of a sort key: a result column, or a new hidden column."""
         return quoted(value) if isinstance(value, str) else self.add(value)
 
 
@@ -460,7 +463,7 @@ def _parted_intervals(query: Query) -> Parted:
         first = quoted(FIRST)
         keys = [*own, frame_key(select, first, catalog, None, values)]
         keys += [quoted(column.name) for column in result.columns]
-        keys.append(quoted("end_ns"))  # several of a sequence may begin in one frame
+        keys.append(quoted("end_ns"))  # several matches of a sequence may begin in one frame
         pers = (
             _per_of_intervals(result, result.sample, OWNER_KEY),
             _per_of_intervals(result, result.top, TOP_OWNER),
@@ -513,9 +516,9 @@ def _in_names(
     bound: tuple[Catalog, BoundValues],
     owners: Mapping[str, str],
 ) -> str:
-    """Rows in the order of a query, then of their columns, names of traces as people count.
+    """Return SQL for rows sorted by query order, then by columns. Trace names sort by number.
 
-    ``owners``: the columns that say whose the nodes of a column are.
+    ``owners``: the columns with the owners of the nodes in a column.
     """
     catalog, values = bound
     names = list(map(quoted, visible))
@@ -532,11 +535,11 @@ def _in_names(
 
 
 class _Grouping:
-    """A query that counts or sums over matches, for parts.
+    """Parts of an aggregating query over a collection.
 
-    What a part is asked first has a column for each value by which rows are grouped, and for each number of a
-    group one or two that can be added up. A number of *different* values is a question of its own, whose answer
-    is the set of them for each group; and one for which all values are wanted is one, too, with a row a match.
+    The first query for a part has a column for each grouping value, and one or two summable columns for each
+    aggregate. An aggregate over *distinct* values needs its own query, which returns the set of values for
+    each group. An aggregate over all values needs its own query too, with one row for each match.
     """
 
     def __init__(self, query: Query) -> None:
@@ -564,7 +567,7 @@ class _Grouping:
             name = key.value if isinstance(key.value, str) else f":order {i}"
             own.append(directed(quoted(name), key.descending))
         having = None if result.having is None else self._text(result.having)
-        if not self._partial:  # a part says which groups it has
+        if not self._partial:  # the part must return its groups
             self._part(Aggregate("count", None, distinct=False, type=Type.number))
         columns = (*self._groups.columns, *self._partial)
         first = Result(columns=columns, whole=False)
@@ -589,7 +592,7 @@ class _Grouping:
         return self._text(column.value)
 
     def _text(self, value: Bound) -> Bound:
-        """A value with leaves in place of the numbers of its groups, and of what tells these apart."""
+        """Replace aggregates and grouping values by columns of the merged parts."""
         match value:
             case GroupKey(name=name):
                 return EdgeRelation(self._keys[name])
@@ -599,7 +602,7 @@ class _Grouping:
                 return with_operands(value, self._text)
 
     def _number(self, number: Aggregate) -> str:
-        """The SQL of a number of a group, of the columns of the parts."""
+        """Return the SQL of an aggregate, computed from columns of the parts."""
         if number not in self._known:
             self._known[number] = self._merged(number)
         return self._known[number]
@@ -632,7 +635,7 @@ class _Grouping:
         return name
 
     def _each(self, number: Aggregate) -> str:
-        """The column with a number of a group that is made of all its values, or of the different ones."""
+        """Return the column of an aggregate that needs all values, or all distinct values."""
         assert number.operand is not None  # noqa: S101 - COUNT(*) alone has none
         hidden = _Hidden(2_000)
         value = hidden.add(number.operand)
@@ -665,7 +668,7 @@ class _Grouping:
         return name
 
     def _every(self, catalog: Catalog, values: BoundValues) -> str:
-        """The rows of all parts: groups with their numbers, and with what is made of all values in them."""
+        """Return the SQL of the rows of all parts: partial aggregates, and aggregates over all values."""
         rows = [Select(["*"], [quoted(PARTS)]).text()]
         rows += [text(catalog, values) for _, text in self._more]
         return "\nUNION ALL BY NAME\n".join(f"({text})" for text in rows)
@@ -675,7 +678,7 @@ _PLACE: Final = '":place"'
 
 
 def _sql(value: Bound, values: BoundValues) -> str:
-    """An expression about groups, whose leaves are columns already."""
+    """Return the SQL of an expression whose leaves are already columns."""
 
     def leaf(found: Any) -> str:
         return found.edge

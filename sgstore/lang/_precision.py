@@ -1,12 +1,12 @@
-"""Precision of values: a number is compared as precisely as the store keeps the other side.
+"""Precision of comparisons: a number is rounded to the precision that the store has for the other side.
 
 The store keeps most attributes of nodes and edges in 32 bits, so a car whose width is 1.8 m has the width
-1.7999999523162842. A number that is compared with such a value is rounded to 32 bits first. Times since the
+1.7999999523162842. The compared number is rounded to 32 bits first. Times since the
 start of a trace count whole microseconds, because clocks of simulators lose the last nanosecond.
 
 Notes
 -----
-A constant is rounded once, here. Another value is rounded by an operator of its own, which each engine has.
+A constant is rounded once, here. Other values are rounded by an operator that each engine has.
 Values of pairs of entities, positions and sums are computed in 64 bits and compared as they are.
 """
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Precision(Enum):
-    """How a value is rounded before it is compared; the value is the word of the operator."""
+    """Rounding of a value before it is compared. The member value is the name of the operator."""
 
     float32 = "float32"
     microseconds = "microseconds"
@@ -36,16 +36,16 @@ _CONVERTED: Final = frozenset({DisplayUnit.degrees, DisplayUnit.along})
 """Units of numbers that are computed from 32-bit columns of one row."""
 
 _SAME: Final = frozenset({"abs", "negative", "min", "max", "coalesce", "case"})
-"""Operators whose value is one of their operands, but for its sign."""
+"""Operators that return one of their operands, apart from the sign."""
 
 _CHOSEN: Final = frozenset({"min", "max", "first", "last", "median", "percentile", "avg"})
-"""Functions of many values whose value lies among these."""
+"""Functions of many values. The result lies between the smallest and the largest value."""
 
 _OVER_TIME: Final = frozenset({"prev", "min_over", "max_over", "avg_over"})
 
 
 def precision_of(value: b.Bound) -> Precision | None:
-    """Return the precision with which a value is known; ``None`` if it is computed in 64 bits."""
+    """Return the precision of a value. ``None`` means that it is computed in 64 bits."""
     if value.type is not Type.number:
         return None
     match value:
@@ -63,7 +63,7 @@ def precision_of(value: b.Bound) -> Precision | None:
 
 
 def _of_whole(attribute: Attribute) -> Precision | None:
-    """Return the precision of an attribute of a frame or a trace, or of a value that is passed on."""
+    """Return the precision of an attribute of a frame or trace, or of a value passed by ``WITH``."""
     if attribute.precision:
         return Precision(attribute.precision)
     timed = attribute.unit in {DisplayUnit.seconds, DisplayUnit.span}
@@ -71,7 +71,7 @@ def _of_whole(attribute: Attribute) -> Precision | None:
 
 
 def _of_many(value: b.Bound) -> Precision | None:
-    """Return the precision of a value that is chosen from many."""
+    """Return the precision of a value that is selected from many."""
     match value:
         case b.OverMatch(word="argmin" | "argmax", at=at) if at is not None:
             return precision_of(at)
@@ -88,13 +88,13 @@ def _of_many(value: b.Bound) -> Precision | None:
 
 
 def _common(operands: tuple[b.Bound, ...]) -> Precision | None:
-    """Return the precision of values of which one is chosen: that of all but the constants."""
+    """Return the common precision of alternative values, ignoring constants."""
     found = {precision_of(one) for one in operands if not isinstance(one, b.Value)}
     return found.pop() if len(found) == 1 else None
 
 
 def is_stored(value: b.Bound) -> bool:
-    """True if a value is a number of 32 bits as the store keeps it, or chosen from such numbers."""
+    """True if a value is a 32-bit number from the store, or is selected from such numbers."""
     return precision_of(value) is Precision.float32 and not any(
         _is_computed(part) for part in b.walk(value)
     )
@@ -115,7 +115,7 @@ def _is_computed(part: b.Bound) -> bool:
 
 
 def compared(*sides: b.Bound) -> tuple[b.Bound, ...]:
-    """Round the sides of a comparison to the least precise of them."""
+    """Round the sides of a comparison to the lowest precision among them."""
     known = {precision_of(side) for side in sides} - {None}
     for precision in Precision:
         if precision in known:
@@ -124,7 +124,7 @@ def compared(*sides: b.Bound) -> tuple[b.Bound, ...]:
 
 
 def chosen(value: b.Bound, choices: b.Choices) -> tuple[b.Bound, b.Choices]:
-    """Round a value and the constants of the list in which it is looked for."""
+    """Round a value and the constants of the list in which it is searched."""
     operand, *items = compared(value, *choices.items)
     return operand, b.Choices(tuple(item for item in items if isinstance(item, b.Value)))
 
@@ -141,7 +141,7 @@ def _rounded(value: b.Bound, precision: Precision) -> b.Bound:
 
 
 def _is_exact(value: b.Bound, precision: Precision) -> bool:
-    """True if a value has the precision as the store keeps it."""
+    """True if the stored value already has the given precision."""
     if precision_of(value) is not precision:
         return False
     if isinstance(value, b.Operation) and value.word in {"abs", "negative"}:

@@ -1,7 +1,8 @@
-"""Syntax trees: the function that builds each rule of the grammar.
+"""Builders of the syntax tree: one function for each grammar rule.
 
-A builder is named for its rule (or for the alias of its alternative), takes the span and the children, and
-returns a part of the syntax tree. Signs and keywords are no children; an absent optional part is ``None``.
+A builder has the name of its rule, or of the alias of an alternative. It takes the span and the children and
+returns a part of the syntax tree. Signs and keywords are not passed as children. An absent optional part is
+``None``.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _DURATION: Final = re.compile(r"([\d.]+)\s*(\w+)")
 
 
 class BuildError(Exception):
-    """A sentence of the grammar that the language refuses all the same."""
+    """Text that matches the grammar, but is not valid in the language."""
 
     def __init__(self, reason: str, span: TextSpan | None = None, hint: str | None = None) -> None:
         self.reason = reason
@@ -63,7 +64,7 @@ def _string(span: TextSpan, children: Children) -> s.Constant:
 
 
 def _unquoted(text: str) -> str:
-    r"""Return the text between the quotes; a backslash that escapes nothing stays, as ``\d`` needs."""
+    r"""Return the text between the quotes. Unknown escapes such as ``\d`` keep their backslash."""
     return _ESCAPED.sub(lambda found: _ESCAPES.get(found[1], found[0]), text[1:-1])
 
 
@@ -108,7 +109,7 @@ def _attribute(span: TextSpan, children: Children) -> s.AttributeOf:
 
 
 def _attribute_in(span: TextSpan, children: Children) -> s.AttributeOf:
-    """``frame.class('E')``: another way to write ``frame.class_E``."""
+    """Build ``frame.class('E')``, which means ``frame.class_E``."""
     owner, name, value = children
     if not (isinstance(owner, s.Variable) and owner.name == "frame" and name.text == "class"):
         hint = said_of("methods", name.text) or f"what is called stands first: {name.text}(x)"
@@ -204,7 +205,7 @@ def _when(span: TextSpan, children: Children) -> s.When:
 
 
 def _case(span: TextSpan, children: Children) -> s.Case:
-    """``CASE x WHEN y THEN …`` asks ``x = y`` of each branch."""
+    """Build a ``CASE``. With ``CASE x WHEN y``, each branch has the condition ``x = y``."""
     subject, *branches, otherwise = children
     if subject is not None:
         branches = [
@@ -227,7 +228,7 @@ def _temporal_pair(_: TextSpan, children: Children) -> s.Temporal:
 
 
 def _bound(span: TextSpan, children: Children) -> tuple[Any, Any]:
-    """``[0s, 2s]``, or ``WITHIN 2s``, which begins at once."""
+    """Build a time bound: ``[0s, 2s]``, or ``WITHIN 2s``, which starts at 0."""
     (found,) = children
     if isinstance(found, s.Duration | s.Parameter):
         return s.Duration(0, "s", span), found
@@ -323,7 +324,7 @@ def _repeat_exactly(span: TextSpan, children: Children) -> tuple[int, int]:
 
 
 MAX_EDGES: Final = 10
-"""Longest path that one edge pattern may stand for."""
+"""Longest path that one edge pattern can match, in edges."""
 
 
 def _unbounded(span: TextSpan) -> BuildError:
@@ -368,7 +369,7 @@ def _match_step(span: TextSpan, children: Children) -> s.StepClause:
 
 
 def _further(_: TextSpan, children: Children) -> tuple[Any, Any]:
-    """A second ``MATCH`` about the same frame: its paths and its condition."""
+    """Build a second ``MATCH`` for the same frame: its paths and its condition."""
     paths, where = children
     return paths, where
 

@@ -1,18 +1,18 @@
-"""The library: predicates, concepts, scenarios and properties that have names.
+"""Library of named predicates, concepts, scenarios and properties.
 
-They lie in ``library/*.sgql``. An entry is a head, which is comments, and the text under it::
+The files are ``library/*.sgql``. An entry has a head of comments, followed by the query text::
 
     -- concept low_ttc: The ego and another would meet soon, if both went on as they do.
     -- param limit = 1.5s: the longest time to collision
     -- source: Hayward 1972, Near-Miss Determination Through Use of a Scale of Danger
     MATCH (e:Ego), (v:Vehicle|Person) WHERE ttc(e, v) < $limit
 
-A line that begins with ``--`` and three blanks goes on with the one before; comments behind a text are about
-the file. ``$limit`` stands for the value of the parameter, which has the type of its default: a number, a
-duration, a text, true or false. A text may be one of several, ``'any'|'main'``, the first by default.
-Predicates have no such parameters, and every query may use them by name.
+A line that begins with ``--`` and three spaces continues the previous line. Comments after a text are about
+the file. ``$limit`` is the value of the parameter. Its type is the type of its default: a number, a duration,
+a text, true or false. A text can have several choices, ``'any'|'main'``; the first is the default. Predicates
+have no such parameters. Every query can use them by name.
 
-Files are read when a name is first asked for, and a text is parsed when a query uses it.
+Files are read when a name is first looked up. A text is parsed when a query uses it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 KINDS_OF_PATTERNS: Final = ("predicate", "concept", "scenario", "property")
-"""Conditions with names; patterns that practitioners ask for; scenarios of a benchmark; rules of traffic."""
+"""Named conditions, common patterns, scenarios of a benchmark, and traffic rules."""
 
 LIBRARY: Final = (
     "std",
@@ -51,7 +51,7 @@ LIBRARY: Final = (
     "sceneflow",
     "rules",
 )
-"""Names of the files, in the order in which they are listed."""
+"""Names of the files, in display order."""
 
 _HEAD: Final = re.compile(rf"-- ({'|'.join(KINDS_OF_PATTERNS)}) (\w+): (\S.*)")
 _PARAMETER: Final = re.compile(r"-- param (\w+) = ('[^']*'(?:\|'[^']*')*|[^\s:]+): (\S.*)")
@@ -61,13 +61,13 @@ _MORE: Final = re.compile(r"--   \s*(\S.*)")
 _DURATION: Final = re.compile(r"\d+(\.\d+)?(ms|s|min|frames)")
 _NUMBER: Final = re.compile(r"-?\d+(\.\d+)?")
 _PLACE: Final = re.compile(r"'(?:[^'\\]|\\.)*'|\"(?:[^\"\\]|\\.)*\"|--[^\n]*|\$(\w+)")
-"""Texts in quotes and comments, which stay as they are; and the places of parameters."""
+"""Texts in quotes and comments, which are kept, and parameters, which are replaced."""
 _DRAWING: Final = re.compile(r"^==== (\w+)\n(.*?)(?=^==== |\Z)", re.MULTILINE | re.DOTALL)
 
 
 @dataclass(frozen=True, slots=True)
 class PatternParameter:
-    """A value of a named pattern that can be chosen.
+    """Parameter of a named pattern.
 
     Attributes
     ----------
@@ -75,11 +75,11 @@ class PatternParameter:
     type : str
         ``number``, ``duration``, ``text`` or ``truth``.
     default : str
-        As it stands in a query: ``1.5s``.
+        Default value as written in a query: ``1.5s``.
     meaning : str
-        With its unit.
+        Meaning, with the unit.
     choices : tuple of str
-        Texts of which it is one, as they stand in a query; empty: any value of its type.
+        Allowed texts, as written in a query; empty means any value of the type.
     """
 
     name: str
@@ -89,12 +89,12 @@ class PatternParameter:
     choices: tuple[str, ...] = ()
 
     def written(self, value: object) -> str:
-        """A value as it stands in a query.
+        """Return a value as query text.
 
         Raises
         ------
         QueryError
-            It is of another type, or none of the choices.
+            The value has the wrong type, or is not one of the choices.
         """
         text = _WRITTEN[self.type](value)
         if text is None or (self.choices and text not in self.choices):
@@ -107,22 +107,22 @@ class PatternParameter:
 
 @dataclass(frozen=True, slots=True)
 class NamedPattern:
-    """An entry of the library.
+    """Entry of the library.
 
     Attributes
     ----------
     name, kind : str
-        The kind is one of :data:`KINDS_OF_PATTERNS`.
+        Name, and kind: one of :data:`KINDS_OF_PATTERNS`.
     query : str
-        The text as it stands in the library: parameters are ``$name``.
+        Query text with parameters as ``$name``.
     parameters : mapping of str to PatternParameter
-        By name, in order.
+        Parameters by name, in order.
     sentence : str
-        What it finds, or what has to hold.
+        One sentence: the matches that it finds, or the rule that must hold.
     source : str
-        Where it comes from.
+        Reference to the literature or the origin.
     library : str
-        The file that it stands in, one of :data:`LIBRARY`.
+        Name of the file, one of :data:`LIBRARY`.
     """
 
     name: str
@@ -135,33 +135,33 @@ class NamedPattern:
 
     @property
     def text(self) -> str:
-        """The query, its parameters being what they are by default: what a store can be asked."""
+        """Query text with the default values of all parameters."""
         return self.written()
 
     @property
     def example(self) -> str:
-        """A scene that it holds in, drawn with letters; empty for a predicate."""
+        """Example scene, drawn with letters. Empty for a predicate."""
         return _drawings().get(self.name, "")
 
     @property
     def is_check(self) -> bool:
-        """Tell whether it is a ``CHECK``, which has a verdict, and not a ``MATCH``, which has matches."""
+        """True for a ``CHECK``, which has a verdict. False for a ``MATCH``, which has matches."""
         return self.kind == "property"
 
     def written(self, **values: object) -> str:
-        """The query with parameters chosen.
+        """Return the query text with the given parameter values.
 
         Parameters
         ----------
         **values : number, str or bool
-            Of some of the parameters; a duration is a text such as ``"1.5s"``, or a number of seconds.
+            Values of some parameters. A duration is a text such as ``"1.5s"``, or a number of seconds.
 
         Raises
         ------
         QueryNameError
-            It has no parameter of that name.
+            Unknown parameter name.
         QueryError
-            A value is of another type than its parameter.
+            A value has the wrong type.
         """
         for name in values:
             if name not in self.parameters:
@@ -204,12 +204,12 @@ def _truth(value: object) -> str | None:
 _WRITTEN: Final = {"number": _number, "duration": _duration, "text": _text, "truth": _truth}
 
 
-# What is asked for ------------------------------------------------------------------------------------------
+# Lookup ------------------------------------------------------------------------------------------
 
 
 @cache
 def patterns() -> Mapping[str, NamedPattern]:
-    """Everything in the library by name, in its order."""
+    """Return all entries of the library by name, in library order."""
     folder = resources.files("sgstore.lang").joinpath("library")
     found: dict[str, NamedPattern] = {}
     for library in LIBRARY:
@@ -222,12 +222,12 @@ def patterns() -> Mapping[str, NamedPattern]:
 
 
 def pattern_named(name: str) -> NamedPattern:
-    """A pattern by its name; how it is written matters only where two differ in nothing else.
+    """Return a pattern by name. Case and underscores count only if two names differ in nothing else.
 
     Raises
     ------
     QueryNameError
-        There is none of that name, or there are two.
+        The name is unknown or ambiguous.
     """
     found = patterns()
     if name in found:
@@ -244,26 +244,26 @@ def pattern_named(name: str) -> NamedPattern:
 
 _WORD: Final = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+")
 _STEM: Final = 4
-"""Letters that words of one stem have in common at least: ``brakes``, ``braking``."""
+"""Smallest number of letters that words of one stem share: ``brakes``, ``braking``."""
 
 
 def search(text: str, kinds: Collection[str] = ()) -> list[NamedPattern]:
-    """Entries of the library that some words describe, the best first.
+    """Return library entries that match some words, best match first.
 
     A word counts most in a name, then in a sentence, then in parameters, source and text. Words of one stem
-    are alike, and so are two words for one kind (``pedestrian``, ``person``).
+    match, and so do synonyms of a kind (``pedestrian``, ``person``).
 
     Parameters
     ----------
     text : str
         Words in any order: ``"pedestrian crosses"``.
     kinds : collection of str
-        Only of these :data:`KINDS_OF_PATTERNS`; empty: of all.
+        Kinds to search, from :data:`KINDS_OF_PATTERNS`; empty means all.
 
     Returns
     -------
     list of NamedPattern
-        Those in which a word occurs, by how many of them do, then by where.
+        Entries with at least one word, sorted by number of words, then by weight.
     """
     wanted = list(dict.fromkeys(_words(text)))
     ranks: list[tuple[int, int, NamedPattern]] = []
@@ -278,7 +278,7 @@ def search(text: str, kinds: Collection[str] = ()) -> list[NamedPattern]:
 
 @cache
 def _places(name: str) -> tuple[tuple[int, frozenset[str]], ...]:
-    """Words of an entry of the library, and how much each of them weighs."""
+    """Return the words of a library entry, grouped by weight."""
     entry = patterns()[name]
     parameters = " ".join(f"{p.name} {p.meaning}" for p in entry.parameters.values())
     rest = f"{parameters} {entry.source} {entry.kind} {entry.query}"
@@ -287,7 +287,7 @@ def _places(name: str) -> tuple[tuple[int, frozenset[str]], ...]:
 
 
 def _words(text: str) -> list[str]:
-    """Words in small letters, ``cut_in`` and ``ParkingExit`` being two each; other words for a kind as that."""
+    """Split a text into lower-case words, such as ``cut`` and ``in``. Synonyms of a kind are replaced."""
     return [LABEL_ALIASES.get(word, word) for word in map(str.lower, _WORD.findall(text))]
 
 
@@ -302,12 +302,12 @@ def _of_one_stem(a: str, b: str) -> bool:
 
 
 _ENDING: Final = 3
-"""Letters of an ending at most: ``ing``."""
+"""Largest number of letters of a word ending: ``ing``."""
 
 
 @cache
 def predicates() -> Mapping[str, Define]:
-    """The predicates of the library by folded name; each is parsed when it is first looked up."""
+    """Return the predicates of the library by folded name. Each is parsed on first use."""
     return _Predicates(
         {normalize_name(p.name): p for p in patterns().values() if p.kind == "predicate"}
     )
@@ -346,7 +346,7 @@ def _drawings() -> Mapping[str, str]:
 
 @dataclass(slots=True)
 class _LibraryEntry:
-    """An entry while it is read."""
+    """Library entry while its file is read."""
 
     kind: str
     name: str
@@ -356,7 +356,7 @@ class _LibraryEntry:
     last: str = "sentence"
 
     def read(self, line: str) -> bool:
-        """Take a line; whether it is one that may stand there."""
+        """Read one line. Return true if the line is valid at this place."""
         if not line.startswith("--") or self.lines:
             self.lines.append(line)
             return True
@@ -398,19 +398,19 @@ class _LibraryEntry:
 
 
 def entries(text: str, library: str) -> Iterator[NamedPattern]:
-    """The entries of a file.
+    """Yield the entries of a library file.
 
     Parameters
     ----------
     text : str
-        Of the file; what comes before the first head is about the file, and lines of ``--`` alone divide.
+        Text of the file. Lines before the first head are about the file. Lines with only ``--`` are separators.
     library : str
-        Its name, for messages.
+        Name of the file, for messages.
 
     Raises
     ------
     QueryError
-        A line of a head cannot be read, or something is missing; it says where.
+        A line of a head is invalid, or a part is missing. The message has the place.
     """
     entry: _LibraryEntry | None = None
     for number, line in enumerate(text.splitlines(), start=1):
@@ -430,7 +430,7 @@ def entries(text: str, library: str) -> Iterator[NamedPattern]:
 
 
 def _type_of(default: str) -> str | None:
-    """The type of a value as it stands in a query."""
+    """Return the type of a default value, as written in a query."""
     if default.startswith("'"):
         return "text"
     if default in {"TRUE", "FALSE"}:
