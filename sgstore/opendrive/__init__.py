@@ -1,17 +1,17 @@
-"""Text of a road map → RoadMap: OpenDRIVE, and the plain lanes of recordings that carry none.
+"""Readers of road map texts: OpenDRIVE, and plain lanes of recordings without OpenDRIVE.
 
-``document`` reads the text into tables · ``lanes`` evaluates reference lines and stacks lanes on them ·
-``network`` finds where traffic flows on, and makes nodes and relations; ``objects`` and ``signals`` theirs.
-A road with a defect is left out and named in the map's warnings: the text is then read once more
-without it, so that no later step has to know. Of a width, a border, a height or a lane offset that is no
-number only that record is left out. Only a map without any usable road is an error.
+``document`` reads the text into tables. ``lanes`` evaluates reference lines and stacks lanes on
+them. ``network`` finds the traffic flow and makes nodes and relations; ``objects`` and ``signals``
+make theirs. A road with a defect is left out and named in the map's warnings: the text is then read
+again without it, so that later steps need no check. For an invalid number in a width, border,
+height or lane offset, only that record is left out. Only a map without any usable road is an error.
 
-OpenDRIVE 1.4 to 1.8 (ASAM) are read alike. Superelevation, crossfall and the height of kerbs are not: a lane
-lies at the elevation of its reference line, which is what storeys are told apart by.
+OpenDRIVE 1.4 to 1.8 (ASAM) are read in the same way. Superelevation, crossfall and kerb heights are
+ignored: a lane has the elevation of its reference line, which is enough to distinguish storeys.
 
-A map that was read is kept by its content, so that the traces of a store, or pictures one after another, read
-it once a process, with the indices that it made. It is not kept on disk: a town is read in a tenth of a second,
-less than starting takes, and what is read from a file has to be checked again.
+Maps are cached by content, so that each process reads a map once for all traces of a store or for
+several pictures. There is no cache on disk: a town is read in a tenth of a second, and a cached
+file would need the same checks.
 """
 
 import lazy_loader

@@ -1,11 +1,11 @@
-"""OpenDRIVE text to tables of elements, in bounded time and memory.
+"""Conversion of OpenDRIVE text to tables of elements, with bounded time and memory.
 
-OpenDRIVE text → tables of elements, in bounded time and memory.
+The text is OpenDRIVE; the tables contain its elements.
 
-The text is fed once to :mod:`sgstore.markup`, without a tree: each element that a map reader can
-use becomes a row in the table of its kind, with the row of its parent; everything else is passed over.
-What an attribute *means* is decided later, by :class:`ElementTable`, which turns a whole column into numbers
-and blames the road of each one that is none.
+:mod:`sgstore.markup` reads the text once, without a tree. Each element that a map reader can use
+becomes a row in the table of its kind, with the row of its parent; other elements are skipped.
+:class:`ElementTable` interprets attributes later: it converts a whole column to numbers and records
+a defect of the road for each invalid one.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 MAX_CHARACTERS: Final = 256 << 20
 MAX_ELEMENTS: Final = 3_000_000
 MAX_MAGNITUDE: Final = 1e12
-"""Greatest absolute value of a number; what is larger is taken for a defect."""
+"""Greatest absolute value of a number; larger values count as defects."""
 
 _Shape = dict[str, Any]
 
@@ -66,7 +66,7 @@ _TRANSPARENT: Final = {
     *("link", "planView", "elevationProfile", "lanes", "left", "center", "right"),
     *("objects", "signals", "outlines"),
 }
-"""Elements that only group others: their children are rows of the element around them."""
+"""Elements that only group others: their children become rows of the parent element."""
 
 
 RECORDS: Final = frozenset(
@@ -77,14 +77,14 @@ RECORDS: Final = frozenset(
         "road/laneSection/lane/border",
     }
 )
-"""Kinds of elements of which one that is broken costs only itself: the one before it holds on."""
+"""Kinds of elements with local defects: a broken one is left out, and the previous one applies."""
 
 Record = tuple[str, int, int]
-"""One of these: its kind, the number of its road in the text, and its own number in this road."""
+"""An element: its kind, the number of its road in the text, and its own number in this road."""
 
 
 class Spoiled(Exception):  # noqa: N818 (control flow inside the package; a road is spoiled, not the map)
-    """Some roads or records cannot be used: rows of roads, and records → what is wrong."""
+    """Unusable roads (by row) and records, each with the reason."""
 
     def __init__(self, roads: dict[int, MapError], records: dict[Record, MapError]) -> None:
         self.roads = roads
@@ -101,7 +101,7 @@ class ElementTable:
     element : str
         Path of tags: ``road/lanes/laneSection``.
     parent : list of int
-        Row of the element around it, in that element's table.
+        Row of the parent element, in that element's table.
     attributes : list of dict
     road : (n,) int64
         Row of the road it belongs to; -1 outside roads.
@@ -117,11 +117,11 @@ class ElementTable:
 
     @property
     def of(self) -> Ints:
-        """(n,) int64: the parents as an array."""
+        """Return the parents as an array (n,), int64."""
         return np.asarray(self.parent, np.int64)
 
     def texts(self, name: str, default: str = "") -> list[str]:
-        """A column of texts; ``default`` where the attribute is absent."""
+        """Return a column of texts; ``default`` for a missing attribute."""
         try:
             return [attributes[name] for attributes in self.attributes]
         except KeyError:
@@ -134,16 +134,16 @@ class Document:
     Attributes
     ----------
     tables : dict
-        Kind of element → :class:`ElementTable`. Kinds are tags without those that only group others, from the
-        road on: ``road``, ``road/geometry/arc``, ``road/laneSection/lane/width``.
+        Kind of element → :class:`ElementTable`. A kind is the path of tags from the road on,
+        without grouping elements: ``road``, ``road/geometry/arc``, ``road/laneSection/lane/width``.
     ordinals : list of int
         Row of the table of roads → the road's number in the text.
     characters : int
         Length of the text.
     blame : dict
-        Row of a road → the first thing that was found wrong with it.
+        Row of a road → its first defect.
     odd : dict
-        Record → the first thing that was found wrong with it.
+        Record → its first defect.
     """
 
     def __init__(
@@ -168,15 +168,15 @@ class Document:
         return self.tables[kind]
 
     def numbers(self, kind: str, name: str, default: float | None = None) -> Floats:
-        """A column of finite numbers.
+        """Return a column of finite numbers.
 
-        Where one is absent and there is no default, or is no finite number of reasonable size, its road
-        gets the blame and the value is 0; outside roads, the value is the default.
+        A missing number without default, or one that is not finite or too large, is a defect of its
+        road, and the value is 0. Outside roads, the value is the default.
         """
         table = self.tables[kind]
         missing = "0" if default is None else repr(default)
         values = _floats(table.texts(name, missing))
-        # A missing number may be meant by NaN, but only where the reader asked for it.
+        # NaN can represent a missing number, but only if the reader passed it as default.
         wild = ~(np.abs(values) <= MAX_MAGNITUDE)
         if default is not None and math.isnan(default):
             wild &= np.array([name in a for a in table.attributes], bool)
@@ -188,7 +188,7 @@ class Document:
         return values
 
     def integers(self, kind: str, name: str, default: int | None = None) -> Ints:
-        """A column of whole numbers, under the same terms."""
+        """Return a column of integers, under the same conditions as :meth:`numbers`."""
         values = self.numbers(kind, name, default)
         broken = (values != np.floor(values)) | (np.abs(values) > 1e9)
         self.accuse(kind, broken, f"attribute {name!r} is no whole number")
@@ -196,13 +196,13 @@ class Document:
         return values.astype(np.int64)
 
     def rough_numbers(self, kind: str, name: str, default: float = 0.0) -> Floats:
-        """A column of numbers of which a broken one costs no road: it is NaN, an absent one ``default``."""
+        """Return a column of numbers: NaN for an invalid number, ``default`` for a missing one."""
         values = _floats(self.tables[kind].texts(name, repr(default)))
         values[~(np.abs(values) <= MAX_MAGNITUDE)] = np.nan
         return values
 
     def accuse(self, kind: str, wrong: Bools, reason: str) -> None:
-        """Blame the roads of the rows where something is ``wrong``; of :data:`RECORDS` the rows alone."""
+        """Record a defect of the roads of the ``wrong`` rows; for :data:`RECORDS`, of the rows only."""
         table = self.tables[kind]
         rows = np.flatnonzero(wrong)
         if kind in RECORDS and len(rows):
@@ -217,12 +217,12 @@ class Document:
                 self.blame[road] = MapError(reason, road=self.road_ids[road], element=table.element)
 
     def settle(self) -> None:
-        """Raise :class:`Spoiled` if any road or record got the blame so far."""
+        """Raise :class:`Spoiled` if a road or record has a defect so far."""
         if self.blame or self.odd:
             raise Spoiled(self.blame, self.odd)
 
     def leave_out(self, records: Collection[Record]) -> None:
-        """Go on without some records."""
+        """Remove these records from the tables."""
         for kind in {kind for kind, _, _ in records}:
             table = self.tables[kind]
             every = self._records(kind, np.arange(len(table)))
@@ -232,7 +232,7 @@ class Document:
             table.road = table.road[kept]
 
     def _records(self, kind: str, rows: Ints) -> list[Record]:
-        """Rows of a kind as records. The rows of a road follow one another."""
+        """Convert rows of a kind to records. The rows of a road are contiguous."""
         road = self.tables[kind].road
         within = rows - np.searchsorted(road, road[rows])
         numbers = [self.ordinals[row] for row in road[rows].tolist()]
@@ -240,12 +240,12 @@ class Document:
 
 
 def read_document(text: str, skip: frozenset[int] = frozenset()) -> Document:
-    """The tables of an OpenDRIVE text, without the roads of the numbers in ``skip``.
+    """Parse an OpenDRIVE text into tables, without the roads numbered in ``skip``.
 
     Raises
     ------
     MapError
-        The text is no XML, no OpenDRIVE, has a document type declaration, or exceeds a bound.
+        The text is not XML or not OpenDRIVE, has a document type declaration, or exceeds a limit.
     """
     if len(text) > MAX_CHARACTERS:
         raise MapError(f"{len(text):,} characters; a map may have {MAX_CHARACTERS:,}")
@@ -257,7 +257,7 @@ _Node = tuple["ElementTable | None", dict[str, "_Node"]]
 
 
 def _grammar() -> tuple[dict[str, ElementTable], dict[str, _Node]]:
-    """Empty tables, and the tree of tags that leads to them."""
+    """Return empty tables, and the tree of tags that leads to them."""
     tables: dict[str, ElementTable] = {}
 
     def branch(shape: Mapping[str, Any], kind: str, element: str) -> dict[str, _Node]:
@@ -288,7 +288,7 @@ class _Builder:
         self._roads = 0
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
-        """An element starts: it becomes a row, stands for the one around it, or is passed over."""
+        """Handle the start of an element: add a row, enter a grouping element, or skip it."""
         levels, rows = self._levels, self._rows
         node = levels[-1].get(tag)
         if node is None:
@@ -310,7 +310,7 @@ class _Builder:
         levels.append(below)
 
     def end(self, _tag: str) -> None:
-        """An element ends."""
+        """Handle the end of an element."""
         self._levels.pop()
         self._rows.pop()
 
@@ -333,7 +333,7 @@ def _parse(text: str, skip: frozenset[int]) -> tuple[dict[str, ElementTable], li
 
 
 def _floats(texts: list[str]) -> Floats:
-    """Texts as numbers; NaN for what is none."""
+    """Convert texts to numbers; NaN for an invalid number."""
     try:
         return np.fromiter(map(float, texts), np.float64, len(texts))
     except ValueError:
@@ -351,12 +351,12 @@ def _number(text: str) -> float:
 
 
 def starts_of(counts: Ints) -> Ints:
-    """(n + 1,) int64: where groups of these sizes start when they follow one another, and the end."""
+    """Return the starts of consecutive groups of these sizes, and the end, (n + 1,)."""
     return np.concatenate((np.zeros(1, np.int64), np.cumsum(counts, dtype=np.int64)))
 
 
 def ragged(counts: Ints) -> tuple[Ints, Ints]:
-    """Groups of these sizes spelled out: the group of each row, and the row's number in its group.
+    """Expand groups of these sizes: the group of each row, and the row's number in its group.
 
     >>> ragged(np.array([2, 0, 3]))
     (array([0, 0, 2, 2, 2]), array([0, 1, 0, 1, 2]))
@@ -366,26 +366,28 @@ def ragged(counts: Ints) -> tuple[Ints, Ints]:
 
 
 def last_before(group: Ints, at: Floats, asked_group: Ints, asked_at: Floats) -> Ints:
-    """The record that holds at each place: the last of its group that starts at or before it.
+    """Find the record for each place: the last one of its group that starts at or before it.
 
     Parameters
     ----------
     group, at : (n,)
-        Group and start of each record, in any order; of records that start together the later holds.
+        Group and start of each record, in any order; of records with the same start the later one
+        counts.
     asked_group, asked_at : (m,)
         Places.
 
     Returns
     -------
     (m,) int64
-        Rows of the records. Before the first record of a group the first holds; -1: the group is empty.
+        Rows of the records. Before the first record of a group the first one counts; -1 for an
+        empty group.
     """
     n, m = len(group), len(asked_group)
     if n == 0:
         return np.full(m, -1, np.int64)
     order = np.lexsort((at, group))
     groups, starts = group[order], at[order]
-    # One sort of records and places together: a place comes after the records that start with it.
+    # One sort of records and places together: a place follows the records with the same start.
     both_group = np.concatenate((groups, asked_group))
     both_at = np.concatenate((starts, asked_at))
     is_place = np.arange(n + m) >= n
@@ -401,23 +403,23 @@ def last_before(group: Ints, at: Floats, asked_group: Ints, asked_at: Floats) ->
 
 
 def cubic(coefficients: Floats, at: Floats) -> Floats:
-    """Values of cubics ``(..., 4)``, constant first, at ``at``."""
+    """Evaluate cubics ``(..., 4)``, constant first, at ``at``."""
     c = coefficients
     return c[..., 0] + at * (c[..., 1] + at * (c[..., 2] + at * c[..., 3]))
 
 
 def cubic_slope(coefficients: Floats, at: Floats) -> Floats:
-    """First derivatives of cubics ``(..., 4)`` at ``at``."""
+    """Return first derivatives of cubics ``(..., 4)`` at ``at``."""
     c = coefficients
     return c[..., 1] + at * (2 * c[..., 2] + at * 3 * c[..., 3])
 
 
 def cubic_bend(coefficients: Floats, at: Floats) -> Floats:
-    """Second derivatives of cubics ``(..., 4)`` at ``at``."""
+    """Return second derivatives of cubics ``(..., 4)`` at ``at``."""
     c = coefficients
     return 2 * c[..., 2] + at * 6 * c[..., 3]
 
 
 def coefficients_of(document: Document, kind: str) -> Floats:
-    """(n, 4): ``a``, ``b``, ``c``, ``d`` of all elements of a kind; those that are absent are 0."""
+    """Return ``a``, ``b``, ``c``, ``d`` of all elements of a kind, (n, 4); 0 for missing ones."""
     return np.stack([document.numbers(kind, letter, 0.0) for letter in "abcd"], axis=1)

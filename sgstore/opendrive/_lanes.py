@@ -1,10 +1,10 @@
 """Reference lines of roads, their lanes, and the surface of lanes as cross sections.
 
-Along a lane section every lateral position (the centre lane's offset, the outer border of each lane) is a
-cubic of s between *cuts*: places where a record of any kind starts. Between cuts cubics add up, so lanes
-are stacked once per cut, as coefficients, and evaluated afterwards at as many *stations* as it takes for
-straight pieces to follow the curves within :data:`SAGITTA`. At a cut where something jumps there are two
-stations in one place, one for each side of the jump.
+Along a lane section every lateral position (the centre lane's offset, the outer border of each
+lane) is a cubic of s between *cuts*: places where a record of any kind starts. Between cuts cubics
+can be added. Therefore lanes are stacked once per cut, as coefficients. They are then evaluated at
+*stations*: enough of them that straight pieces follow the curves within :data:`SAGITTA`. A jump at
+a cut has two stations in one place, one for each side.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 LINE, ARC, SPIRAL, CUBIC = range(4)
 
 MAX_TURN: Final = 12 * np.pi
-"""Greatest change of heading within one spiral; rad. The quadrature is exact to far below 1 mm up to it."""
+"""Greatest change of heading within one spiral; rad. Up to it the quadrature is exact to far below 1 mm."""
 
 _NODES, _WEIGHTS = (np.asarray(a, np.float64) for a in np.polynomial.legendre.leggauss(32))
 _FEW_NODES, _FEW_WEIGHTS = (np.asarray(a, np.float64) for a in np.polynomial.legendre.leggauss(5))
@@ -51,7 +51,7 @@ _BELOW_ONE: Final = 1 - 1e-12
 
 @dataclass(frozen=True, slots=True)
 class _Measure:
-    """Arc length of cubics: where the parameter ends, how long that is, and the share run at 65 steps."""
+    """Arc length of cubics: end parameter, length, and shares of the length at 65 equal steps."""
 
     span: Floats
     length: Floats
@@ -60,7 +60,7 @@ class _Measure:
 
 @dataclass(frozen=True, slots=True)
 class PlanView:
-    """The records of all plan views, ordered by road and s.
+    """Records of all plan views, ordered by road and s.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class PlanView:
     kind : (n,) int8
         ``LINE``, ``ARC``, ``SPIRAL`` or ``CUBIC``.
     curvature, rate : (n,) float64
-        At the start, and its change per metre; of lines, arcs and spirals.
+        Curvature at the start, and its change per metre; for lines, arcs and spirals.
     u, v : (c, 4) float64
         Polynomials of the cubics only, in their order, over their parameter, constant first.
     measure : _Measure
@@ -94,7 +94,7 @@ class PlanView:
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """Places on reference lines, shape (N,): position, heading and curvature."""
+    """Places on reference lines; shape (N,): position, heading and curvature."""
 
     x: Floats
     y: Floats
@@ -103,7 +103,7 @@ class Poses:
 
 
 def read_plan_view(document: Document) -> PlanView:
-    """The plan views of all roads; what is wrong is blamed on its road."""
+    """Read the plan views of all roads; record defects of roads."""
     table = document["road/geometry"]
     n = len(table)
     s, x, y, heading, length = (
@@ -157,7 +157,7 @@ def _read_cubics(document: Document, kind: Codes, length: Floats) -> tuple[Float
     u, v, span = np.zeros((n, 4)), np.zeros((n, 4)), np.zeros(n)
     poly3, param = document["road/geometry/poly3"].of, document["road/geometry/paramPoly3"].of
     u[poly3, 1] = 1.0
-    span[poly3] = np.nan  # known once the arc length is
+    span[poly3] = np.nan  # computed from the arc length later
     for i, letter in enumerate("abcd"):
         v[poly3, i] = document.numbers("road/geometry/poly3", letter)
         u[param, i] = document.numbers("road/geometry/paramPoly3", f"{letter}U")
@@ -170,9 +170,9 @@ def _read_cubics(document: Document, kind: Codes, length: Floats) -> tuple[Float
 
 
 def _measured(u: Floats, v: Floats, span: Floats, length: Floats) -> _Measure:
-    """Spans (those that are NaN found from the length), arc lengths, and their shares at equal steps."""
+    """Compute spans (where NaN), arc lengths, and shares of them at equal parameter steps."""
     unknown = np.isnan(span)
-    reach = np.where(unknown, length, span)  # v over u is at least as long as u
+    reach = np.where(unknown, length, span)  # the arc length is never shorter than u
     arc = _arc_table(u, v, reach)
     rows = np.flatnonzero(unknown & (arc[:, -1] > 0))
     if len(rows):
@@ -192,7 +192,7 @@ def _arc_table(u: Floats, v: Floats, span: Floats) -> Floats:
 
 
 def _parameter(u: Floats, v: Floats, measure: _Measure, rows: Ints, share: Floats) -> Floats:
-    """Parameters at which the cubics of ``rows`` have run this ``share`` of their arc length.
+    """Return the parameters at which these cubics reach a share of their arc length.
 
     Cubic Hermite interpolation in the cell of the table.
     """
@@ -205,7 +205,7 @@ def _parameter(u: Floats, v: Floats, measure: _Measure, rows: Ints, share: Float
     h = np.clip((share - low) / np.maximum(high - low, _TINY), 0.0, 1.0)
     step = measure.span[rows] / _CELLS
     run = (high - low) * measure.length[rows]
-    # dp/dh at both ends of the cell; where the curve all but stops, its pace tells nothing.
+    # dp/dh at both ends of the cell; ignored where the curve almost stops.
     before, after = (
         np.minimum(
             run / np.maximum(np.hypot(cubic_slope(u[rows], p), cubic_slope(v[rows], p)), _TINY),
@@ -218,7 +218,7 @@ def _parameter(u: Floats, v: Floats, measure: _Measure, rows: Ints, share: Float
 
 
 def poses(plan: PlanView, record: Ints, s: Floats) -> Poses:
-    """Places on reference lines.
+    """Return places on reference lines.
 
     Parameters
     ----------
@@ -226,14 +226,15 @@ def poses(plan: PlanView, record: Ints, s: Floats) -> Poses:
     record : (N,) int64
         Row of the record of each place.
     s : (N,) float64
-        Along the road; m. Before the record's start the start is taken.
+        Along the road; m. Places before the record's start are moved to it.
     """
     ds = np.maximum(s - plan.s[record], 0.0)
     heading0, k0 = plan.heading[record], plan.curvature[record]
     curvature = k0 + plan.rate[record] * ds
     turned = ds * (k0 + curvature) / 2
     kind = plan.kind[record]
-    # Chord of an arc: along the mean heading, shorter by sin(x) / x. A line is an arc without curvature.
+    # Chord of an arc: along the mean heading, shorter by sin(x) / x. A line is an arc without
+    # curvature.
     chord = ds * np.sinc(turned / (2 * np.pi))
     along, across = chord * np.cos(turned / 2), chord * np.sin(turned / 2)
     rows = np.flatnonzero(kind == SPIRAL)
@@ -253,7 +254,7 @@ def poses(plan: PlanView, record: Ints, s: Floats) -> Poses:
 
 
 def _spiral(ds: Floats, curvature: Floats, rate: Floats) -> tuple[Floats, Floats]:
-    """Along and across after ``ds`` on clothoids; ∫ cos θ, ∫ sin θ by quadrature."""
+    """Return distances along and across after ``ds`` on clothoids, by quadrature."""
     at = ds[:, None] * ((_NODES + 1) / 2)
     angle = at * (curvature[:, None] + rate[:, None] * at / 2)
     half = ds / 2
@@ -261,7 +262,7 @@ def _spiral(ds: Floats, curvature: Floats, rate: Floats) -> tuple[Floats, Floats
 
 
 def _cubic(plan: PlanView, record: Ints, ds: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Along, across, turned and curvature after ``ds`` on parametric cubics."""
+    """Return distances along and across, turn, and curvature after ``ds`` on parametric cubics."""
     number = np.cumsum(plan.kind == CUBIC) - 1
     length = plan.length[record]
     share = np.where(length > 0, ds / np.maximum(length, _TINY), 0.0)
@@ -277,37 +278,38 @@ def _cubic(plan: PlanView, record: Ints, ds: Floats) -> tuple[Floats, Floats, Fl
 # Lane sections and lanes, and the surface of lanes as cross sections ----------------------------
 
 SAGITTA: Final = 2e-3
-"""Greatest distance between a border and the straight pieces that stand for it; m.
+"""Greatest distance between a border and its approximation by straight pieces; m.
 
-Half the tolerance would cost half as many pieces more, in every look-up. Centre lines are smoother: between
-cross sections their headings tell how they bend.
+Half the tolerance would need half as many pieces more in every look-up. Centre lines are smoother,
+because headings of the cross sections define their curves.
 """
 RISE: Final = 2e-2
-"""The same for heights; m."""
+"""Greatest error of heights; m."""
 MAX_STEP: Final = 10.0
 """Greatest length of a piece, so that its bounding box stays small; m."""
 MAX_STATIONS: Final = 250_000
 """Greatest number of cross sections of the lanes of one road: 100 km of a winding motorway of eight lanes.
 
-A cross section takes up to 700 bytes until its lanes can be looked up.
+A cross section takes up to 700 bytes until the look-up of its lanes is ready.
 """
 MAX_TOTAL: Final = 4_000_000
 """Greatest number of cross sections of all lanes of a map."""
 MAX_OF_SMALL: Final = 500_000
-"""Greatest number of them in a map of up to :data:`CHARACTERS` times as many characters: a short text in which
-some numbers are wrong does not become a gigabyte. Towns take 70 characters and more for each."""
+"""Greatest number of cross sections in a map below :data:`CHARACTERS` times as many characters. It
+prevents that a short text with some wrong numbers becomes a gigabyte. Towns have 70 characters or
+more for each."""
 CHARACTERS: Final = 8
-"""Characters that each cross section of a larger map has to have."""
+"""Least number of characters per cross section of a larger map."""
 MAX_LANES: Final = 1_000
 """Greatest number of lanes of a section."""
 MAX_COORDINATE: Final = 1e8
 JUMP: Final = 2e-4
-"""Least distance by which something jumps at a cut; m."""
+"""Least distance of a jump at a cut; m."""
 CORNER: Final = 2e-4
 """Least change of direction at a cut that makes a corner; rad."""
 _SAME_PLACE: Final = 1e-6
 _SAMPLES: Final = 5
-"""Places between two cuts at which curvature is looked at."""
+"""Sample places between two cuts for the curvature."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -319,7 +321,7 @@ class LaneSections:
     road : int64
         Row of the road.
     number : int64
-        From 0 in its road.
+        Number in its road, from 0.
     start, end : float64
         Along the road; m.
     """
@@ -332,7 +334,7 @@ class LaneSections:
 
 @dataclass(frozen=True, slots=True)
 class LaneTable:
-    """All lanes but centre lanes, ordered by section and from left to right; shape (L,).
+    """All lanes except centre lanes, ordered by section and from left to right; shape (L,).
 
     Attributes
     ----------
@@ -341,17 +343,17 @@ class LaneTable:
         Rows of section and road; the lane's number in its section.
     type : list of str
     forward : bool
-        Whether traffic runs along s.
+        True if traffic runs along s.
     both : bool
-        Whether traffic runs both ways.
+        True if traffic runs both ways.
     inner : int64
-        The lane between it and the centre lane, -1: the centre lane itself.
+        The next lane towards the centre lane; -1 means the centre lane itself.
     rank : int64
-        How many lanes there are between it and the centre lane.
+        Number of lanes between it and the centre lane.
     row : (raw,) int64
         Row of each element of the document, -1 for centre lanes.
     centre : (raw,) int64
-        Section of each element that is a centre lane, else -1.
+        Section of each centre lane element, else -1.
     """
 
     sections: LaneSections
@@ -371,7 +373,7 @@ class LaneTable:
 
 
 def read_lanes(document: Document) -> LaneTable:
-    """All lane sections and lanes; what is wrong is blamed on its road."""
+    """Read all lane sections and lanes; record defects of roads."""
     sections, section_row = _read_sections(document)
     table = document["road/laneSection/lane"]
     ident = document.integers("road/laneSection/lane", "id")
@@ -399,7 +401,7 @@ def read_lanes(document: Document) -> LaneTable:
 
 
 def odd_sections(document: Document) -> list[str]:
-    """Warnings of sections that are for one side of the road only: they are read as if they were for both."""
+    """Return warnings about one-sided sections, which are read as two-sided."""
     table = document["road/laneSection"]
     roads = {
         document.road_ids[road]
@@ -433,12 +435,12 @@ def _read_sections(document: Document) -> tuple[LaneSections, Ints]:
     number = np.arange(len(road)) - np.searchsorted(road, road)
     row = np.empty(len(order), np.int64)
     row[order] = np.arange(len(order))
-    # A road may end a little before its last section starts, as numbers were rounded.
+    # Rounded numbers can let a road end slightly before its last section starts.
     return LaneSections(road, number, start, np.maximum(end, start)), row
 
 
 def _stack(section: Ints, ident: Ints) -> tuple[Ints, Ints]:
-    """The next lane towards the centre, and the number of lanes that lie between."""
+    """Return the next lane towards the centre, and the number of lanes between."""
     n = len(ident)
     order = np.lexsort((np.abs(ident), ident > 0, section))
     same = (np.diff(section[order]) == 0) & (np.diff((ident > 0)[order].astype(np.int8)) == 0)
@@ -459,7 +461,7 @@ class _LaneIntervals:
     section: Ints
     start: Floats
     end: Floats
-    first: Ints  # (sections + 1,): where the intervals of each section start
+    first: Ints  # (sections + 1,): start of the intervals of each section
 
 
 def _intervals(document: Document, lanes: LaneTable, plan: PlanView) -> _LaneIntervals:
@@ -496,7 +498,7 @@ def _intervals(document: Document, lanes: LaneTable, plan: PlanView) -> _LaneInt
 
 
 def _shifted(coefficients: Floats, by: Floats) -> Floats:
-    """Cubics over ``x`` as cubics over ``x - by``."""
+    """Convert cubics over ``x`` to cubics over ``x - by``."""
     return np.stack(
         (
             cubic(coefficients, by),
@@ -511,7 +513,7 @@ def _shifted(coefficients: Floats, by: Floats) -> Floats:
 def _along_road(
     document: Document, kind: str, lanes: LaneTable, intervals: _LaneIntervals
 ) -> Floats:
-    """(intervals, 4): the cubics of a record of roads over the distance from the interval's start."""
+    """Return cubics of a road record over the distance from each interval's start, (intervals, 4)."""
     middle = (intervals.start + intervals.end) / 2
     at = document.numbers(kind, "s")
     record = last_before(document[kind].road, at, lanes.sections.road[intervals.section], middle)
@@ -526,7 +528,7 @@ def _along_road(
 class _LaneBorders:
     """Outer and inner borders of lanes on intervals, as cubics over the distance from the interval's start."""
 
-    first: Ints  # (L + 1,): where the rows of each lane start, one row an interval of its section
+    first: Ints  # (L + 1,): start of the rows of each lane, one row per interval of its section
     interval: Ints
     inner: Floats
     outer: Floats
@@ -561,7 +563,7 @@ def _borders(
 def _of_lanes(
     document: Document, tag: str, lanes: LaneTable, at: tuple[Ints, Floats, Floats]
 ) -> tuple[Floats, Bools]:
-    """Cubics of the records of lanes that hold at places (lane, middle, start), and where there are any."""
+    """Return cubics of the lane records at places (lane, middle, start), and a mask of existing ones."""
     kind = f"road/laneSection/lane/{tag}"
     lane, middle, start = at
     of = lanes.row[document[kind].of]
@@ -580,7 +582,7 @@ def _pieces(
     plan: PlanView,
     parts: tuple[_LaneIntervals, _LaneBorders, Floats],
 ) -> tuple[Ints, Ints]:
-    """Into how many pieces each interval is cut, and the record of the plan view that holds in it."""
+    """Return the number of pieces of each interval, and its plan view record."""
     intervals, borders, heights = parts
     length = intervals.end - intervals.start
     road = lanes.sections.road[intervals.section]
@@ -592,7 +594,7 @@ def _pieces(
     at = length[borders.interval][:, None] * np.array([0.0, 0.5, 1.0])
     kappa = curvature[borders.interval][:, [0, _SAMPLES // 2, -1]]
     sharpest = np.abs(curvature).max(axis=1)[borders.interval][:, None]
-    # What is too large for a number is endless: such roads are refused below.
+    # An overflow is infinite: such roads are rejected below.
     with np.errstate(over="ignore", invalid="ignore"):
         bend = np.zeros(len(length))
         for side in (borders.inner, borders.outer):
@@ -613,7 +615,7 @@ def _pieces(
 
 
 def _bound(document: Document, lanes: LaneTable, intervals: _LaneIntervals, pieces: Floats) -> None:
-    """Refuse roads, or the map, whose intervals would be cut into too many pieces."""
+    """Reject roads, or the map, with intervals that need too many pieces."""
     road = lanes.sections.road[intervals.section]
     lanes_here = np.bincount(lanes.section, minlength=len(lanes.sections.start)) + 1.0
     points = (pieces + 1) * lanes_here[intervals.section]
@@ -627,8 +629,8 @@ def _bound(document: Document, lanes: LaneTable, intervals: _LaneIntervals, piec
 
 
 _Stations = tuple["Ints", "Ints", "Floats", Poses, "Floats"]
-"""Places where cross sections are taken, by section and s: (sections + 1,) where those of each begin; of each
-place its interval, s, pose and z."""
+"""Places of cross sections, by section and s: starts per section (sections + 1,), and the interval,
+s, pose and z of each place."""
 
 
 def _stations(
@@ -640,7 +642,7 @@ def _stations(
     into = length * number / pieces[interval]
     s = intervals.start[interval] + into
     pose = poses(plan, record[interval], s)
-    # The last station before a cut goes, unless something jumps or has a corner there.
+    # The last station before a cut is dropped, unless there is a jump or corner.
     ends = np.cumsum(pieces + 1) - 1
     inner_cut = np.flatnonzero(np.diff(intervals.section) == 0)
     before, after = ends[inner_cut], ends[inner_cut] + 1
@@ -674,14 +676,14 @@ def _lateral_jumps(
 
 
 def surface(document: Document, lanes: LaneTable, plan: PlanView) -> Ribbons:
-    """The surface of all lanes.
+    """Compute the surface of all lanes.
 
     Raises
     ------
     Spoiled
         Some roads are too bent, too long, or too far away.
     MapError
-        All roads together are.
+        The map needs too many points in total.
     """
     intervals = _intervals(document, lanes, plan)
     _bound(document, lanes, intervals, np.ones(len(intervals.section)))
@@ -707,10 +709,10 @@ def surface(document: Document, lanes: LaneTable, plan: PlanView) -> Ribbons:
 def heights(
     document: Document, lanes: LaneTable, ribbons: Ribbons
 ) -> Callable[[Ints, Floats], Floats] | None:
-    """The function from lanes, and places along them, to heights there; m. ``None``: no road has any.
+    """Return a function from lanes and places along them to heights (m), or ``None`` without heights.
 
-    Between cross sections a lane is straight, which is good enough for its height, but not for its slope.
-    ``ribbons`` may be of more lanes, which are of no road.
+    Between cross sections a lane is straight. This is exact enough for heights, but not for slopes.
+    ``ribbons`` can have more lanes, without a road.
     """
     kind = "road/elevation"
     road, at, cubics = (

@@ -1,10 +1,9 @@
-"""Lanes, roads and junctions as nodes: where traffic flows on, and where it may change lanes.
+"""Lanes, roads and junctions as nodes, with traffic flow and lane changes.
 
-A lane ends at one end of its section, or at both if traffic runs both ways. What lies beyond is found
-from that *end*: the next section of the road; a linked road at its contact point (or, from a virtual
-junction, in its middle); or, through a junction, the connecting roads that take this road in. A pair
-counts only if the lane beyond is entered where its own traffic enters: maps also link lanes tail to tail.
-(ASAM OpenDRIVE 1.8, 10.3, 11.5 and 12.)
+A lane ends at one end of its section, or at both if traffic runs both ways. The lanes after it come
+from links to the next section or road (also into a road, in its middle), or from the connecting
+roads of a junction. A pair counts only if the next lane is entered where its own traffic enters:
+maps also link lanes tail to tail. (ASAM OpenDRIVE 1.8, 10.3, 11.5 and 12.)
 """
 
 from __future__ import annotations
@@ -44,20 +43,20 @@ _OTHER: Final = {START: END, END: START}
 
 
 class Target(NamedTuple):
-    """One end of a section that traffic comes to: at its start, at its end, or somewhere within."""
+    """Place where traffic enters a section: at its start, at its end, or within."""
 
     section: int
     contact: str
-    """``start``, ``end``, ``+`` or ``-`` (within, along or against s), or empty: within, either way."""
+    """``start``, ``end``, ``+`` or ``-`` (within, along or against s), or empty: within, in both directions."""
 
 
 _Connection = tuple[Target, tuple[tuple[int, int], ...]]
-"""A way through a junction: where it starts, and which lanes it joins to which."""
+"""A way through a junction: its target, and the pairs of lanes that it connects."""
 
 
 @dataclass(slots=True)
 class Network:
-    """The lanes of all roads, to be found by what the map calls them.
+    """Lanes of all roads, with look-ups by the ids of the map.
 
     Attributes
     ----------
@@ -66,7 +65,7 @@ class Network:
     lane : dict
         (Section, lane id) → lane.
     first, last : list of int
-        First and last section of each road; -1: it has none.
+        First and last section of each road, or -1.
     """
 
     lanes: LaneTable
@@ -78,7 +77,7 @@ class Network:
 
     @classmethod
     def of(cls, document: Document, lanes: LaneTable) -> Network:
-        """The network of a document's lanes."""
+        """Build the network of a document's lanes."""
         roads: dict[str, int] = {}
         warnings: list[str] = []
         for row, name in enumerate(document.road_ids):
@@ -93,13 +92,13 @@ class Network:
         return cls(lanes, roads, lane, first.tolist(), last.tolist(), warnings)
 
     def section_at(self, road: int, s: float) -> int:
-        """The section of a road that holds at ``s``."""
+        """Return the section of a road at ``s``."""
         starts = self.lanes.sections.start[self.first[road] : self.last[road] + 1]
         within = int(np.searchsorted(starts, s, side="right")) - 1
         return self.first[road] + max(within, 0)
 
     def target(self, attributes: dict[str, str]) -> Target | None:
-        """Section that a link of a road to a road leads to; ``None`` if there is no such road."""
+        """Return the section that a link between roads leads to, or ``None`` for an unknown road."""
         road = self.roads.get(attributes.get("elementId", ""))
         if road is None:
             return None
@@ -110,14 +109,14 @@ class Network:
         return Target(self.first[road] if contact == START else self.last[road], contact)
 
     def enters(self, lane: int, contact: str) -> bool:
-        """Return whether traffic that comes to a section at ``contact`` may enter this lane of it."""
+        """True if traffic at the end ``contact`` of a section may enter this lane."""
         if self.lanes.both[lane] or not contact:
             return True
         return bool(self.lanes.forward[lane]) == (contact in {START, "+"})
 
 
 def flows(document: Document, network: Network) -> tuple[Ints, Ints]:
-    """All pairs of lanes between which traffic can flow, each once: from these, and on to those."""
+    """Return all pairs of lanes (from, to) with traffic flow, each once."""
     joints = _Joints(document, network)
     pairs = {
         (lane, beyond)
@@ -138,7 +137,7 @@ def _exits(lanes: LaneTable) -> Iterator[tuple[int, str]]:
 
 
 class _Joints:
-    """Lanes beyond the ends of lanes."""
+    """Look-up of the lanes after the ends of lanes."""
 
     def __init__(self, document: Document, network: Network) -> None:
         self._network = network
@@ -155,7 +154,7 @@ class _Joints:
         self._missed: set[str] = set()
 
     def beyond(self, lane: int, contact: str) -> list[int]:
-        """The lanes beyond one end of a lane that traffic may enter."""
+        """Return the lanes after one end of a lane that its traffic may enter."""
         network, lanes = self._network, self._network.lanes
         road, section, ident = (int(c[lane]) for c in (lanes.road, lanes.section, lanes.ident))
         linked = self._lane_links[contact].get(lane, [])
@@ -210,7 +209,7 @@ def _road_links(table: ElementTable) -> dict[int, dict[str, str]]:
 
 
 def _junctions(document: Document, network: Network) -> dict[tuple[str, str], list[_Connection]]:
-    """(Junction, road that comes in) → its ways through. A direct junction joins both roads both ways."""
+    """Map (junction, incoming road) to its ways; a direct junction connects in both directions."""
     ways: dict[tuple[str, str], list[_Connection]] = defaultdict(list)
     junctions = document["junction"]
     links = _lane_pairs(document)
@@ -246,7 +245,7 @@ def _lane_pairs(document: Document) -> dict[int, tuple[tuple[int, int], ...]]:
 
 
 def _junction_ends(document: Document) -> dict[tuple[str, str], list[str]]:
-    """(Junction, road) → the ends of the road that lie at it."""
+    """Map (junction, road) to the ends of the road at the junction."""
     ends: dict[tuple[str, str], list[str]] = defaultdict(list)
     for kind, contact in (("road/predecessor", START), ("road/successor", END)):
         for row, attributes in _road_links(document[kind]).items():
@@ -257,7 +256,7 @@ def _junction_ends(document: Document) -> dict[tuple[str, str], list[str]]:
 
 
 def _branches(document: Document, network: Network) -> Iterator[tuple[int, int]]:
-    """Lanes of main roads and the lanes that branch off them in virtual junctions, midway."""
+    """Yield pairs of a main road's lane and a lane that branches off in a virtual junction."""
     links = _lane_pairs(document)
     table = document["junction/connection"]
     junctions = document["junction"].attributes
@@ -286,7 +285,7 @@ def _branches(document: Document, network: Network) -> Iterator[tuple[int, int]]
 
 
 def _whole(text: str) -> int:
-    """A lane id; 0, which is no lane with traffic, where there is none."""
+    """Parse a lane id; 0 (never a lane with traffic) for an invalid one."""
     try:
         return int(text)
     except ValueError:
@@ -303,17 +302,17 @@ def _number(text: str) -> float:
 # Lanes, roads and junctions as nodes with relations, and lane changes from road marks -----------
 
 NARROW: Final = 1e-2
-"""A lane that is nowhere wider has no neighbours: those on both sides of it are neighbours; m."""
+"""A lane that is nowhere wider has no neighbours: the lanes on both sides are neighbours; m."""
 
 SPEED_UNITS: Final = {"": 1.0, "m/s": 1.0, "mph": 0.44704, "km/h": 1 / 3.6, "kmh": 1 / 3.6}
 """Units of speed → m/s. (ASAM OpenDRIVE 1.8, ``e_unitSpeed``.)"""
 
 FIRST_LANE: Final = 1
-"""Row of the first lane: ``off_road`` comes before it."""
+"""Row of the first lane: row 0 is ``off_road``."""
 
 
 def lane_nodes(document: Document, lanes: LaneTable, ribbons: Ribbons) -> MapNodes:
-    """The lanes, in their order."""
+    """Return the nodes of the lanes, in their order."""
     road_names = document.road_ids
     sections = lanes.sections
     number = sections.number[lanes.section]
@@ -344,13 +343,13 @@ def lane_nodes(document: Document, lanes: LaneTable, ribbons: Ribbons) -> MapNod
 
 
 def junction_of(document: Document, road: int) -> str:
-    """Id of the junction that a road lies in, empty if it lies in none."""
+    """Return the id of the junction of a road, or an empty text."""
     junction = document["road"].attributes[road].get("junction", "-1")
     return "" if junction == "-1" else junction
 
 
 def _turns(document: Document, lanes: LaneTable, ribbons: Ribbons) -> tuple[str, ...]:
-    """Turns of lanes on their way through a junction; a road that turns in several sections turns once."""
+    """Return turns of lanes in junctions; a road with several sections has one turn in total."""
     sign = np.where(lanes.forward, 1.0, -1.0)
     _, one = np.unique(lanes.section, return_index=True)
     of_road = np.zeros(len(document["road"]))
@@ -363,7 +362,7 @@ def _turns(document: Document, lanes: LaneTable, ribbons: Ribbons) -> tuple[str,
 
 
 def _speed_limits(document: Document, lanes: LaneTable) -> Floats:
-    """Limits at the middle of each lane: the lane's own record, else that of its road; m/s."""
+    """Return speed limits at the middle of lanes: own record, else the road's; m/s."""
     sections = lanes.sections
     start, end = sections.start[lanes.section], sections.end[lanes.section]
     middle = (start + end) / 2
@@ -391,7 +390,7 @@ def _speeds(document: Document, kind: str) -> Floats:
 
 
 def speed(value: str, unit: str) -> float:
-    """A speed in m/s; NaN for ``no limit``, ``undefined`` and what is no speed."""
+    """Convert a speed to m/s; NaN for ``no limit``, ``undefined`` and invalid values."""
     try:
         metres = float(value) * SPEED_UNITS[unit.strip().lower()]
     except (ValueError, KeyError):
@@ -400,15 +399,15 @@ def speed(value: str, unit: str) -> float:
 
 
 def wide_pairs(lanes: LaneTable, ribbons: Ribbons) -> Ints:
-    """(2, n): lanes that share a border, the left one first."""
+    """Return pairs of lanes that share a border, the left one first, (2, n)."""
     return _pairs(lanes, np.flatnonzero(mean_widths(ribbons) > NARROW))
 
 
 def neighbours(lanes: LaneTable, ribbons: Ribbons) -> list[Edge]:
-    """``toLeftOf``, ``toRightOf`` and ``opposes`` among lanes.
+    """Return the edges ``toLeftOf``, ``toRightOf`` and ``opposes`` among lanes.
 
-    Neighbours share a border. Lanes of traffic that only lanes without traffic part (a median, a strip of
-    grass) are neighbours as well: they are what a driver looks at across it.
+    Neighbours share a border. Lanes of traffic with only lanes without traffic between them (a
+    median, a strip of grass) are also neighbours, because drivers look across it.
     """
     wide = np.flatnonzero(mean_widths(ribbons) > NARROW)
     traffic = _pairs(lanes, wide[[lanes.type[lane] in TRAFFIC for lane in wide.tolist()]])
@@ -428,7 +427,7 @@ def neighbours(lanes: LaneTable, ribbons: Ribbons) -> list[Edge]:
 
 
 def _pairs(lanes: LaneTable, rows: Ints) -> Ints:
-    """(2, n): lanes of a section that follow one another among ``rows``, from left to right."""
+    """Return consecutive lanes of a section among ``rows``, from left to right, (2, n)."""
     same: Bools = np.diff(lanes.section[rows]) == 0
     return np.stack((rows[:-1][same], rows[1:][same]))
 
@@ -436,7 +435,7 @@ def _pairs(lanes: LaneTable, rows: Ints) -> Ints:
 def flow_edges(
     lanes: LaneTable, nodes: MapNodes, ribbons: Ribbons, flow: tuple[Ints, Ints]
 ) -> list[Edge]:
-    """``travelsTo`` and ``conflictsWith`` among lanes; ``nodes`` are theirs."""
+    """Return the edges ``travelsTo`` and ``conflictsWith`` among lanes; ``nodes`` are their nodes."""
     crossing = [
         lane
         for lane, (kind, junction) in enumerate(zip(lanes.type, nodes.junction, strict=True))
@@ -451,7 +450,7 @@ def flow_edges(
 
 
 def road_nodes(document: Document) -> list[MapNodes]:
-    """The roads, the junctions and the roundabouts, in their order."""
+    """Return the nodes of roads, junctions and roundabouts."""
     every = range(len(document["road"]))
     road = MapNodes.of(
         "road",
@@ -466,7 +465,7 @@ def road_nodes(document: Document) -> list[MapNodes]:
 
 
 def _roundabouts(document: Document) -> dict[str, set[str]]:
-    """Roundabouts and their junctions: groups of junctions of that type (ASAM OpenDRIVE 1.8, 12.14)."""
+    """Return roundabouts with their junctions: junction groups of that type (ASAM OpenDRIVE 1.8, 12.14)."""
     groups, members = document["junctionGroup"], document["junctionGroup/junctionReference"]
     names, found = groups.texts("id"), dict[str, set[str]]()
     kinds = groups.texts("type")
@@ -477,7 +476,7 @@ def _roundabouts(document: Document) -> dict[str, set[str]]:
 
 
 def _in_roundabouts(document: Document) -> Iterator[tuple[int, int]]:
-    """Rows of roads and of roundabouts: those of its junctions, and those from one of these to another."""
+    """Yield rows of road and roundabout: roads in its junctions, and roads between two of them."""
     ends: list[list[str]] = [[] for _ in range(len(document["road"]))]
     for kind in ("road/predecessor", "road/successor"):
         table = document[kind]
@@ -492,7 +491,7 @@ def _in_roundabouts(document: Document) -> Iterator[tuple[int, int]]:
 
 
 def road_types(document: Document) -> dict[str, tuple[tuple[float, str], ...]]:
-    """Id of each road that has a type → where along it which type begins."""
+    """Map each road with a type to the start of each type along it."""
     table = document["road/type"]
     found: dict[str, list[tuple[float, str]]] = {}
     places = document.rough_numbers("road/type", "s").tolist()
@@ -502,14 +501,14 @@ def road_types(document: Document) -> dict[str, tuple[tuple[float, str], ...]]:
 
 
 def junction_types(document: Document) -> dict[str, str]:
-    """Id of each junction → its type (ASAM OpenDRIVE 1.8, 12: one that does not say is ``default``)."""
+    """Map each junction to its type; by default ``default`` (ASAM OpenDRIVE 1.8, 12)."""
     table = document["junction"]
     pairs = zip(table.texts("id"), table.texts("type", "default"), strict=True)
     return {name: kind.strip() or "default" for name, kind in pairs}
 
 
 def containment(document: Document, road: Ints) -> list[Edge]:
-    """``isIn``: lanes in their roads, roads in junctions and roundabouts, in the order of their nodes.
+    """Return the edges ``isIn``: lanes in roads, roads in junctions and roundabouts.
 
     ``road``: rows of the roads of all lanes.
     """
@@ -534,10 +533,10 @@ def containment(document: Document, road: Ints) -> list[Edge]:
 
 
 # Road marks → where traffic may change lanes ----------------------------------------------------
-# The mark of a lane is on its outer border, that of the centre lane on the line between left and right. What
-# ``laneChange`` says holds; where it says nothing the type of the mark does: broken lines may be crossed, and
-# of a double line the one on one's own side counts. A border without any mark forbids nothing. (ASAM OpenDRIVE
-# 1.8, 11.9.)
+# The mark of a lane is on its outer border; the mark of the centre lane is on the line between left
+# and right. The attribute ``laneChange`` decides. Without it the type of the mark decides: broken
+# lines may be crossed, and for a double line the one on one's own side counts. A border without a
+# mark allows changes. (ASAM OpenDRIVE 1.8, 11.9.)
 
 _ATTRIBUTE: Final = {
     "both": (True, True),
@@ -545,22 +544,22 @@ _ATTRIBUTE: Final = {
     "increase": (True, False),
     "decrease": (False, True),
 }
-"""``laneChange`` → whether lanes may be changed towards higher ids (to the left along s), towards lower ids."""
+"""``laneChange`` → permission to change towards higher ids (to the left along s), and towards lower ids."""
 
 _CROSSED: Final = frozenset({"none", "broken", "broken broken", "botts dots"})
-"""Types of marks that may be crossed from either side."""
+"""Types of marks that may be crossed from both sides."""
 
 
 def permitted(kind: str, attribute: str, owner: int) -> tuple[bool, bool]:
-    """Permission of a mark to change towards higher lane ids, and towards lower ids.
+    """Return the permission of a mark to change towards higher lane ids, and towards lower ids.
 
     Parameters
     ----------
     kind, attribute : str
         ``type`` and ``laneChange`` of the mark.
     owner : int
-        Id of the lane whose mark it is. Double lines are named from the inside out, that of the centre lane
-        from left to right.
+        Id of the lane with the mark. Double lines are named from the inside out, those of the
+        centre lane from left to right.
     """
     if attribute in _ATTRIBUTE:
         return _ATTRIBUTE[attribute]
@@ -568,17 +567,18 @@ def permitted(kind: str, attribute: str, owner: int) -> tuple[bool, bool]:
         return True, True
     if kind not in {"solid broken", "broken solid"}:
         return False, False
-    # To the right of the centre, inside is to the left. From the side with the broken line one may cross.
+    # To the right of the centre, inside is to the left. Crossing is allowed from the side with the
+    # broken line.
     left_is_broken = (kind == "broken solid") == (owner <= 0)
     return not left_is_broken, left_is_broken
 
 
 _Stretch = tuple[float, float, bool, bool]
-"""Part of a border: start and end, and whether a change to the left, and to the right, is permitted."""
+"""Part of a border: start and end, and the permission to change to the left and to the right."""
 
 
 def read_lane_changes(document: Document, lanes: LaneTable, ribbons: Ribbons) -> LaneChanges:
-    """Stretches for a change of lane: driving lanes side by side with traffic in one direction."""
+    """Return stretches for lane changes: neighbouring driving lanes with traffic in one direction."""
     left, right = wide_pairs(lanes, ribbons)
     driving = np.array([kind in DRIVING for kind in lanes.type], bool)
     one_way = lanes.forward[left] == lanes.forward[right]
@@ -596,7 +596,7 @@ def read_lane_changes(document: Document, lanes: LaneTable, ribbons: Ribbons) ->
 
 
 def _marks(document: Document, lanes: LaneTable) -> Callable[[int, int], list[_Stretch]]:
-    """Return a function that gives the stretches of the border between two lanes, left and right, along s."""
+    """Return a function from two neighbouring lanes to the stretches of their common border."""
     kind = "road/laneSection/lane/roadMark"
     table = document[kind]
     offsets = document.rough_numbers(kind, "sOffset").tolist()
@@ -631,7 +631,7 @@ def _marks(document: Document, lanes: LaneTable) -> Callable[[int, int], list[_S
 
 
 def read_broad_lines(document: Document, lanes: LaneTable, ribbons: Ribbons) -> MapPlaces:
-    """Markings of the weight ``bold``: at the outer border of one lane, at the inner one of the next."""
+    """Return ``bold`` markings: at the outer border of one lane, at the inner border of the next."""
     kind = "road/laneSection/lane/roadMark"
     table, offsets = document[kind], document.rough_numbers(kind, "sOffset").tolist()
     columns = table.parent, offsets, table.texts("type", "none"), table.texts("weight")
@@ -654,7 +654,7 @@ def read_broad_lines(document: Document, lanes: LaneTable, ribbons: Ribbons) -> 
         cuts = [min(max(start + offset, start), end) for offset, _ in sorted(marks)] + [end]
         for (_, bold), first, last in zip(sorted(marks), cuts, cuts[1:], strict=False):
             for row, inner in beside if bold and last > first else ():
-                # Inside is left of a lane that is driven on its road's right.
+                # Inside is left for a lane on the right of its road's direction.
                 left = inner == ((lanes.ident[row] < 0) == lanes.forward[row])
                 rows.append((row, bool(left), first, last))
     lane = np.array([row[0] for row in rows], np.int64)
@@ -668,7 +668,7 @@ def read_broad_lines(document: Document, lanes: LaneTable, ribbons: Ribbons) -> 
 
 
 def _along(ribbons: Ribbons, lane: Ints, to: Ints, ends: Floats) -> LaneChanges:
-    """Stretches from s to lengths of the centre line, in order, those that follow on one another as one."""
+    """Convert stretches from s to lengths of the centre line, and join consecutive ones."""
     one, other = ribbons.along_at(lane, ends[:, 0]), ribbons.along_at(lane, ends[:, 1])
     start, end = np.minimum(one, other), np.maximum(one, other)
     order = np.lexsort((start, to, lane))

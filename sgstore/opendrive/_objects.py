@@ -1,10 +1,10 @@
-"""Objects beside and on roads: crosswalks, parking spaces, and scenery with its outlines.
+"""Objects at roads: crosswalks, parking spaces, and scenery with its outlines.
 
-An object has outlines, in its own axes (``cornerLocal``) or along the road (``cornerRoad``); or a length and
-a width; or a radius; or nothing, and is a point. A ``repeat`` makes many of one: copies at distances, or one
-strip along the road where the distance is 0. (ASAM OpenDRIVE 1.8, 13.) All corners of all objects are placed
-at once. A parking space is a lane of type ``parking`` with two cross sections. What is painted on the road
-(stop lines, arrows, hatchings) is neither a thing nor a place to be in, and makes no node.
+An object has outlines, in its own axes (``cornerLocal``) or along the road (``cornerRoad``); or a
+length and a width; or a radius; or it is a point. A ``repeat`` makes many objects of one: copies at
+distances, or one strip along the road for distance 0. (ASAM OpenDRIVE 1.8, 13.) All corners of all
+objects are placed at once. A parking space is a lane of type ``parking`` with two cross sections.
+Paint on the road (stop lines, arrows, hatchings) has no node.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
 
 PARKING: Final = "parking"
-"""What a parking space is: no kind of entity, but a lane of this type."""
+"""Marker for a parking space: it is a lane of this type, not an entity."""
 PAINT: Final = "paint"
-"""What is only paint: no kind either."""
+"""Marker for paint, which is not an entity either."""
 
 KIND_OF_TYPE: Final = {
     **dict.fromkeys(
@@ -61,21 +61,21 @@ _PHRASES: Final = (
     (("tree", "bush", "hedge", "shrub", "vegetation"), "vegetation"),
     (("parking space", "parking lot"), PARKING),
 )
-"""Words, one after another, in a name or unknown type → kinds, the first that fits: for maps without types."""
+"""Words in a name or unknown type → kinds, for maps without types; the first match counts."""
 _WORD: Final = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 
 MOST_POINTS: Final = 1_000_000
-"""Corners that the objects of a map may have together, copies included; what has more is left out and said."""
+"""Greatest number of corners of all objects of a map, with copies; more are left out with a warning."""
 _STRIP_STEP: Final = 1.0
-"""Distance of the corners of a strip along a road; m."""
+"""Distance between the corners of a strip along a road; m."""
 _MOST_STEPS: Final = 5_000
 _CIRCLE: Final = np.linspace(0.0, 2 * np.pi, 16, endpoint=False)
 
 
 def kind_of_object(type_name: str, name: str) -> str:
-    """The kind of an object by its type, else by whole words of its type and name.
+    """Return the kind of an object by its type, else by whole words of its type and name.
 
-    :data:`PARKING` and :data:`PAINT` for what is no entity; ``prop`` for whatever is none of the others.
+    :data:`PARKING` and :data:`PAINT` for objects that are not entities; ``prop`` for all others.
     """
     declared = KIND_OF_TYPE.get(type_name.strip().lower())
     if declared is not None:
@@ -95,18 +95,18 @@ def _singular(word: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Objects:
-    """Objects of a map: nodes, and a geometry of each."""
+    """Objects of a map: nodes, and one geometry each."""
 
     nodes: MapNodes
     shapes: list[Any]
 
     def take(self, rows: Ints) -> Objects:
-        """Some of them, in the order given."""
+        """Return the objects of these rows, in this order."""
         return Objects(self.nodes.take(rows), [self.shapes[row] for row in rows.tolist()])
 
 
 class _Ring(NamedTuple):
-    """Corners (k, 2) around an area, or along a line, of an item."""
+    """Corners (k, 2) of an area, or of a line, of an item."""
 
     item: int
     corners: Floats
@@ -115,9 +115,9 @@ class _Ring(NamedTuple):
 
 @dataclass(slots=True)
 class _Items:
-    """Things beside the roads, one row a copy or a strip, and the rings that are its outline.
+    """Objects at the roads, one row per copy or strip, with their rings.
 
-    The corners of ``local`` are in the item's own axes, those of ``along`` are s and t of its road.
+    Corners in ``local`` are in the item's own axes; corners in ``along`` are s and t of its road.
     """
 
     row: list[int] = field(default_factory=list[int])
@@ -133,7 +133,7 @@ class _Items:
     def add(
         self, row: int, name: str, place: tuple[float, float, float], size: tuple[float, float]
     ) -> int:
-        """One more item: the object it comes from, its s, t and height, length and width; its number."""
+        """Add an item (object row, s, t and height, length and width); return its number."""
         self.row.append(row)
         self.name.append(name)
         self.place.append(place)
@@ -144,9 +144,9 @@ class _Items:
 def read_objects(
     document: Document, plan: PlanView, warnings: list[str]
 ) -> tuple[Objects, Objects, list[PlainLane], Ints]:
-    """Read the objects of a map; one whose place is broken is left out with a warning.
+    """Read the objects of a map; an object with an invalid place is left out with a warning.
 
-    Crosswalks, all other entities, parking spaces, and the rows of their roads.
+    Returns crosswalks, all other entities, parking spaces, and the rows of their roads.
     """
     kind = "road/object"
     table = document[kind]
@@ -186,7 +186,7 @@ def read_objects(
 
 
 def _space(objects: Objects, row: int) -> PlainLane | None:
-    """A parking space as a lane: lengthwise, as the object faces; ``None`` if it has no area."""
+    """Convert a parking space to a lane along its heading, or ``None`` without an area."""
     nodes, shape = objects.nodes, objects.shapes[row]
     if shape.area <= 0:
         return None
@@ -211,7 +211,7 @@ def _space(objects: Objects, row: int) -> PlainLane | None:
 
 
 def _quadrangle(shape: Any) -> Floats:
-    """(4, 2): the corners of a shape that has four, counter-clockwise, else of the rectangle around it."""
+    """Return the four corners of a shape, or of its bounding rectangle, counter-clockwise, (4, 2)."""
     if shape.geom_type != "Polygon" or len(shape.exterior.coords) != 5 or not shape.is_valid:
         shape = shapely.minimum_rotated_rectangle(shape)
     corners = np.asarray(shape.exterior.coords, np.float64)[:-1]
@@ -220,7 +220,7 @@ def _quadrangle(shape: Any) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class _Repeat:
-    """A ``repeat``: from ``s`` for ``length``, every ``distance``; the rest at its start and its end."""
+    """A ``repeat``: from ``s`` for ``length``, every ``distance``; other values at its start and end."""
 
     s: float
     length: float
@@ -230,19 +230,19 @@ class _Repeat:
     width: tuple[float, float]
 
     def copies(self) -> int:
-        """Number of copies that a repetition makes; of a strip, of the steps along the road."""
+        """Return the number of copies; for a strip, the number of steps along the road."""
         step = self.distance if self.distance > 0 else max(_STRIP_STEP, self.length / _MOST_STEPS)
         return int(min(np.floor(self.length / step + 1e-9), MOST_POINTS)) + 1
 
     def shares(self, n: int) -> Floats:
-        """(n,): how far along it is at each of n copies, 0 … 1."""
+        """Return the places of n copies along the repetition, 0 … 1, (n,)."""
         if self.distance > 0 and self.length > 0:
             return np.arange(n, dtype=np.float64) * (self.distance / self.length)
         return np.linspace(0.0, 1.0, n)
 
 
 def _repeats(document: Document) -> dict[int, list[_Repeat]]:
-    """Row of an object → its repeats; one that is no numbers is none."""
+    """Map rows of objects to their repeats, without invalid ones."""
     kind = "road/object/repeat"
     names = ("s", "length", "distance", "tStart", "tEnd", "zOffsetStart", "zOffsetEnd")
     columns = [document.rough_numbers(kind, name) for name in names]
@@ -270,14 +270,14 @@ class _Outlines:
         self.ids = document[kind].texts("id")
 
     def of(self, row: int) -> tuple[list[Floats], list[Floats]]:
-        """Rings of an object in its own axes, and along its road, its own place taken off."""
+        """Return rings of an object in its own axes, and along its road relative to its place."""
         place = np.array((self.own["s"][row], self.own["t"][row]))
         along = [ring - place for ring in self.along.get(row, [])]
         local = self.local.get(row, [])
         return (local if local or along else [self._plain(row)]), along
 
     def _plain(self, row: int) -> Floats:
-        """The outline of an object that has none but may have a size."""
+        """Return the outline of an object from its size, or a point."""
         length, width, radius = (self.own[name][row] for name in ("length", "width", "radius"))
         if length > 0 and width > 0:
             return np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (length / 2, width / 2)
@@ -287,7 +287,7 @@ class _Outlines:
 
 
 def _corners(document: Document, tag: str, names: tuple[str, str]) -> dict[int, list[Floats]]:
-    """Row of an object → its outlines with corners of this kind; one that is no numbers is none."""
+    """Map rows of objects to outlines with corners of this kind, without invalid ones."""
     kind = f"road/object/outline/{tag}"
     points = np.column_stack([document.rough_numbers(kind, name) for name in names])
     outline = document[kind].of
@@ -303,7 +303,7 @@ def _corners(document: Document, tag: str, names: tuple[str, str]) -> dict[int, 
 def _items(
     outlines: _Outlines, repeats: dict[int, list[_Repeat]], rows: list[int], warnings: list[str]
 ) -> _Items:
-    """The objects of ``rows``, each as often as its repeats say."""
+    """Return the objects of ``rows`` with all their repeats."""
     items = _Items()
     own = outlines.own
     for row in rows:
@@ -336,7 +336,7 @@ _Rings = tuple[list["Floats"], list["Floats"]]
 
 
 def _stand(items: _Items, item: int, rings: _Rings) -> None:
-    """Give an item its rings."""
+    """Add rings to an item at its place."""
     s, t, _ = items.place[item]
     items.local.extend(_Ring(item, ring) for ring in rings[0])
     items.along.extend(_Ring(item, ring + np.array((s, t))) for ring in rings[1])
@@ -349,7 +349,7 @@ def _copy(
     repeat: _Repeat,
     one: tuple[_Rings, tuple[float, float]],
 ) -> int:
-    """The copies that a repeat makes of an object with these rings and this size; the next copy's number."""
+    """Add the copies of a repeat; return the number of the next copy."""
     shares = repeat.shares(repeat.copies()).tolist()
     for number, share in enumerate(shares, name[1]):
         place = (
@@ -362,7 +362,7 @@ def _copy(
 
 
 def _stretch(items: _Items, row: int, name: str, repeat: _Repeat) -> None:
-    """The strip along the road that a repeat without distance makes of an object."""
+    """Add the strip along the road of a repeat without distance."""
     n = repeat.copies() + 1
     share = repeat.shares(n)
     s, t = repeat.s + share * repeat.length, np.interp(share, (0, 1), repeat.t)
@@ -379,7 +379,7 @@ def _stretch(items: _Items, row: int, name: str, repeat: _Repeat) -> None:
 def _placed(
     document: Document, plan: PlanView, items: _Items, columns: dict[str, Any]
 ) -> list[_Ring]:
-    """All rings in map axes."""
+    """Return all rings in map axes."""
     local, item = _laid_out(items.local)
     cos, sin = np.cos(columns["heading"][item]), np.sin(columns["heading"][item])
     x = columns["x"][item] + cos * local[:, 0] - sin * local[:, 1]
@@ -394,14 +394,14 @@ def _placed(
 
 
 def _laid_out(rings: list[_Ring]) -> tuple[Floats, Ints]:
-    """The corners of rings one after another, and the item of each."""
+    """Concatenate the corners of rings, with the item of each corner."""
     points = np.concatenate([np.zeros((0, 2)), *(ring.corners for ring in rings)])
     items = np.array([ring.item for ring in rings], np.int64)
     return points, np.repeat(items, np.array([len(ring.corners) for ring in rings], np.int64))
 
 
 def _moved(rings: list[_Ring], points: Floats) -> Iterator[_Ring]:
-    """The rings, their corners taken from ``points`` in turn."""
+    """Yield the rings with new corners, taken from ``points`` in order."""
     end = 0
     for ring in rings:
         begin, end = end, end + len(ring.corners)
@@ -409,7 +409,7 @@ def _moved(rings: list[_Ring], points: Floats) -> Iterator[_Ring]:
 
 
 def _shapes(items: _Items, rings: list[_Ring]) -> list[Any]:
-    """The geometry of each item: an area, a line, or a point."""
+    """Return the geometry of each item: an area, a line, or a point."""
     parts: list[list[Any]] = [[] for _ in items.row]
     for item, corners, is_area in rings:
         if len(corners) == 1:

@@ -1,17 +1,6 @@
-"""Text of a road map → RoadMap: OpenDRIVE, and the plain lanes of recordings that carry none.
+"""Reader of road map texts: OpenDRIVE, and plain lanes of recordings without OpenDRIVE.
 
-``document`` reads the text into tables · ``planview`` evaluates reference lines · ``lanes`` stacks lanes on
-them · ``links`` finds where traffic flows on · ``nodes`` and its kin make nodes and relations of it all.
-A road with a defect is left out and named in the map's warnings: the text is then read once more
-without it, so that no later step has to know. Of a width, a border, a height or a lane offset that is no
-number only that record is left out. Only a map without any usable road is an error.
-
-OpenDRIVE 1.4 to 1.8 (ASAM) are read alike. Superelevation, crossfall and the height of kerbs are not: a lane
-lies at the elevation of its reference line, which is what storeys are told apart by.
-
-A map that was read is kept by its content, so that the traces of a store, or pictures one after another, read
-it once a process, with the indices that it made. It is not kept on disk: a town is read in a tenth of a second,
-less than starting takes, and what is read from a file has to be checked again.
+See :mod:`sgstore.opendrive` for the steps and the treatment of defects.
 """
 
 from __future__ import annotations
@@ -60,45 +49,45 @@ if TYPE_CHECKING:
 
 
 SIGNS: Final = Signs()
-"""How signals are read if nobody says otherwise."""
+"""Default interpretation of signals."""
 _ROUNDS: Final = 8
-"""Readings of a text: each leaves out the roads that the one before found defects in."""
+"""Greatest number of readings of a text; each leaves out the roads with defects of the previous one."""
 
 
 _KEPT: Final = 4
-"""Maps that are kept: one of 30 MB of text and 6,000 lanes takes 95 MB, a town a tenth of it."""
+"""Number of cached maps: a map with 30 MB of text and 6,000 lanes takes 95 MB, a town a tenth."""
 
 
 @lru_cache(maxsize=_KEPT)
 def read_map(text: str, name: str, signs: Signs = SIGNS) -> RoadMap:
-    """The road map that a text describes; the same one again if it was asked for lately.
+    """Return the road map that a text describes; recent maps are cached.
 
     Parameters
     ----------
     text : str
-        The text of an ``.xodr`` file, or plain lanes (:mod:`sgstore.roads._lane_text`). Untrusted: time and
-        memory are bounded by its length.
+        The text of an ``.xodr`` file, or plain lanes (:mod:`sgstore.roads._lane_text`). It is
+        untrusted: its length bounds time and memory.
     name : str
-        What people call it; empty: the name in its header, or the first digits of its digest.
+        Display name; empty means the name in its header, or the first digits of its digest.
     signs : Signs
-        How signals are read: kinds that the client says they are, and what their orientation means. A map for
-        which that matters is another map: it has another digest.
+        Interpretation of signals: configured kinds, and the meaning of orientations. If this
+        changes the map, the map has another digest.
 
     Returns
     -------
     RoadMap
-        Roads with a defect are left out; its ``warnings`` say which, and why.
+        Roads with a defect are left out; ``warnings`` names each with the reason.
 
     Raises
     ------
     MapError
-        The text is no XML or no OpenDRIVE, exceeds a bound, or has no road that can be used.
+        The text is not XML or OpenDRIVE, exceeds a limit, or has no usable road.
     """
     return parse_map(text, name, signs)
 
 
 def parse_map(text: str, name: str, signs: Signs = SIGNS) -> RoadMap:
-    """The same, read anew."""
+    """Read a map text without the cache; see :func:`read_map`."""
     if is_lane_text(text):
         return read_lane_text(text, name or _short_digest(text))
     skip: dict[int, MapError] = {}
@@ -125,7 +114,7 @@ def parse_map(text: str, name: str, signs: Signs = SIGNS) -> RoadMap:
 
 
 def _without(odd: Mapping[Record, MapError], skip: Container[int]) -> list[str]:
-    """Warnings of records that were left out of roads that are kept: a line for each road and kind."""
+    """Return warnings about omitted records of kept roads: one line per road and kind."""
     groups: dict[tuple[str, int], list[MapError]] = {}
     for (kind, road, _), error in odd.items():
         if road not in skip:

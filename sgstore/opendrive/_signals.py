@@ -1,10 +1,10 @@
-"""Signals: type, place and controlled lanes, with warnings where these disagree.
+"""Signals: type, place and controlled lanes, with warnings about contradictions.
 
-Signals whose place contradicts the lanes that their orientation names.
+This module finds signals whose place contradicts the lanes of their orientation.
 
-Only what has no validity is looked at. Its place contradicts if nobody drives in the direction that is named
-although there is traffic; and a light, a stop or a yield sign that stands before a junction contradicts if all
-that is named comes out of the junction there while other traffic comes towards it.
+Only signals without validity are checked. The place contradicts if no lane has the named direction
+although there is traffic. The place of a light, stop or yield sign before a junction also
+contradicts if all named lanes come out of the junction while other lanes lead into it.
 """
 
 from __future__ import annotations
@@ -33,30 +33,30 @@ if TYPE_CHECKING:
 
 
 NEAR: Final = 50.0
-"""What stands farther from a junction than this is not taken to stand before it; m along the road."""
+"""A signal farther from a junction than this does not count as before it; m along the road."""
 LISTED: Final = 8
-"""Signals that a warning names."""
+"""Greatest number of signals that a warning names."""
 _BEFORE_JUNCTIONS: Final = frozenset({"traffic_light", "stop_sign", "yield_sign"})
 _READERS: Final = {"asam": "as ASAM OpenDRIVE reads it", "carla": "as CARLA reads it"}
 
 
 @dataclass(slots=True)
 class Doubts:
-    """Doubts about the orientation of the signals of a map, as far as they were found.
+    """Collector of contradictory orientations of the signals of a map.
 
     Parameters
     ----------
     document : Document
     network : Network
     reading : str
-        ``asam`` or ``carla``: how orientations are read.
+        ``asam`` or ``carla``: interpretation of orientations.
 
     Attributes
     ----------
     kinds : dict
         Signal -> its kind.
     asked : int
-        How many elements there are that have an orientation and no validity.
+        Number of elements with an orientation and without validity.
     """
 
     document: Document
@@ -75,10 +75,10 @@ class Doubts:
         there: frozenset[int],
         readings: tuple[frozenset[int], frozenset[int]],
     ) -> None:
-        """Look at an element of a signal at a place (road, s).
+        """Check an element of a signal at a place (road, s).
 
-        ``there``: the driving lanes at this place; ``readings``: those of them that it names, and those that
-        it would name as others read it.
+        ``there``: the driving lanes at this place; ``readings``: the lanes of its orientation in
+        the chosen and in the other interpretation.
         """
         self.asked += 1
         ours, theirs = (self._fits(self.kinds.get(signal, ""), place, there, r) for r in readings)
@@ -86,7 +86,7 @@ class Doubts:
             self._odd[signal] = self._odd.get(signal, True) and theirs
 
     def warnings(self) -> list[str]:
-        """Warning about the signals whose orientation is in doubt; empty if there are none."""
+        """Return a warning about signals with a doubtful orientation, or an empty list."""
         if not self._odd:
             return []
         names = ", ".join(map(repr, list(self._odd)[:LISTED]))
@@ -117,7 +117,7 @@ class Doubts:
         return bool(lanes.both[lane] or lanes.forward[lane] == (end == END))
 
     def _before(self, road: int, s: float) -> str:
-        """The end of its road at which there is a junction before which a place lies; empty: there is none."""
+        """Return the end of the road with a junction near a place, or an empty text."""
         if not self._junctions:
             self._lengths = self.document.rough_numbers("road", "length").tolist()
             self._junctions = {
@@ -142,9 +142,9 @@ class Doubts:
 def places(
     document: Document, plan: PlanView, road: Ints, s: Floats, t: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Places ``s`` along roads and ``t`` to their left; before or beyond a road, its end is taken.
+    """Return places ``s`` along roads and ``t`` to their left, clamped to the road's ends.
 
-    x, y and z in map axes, and the heading of the road there.
+    Returns x, y and z in map axes, and the heading of the road there.
     """
     length = document.numbers("road", "length")[road]
     s = np.clip(s, 0.0, length)
@@ -163,7 +163,7 @@ def places(
 
 
 def standing(document: Document, kind: str, rows: Ints, warnings: list[str]) -> Ints:
-    """Those ``rows`` of signals or objects whose place is known; a warning for each of the others."""
+    """Return the rows with a known place; add a warning for each other row."""
     table = document[kind]
     placed = np.ones(len(table), bool)
     for name in ("s", "t", "zOffset", "hdg", "hOffset"):
@@ -183,10 +183,10 @@ def node_columns(
     rows: Ints,
     at: tuple[Floats, Floats, Floats] | None = None,
 ) -> dict[str, Any]:
-    """Columns of :class:`~sgstore.roads.MapNodes` that say where signals or objects stand.
+    """Return columns of :class:`~sgstore.roads.MapNodes` for places of signals or objects.
 
-    ``at`` is s, t and the height above the road, else the element's own. The heading is the road's plus the
-    element's own, as the file has it.
+    ``at`` is s, t and the height above the road, else the element's own. The heading is the sum of
+    the road's and the element's heading.
     """
     table = document[kind]
     own = {
@@ -208,15 +208,15 @@ def node_columns(
 
 
 # Signals: what they are, where they stand, and which lanes they apply to ------------------------
-# A signal stands in one place and applies to lanes of the roads that name it: by its own validity, and by each
-# ``signalReference`` with its own. Without a validity it applies to whatever travels in the direction of its
-# orientation. (ASAM OpenDRIVE 1.8, 14.) LibCarla takes the lanes of a *side* for it: those to the left of the
-# road's line for ``+``. On a road for right-hand traffic these are opposites, and maps are written for either
-# reading, so a signal whose place contradicts the one that is taken is told of
-# (:mod:`sgstore.opendrive._signals`). The maps of CARLA keep speed limits and painted stop signs as
-# *objects* named ``Speed_30`` and ``Stencil_STOP``, which LibCarla reads as signals of type 274 and 206 (and
-# loses the painted ones on the way to its landmarks); their orientation is the sign of the lanes that they
-# apply to.
+# A signal has one place. It applies to lanes of the roads that name it: by its own validity, and by
+# each ``signalReference`` with its validity. Without a validity it applies to all traffic in the
+# direction of its orientation. (ASAM OpenDRIVE 1.8, 14.) LibCarla uses the lanes of a *side*
+# instead: for ``+`` the lanes left of the road's line. On a road for right-hand traffic the two
+# interpretations are opposite, and maps exist for both; therefore a contradictory place causes a
+# warning (:mod:`sgstore.opendrive._signals`). The maps of CARLA contain speed limits and painted
+# stop signs as *objects* named ``Speed_30`` and ``Stencil_STOP``. LibCarla reads them as signals of
+# type 274 and 206 (and loses the painted ones among its landmarks); their orientation is the sign
+# of the lanes that they apply to.
 
 KIND_OF_TYPE: Final = {
     "206": "stop_sign",
@@ -227,14 +227,14 @@ KIND_OF_TYPE: Final = {
     "274.1": "speed_limit",
     "R2-1": "speed_limit",
 }
-"""Codes of traffic signs → kinds: StVO (Germany), which CARLA and esmini use, and MUTCD (United States)."""
+"""Codes of traffic signs → kinds: StVO (Germany), used by CARLA and esmini, and MUTCD (United States)."""
 
 _LIGHT: Final = re.compile(r"10000(0[1-9]|1\d|2\d)$")
-"""Codes of traffic lights in the catalogue that OpenDRIVE's country ``OpenDRIVE`` means."""
+"""Codes of traffic lights in the catalogue of OpenDRIVE's country ``OpenDRIVE``."""
 _NOT_LIGHTS: Final = {"1000003", "1000004"}
 """Crossings for people and bicycles, painted on the road."""
 _STOP_LINE: Final = "294"
-"""Code of the line at which one stops: StVO (Germany), which other countries' maps use, too."""
+"""Code of a stop line: StVO (Germany), also used in maps of other countries."""
 _SPEED_OBJECT: Final = re.compile(r"speed_(\d+(?:\.\d+)?)", re.IGNORECASE)
 _STOP_STENCIL: Final = "stencil_stop"
 
@@ -251,12 +251,12 @@ class Signals:
     ----------
     nodes : MapNodes
     lanes : list of Stops
-        Lanes that each applies to, and where.
+        Lanes that each signal applies to, and the places.
     codes : list of str
         The type of each in the file.
     told : str
-        Which kinds are what the client says that they are, and how orientations are read if that is not as
-        the standard says and matters; empty: none, and it is.
+        Configured kinds, and the interpretation of orientations if it differs from the standard and
+        matters; empty if neither applies.
     """
 
     nodes: MapNodes
@@ -265,7 +265,7 @@ class Signals:
     told: str = ""
 
     def edges(self, first: int) -> Edge:
-        """``controlsTrafficOf``; ``first`` is the row of the first signal among the nodes."""
+        """Return the edges ``controlsTrafficOf``; ``first`` is the row of the first signal among the nodes."""
         found = {(first + row, lane) for row, lanes in enumerate(self.lanes) for lane, _ in lanes}
         pairs = sorted(found)
         signal, lane = np.array(pairs, np.int64).reshape(-1, 2).T
@@ -278,12 +278,12 @@ class Signals:
         return first + row, lane, np.array([s for *_, s in rows], np.float64)
 
     def stop_lines(self, first: int) -> Ints:
-        """Rows, among the nodes, of those that are painted stop lines."""
+        """Return rows of the painted stop lines among the nodes."""
         return first + np.array([r for r, c in enumerate(self.codes) if c == _STOP_LINE], np.int64)
 
 
 def read_signals(document: Document, plan: PlanView, network: Network, signs: Signs) -> Signals:
-    """The signals of a map; one whose place is broken is left out with a warning."""
+    """Read the signals of a map; a signal with an invalid place is left out with a warning."""
     reach = _Reach(document, network, signs.orientation)
     kinds = dict(signs.kinds)
     parts = (_elements(document, plan, reach, kinds), _signal_objects(document, plan, reach))
@@ -298,7 +298,7 @@ def read_signals(document: Document, plan: PlanView, network: Network, signs: Si
 
 
 def read_controllers(document: Document) -> dict[str, tuple[str, ...]]:
-    """Id of each controller → ids of the signals that switch together."""
+    """Map each controller to the ids of the signals that switch together."""
     table = document["controller/control"]
     names = document["controller"].texts("id")
     members: dict[str, list[str]] = {}
@@ -308,12 +308,12 @@ def read_controllers(document: Document) -> dict[str, tuple[str, ...]]:
 
 
 def is_signal_object(name: str) -> bool:
-    """Return whether an object of this name is a signal in truth."""
+    """True if an object with this name is a signal."""
     return bool(_SPEED_OBJECT.match(name)) or _STOP_STENCIL in name.lower()
 
 
 def kind_of_signal(code: str, *, dynamic: bool, name: str = "") -> str:
-    """The kind of a signal with this type code; ``sign`` for whatever is none of the others."""
+    """Return the kind of a signal with this type code; by default ``sign``."""
     if _LIGHT.match(code) and code not in _NOT_LIGHTS:
         return "traffic_light"
     if code in KIND_OF_TYPE:
@@ -342,11 +342,11 @@ class _Reach:
             kind: _validities(document, kind) for kind in ("road/signal", "road/signalReference")
         }
         self._tables = {kind: document[kind] for kind in self._ranges}
-        # Many signals apply to the same lanes: what was found once is found again.
+        # Many signals apply to the same lanes: results are cached.
         self._known: dict[tuple[int, object], frozenset[int]] = {}
 
     def valid(self, element: tuple[str, int, str], place: tuple[int, float]) -> frozenset[int]:
-        """The driving lanes at a place (road, s) that an element (its kind, row and signal) is valid for."""
+        """Return the driving lanes at a place (road, s) in the validity of an element (kind, row, signal)."""
         kind, row, signal = element
         ranges = self._ranges[kind].get(row)
         orientation = self._tables[kind].attributes[row].get("orientation", "")
@@ -371,14 +371,14 @@ class _Reach:
         return self._known[key]
 
     def on_side(self, place: tuple[int, float], *, left: bool) -> frozenset[int]:
-        """The driving lanes at a place (road, s) to the left or to the right of the centre lane."""
+        """Return the driving lanes at a place (road, s) to the left or right of the centre lane."""
         lanes = self._driving.get(self._network.section_at(*place), [])
         return frozenset(lane for lane, ident in lanes if (ident > 0) == left)
 
     def _oriented(
         self, lanes: list[tuple[int, int]], orientation: str, reading: str
     ) -> frozenset[int]:
-        """The lanes that an orientation means: of traffic in that direction, or of that side."""
+        """Return the lanes of an orientation: those in that direction, or on that side."""
         if orientation not in {"+", "-"}:
             return frozenset(lane for lane, _ in lanes)
         plus, about = orientation == "+", self._network.lanes
@@ -434,7 +434,7 @@ def _stops(lanes: frozenset[int], place: tuple[int, float]) -> Stops:
 
 
 def _referred(document: Document, reach: _Reach) -> dict[str, Stops]:
-    """Id of a signal → lanes that references to it, anywhere in the map, make it apply to, and where."""
+    """Map each signal to the lanes and places of all references to it."""
     kind = "road/signalReference"
     table = document[kind]
     s = document.rough_numbers(kind, "s")
@@ -449,7 +449,7 @@ def _referred(document: Document, reach: _Reach) -> dict[str, Stops]:
 
 
 def _limit(attributes: dict[str, str]) -> float:
-    """Speed limit of a sign; without a unit, km/h, or mph for the United States' own codes."""
+    """Return the speed limit of a sign; the default unit is km/h, or mph for codes of the United States."""
     american = attributes.get("type", "").startswith("R") or attributes.get("country") == "US"
     unit = attributes.get("unit") or ("mph" if american else "km/h")
     return speed(attributes.get("value", ""), unit)
