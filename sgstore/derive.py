@@ -1,4 +1,4 @@
-"""Other relations from the states of a store, without its recordings: ``derive``."""
+"""Derivation of other relations from the states in a store, without its recordings."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ if TYPE_CHECKING:
 
 
 _ASIDE: Final = 10.0
-"""How far at most the line of a corridor begins from the ego; m."""
+"""Maximum distance from the ego to the start of a corridor line; m."""
 
 _NOT_RELATIONS: Final = ("ego", "egos", "payloads", "mapping", "rate")
-"""Settings that say what is read, not what is related: those of the ingest hold."""
+"""Settings of the reading, not of relations; the values of the ingest apply."""
 
 
 @dataclass(frozen=True, slots=True)
 class Derivation:
-    """Outcome of a trace.
+    """Outcome of the derivation for one trace.
 
     Attributes
     ----------
     trace : str
         Its name.
     status : str
-        ``derived``; ``present``: the store had this set of it already, with the same settings.
+        ``derived``; ``present``: the store already had this set with the same settings.
     frames, edges : int
-        How many were made; an edge counts in every frame. 0 if it was present.
+        Number of derived frames and edges; an edge counts in every frame. 0 for ``present``.
     losses : list of str
-        What could not be made.
+        Parts that could not be derived.
     """
 
     trace: str
@@ -64,22 +64,22 @@ def derive(
     *,
     replace_old: bool = False,
 ) -> list[Derivation]:
-    """Make another set of relations from the stored states, and keep it under a name.
+    """Derive another set of relations from the stored states, and store it under a name.
 
-    It holds what ingesting with these settings would have made: edges, and what is in range. Each trace is one
-    transaction, so that a run that was killed goes on where it was; the recordings are not read.
+    The set equals an ingest with these settings: the same edges, and the same range. The recordings are not
+    read. Each trace is one transaction, so a stopped run can continue.
 
     Parameters
     ----------
     store : str or Path
     config : Config
-        Its relations and range. What is read from a recording (egos, payloads, rate) stays as it was ingested.
+        Its relations and range apply. The settings of the reading (egos, payloads, rate) stay as ingested.
     name : str
-        Of the set; what ``USING ABSTRACTION`` takes.
+        Name of the set, for ``USING ABSTRACTION``.
     traces : sequence, optional
-        Names or ids; all by default.
+        Names or ids. Default: all traces.
     replace_old : bool
-        Whether a set of this name with other settings is replaced.
+        Replace a set of this name with other settings.
 
     Returns
     -------
@@ -89,11 +89,11 @@ def derive(
     Raises
     ------
     AbstractionError
-        The name is no name, is that of an abstraction, or is taken by a set with other settings.
+        The name is invalid, is the name of an abstraction, or belongs to a set with other settings.
     ConfigError
-        The settings need what is not in the store: a larger range, other kinds, finer lanes.
+        The settings need data that the store lacks: a larger range, other kinds, finer lanes.
     StoreError
-        There is no such store or trace, or others keep the store for too long.
+        The store or a trace does not exist, or another process locks the store for too long.
     """
     check_name(name)
     if normalize_name(name) in abstractions():
@@ -125,17 +125,18 @@ def derive(
 def keep_abstraction(
     store: str | Path, name: str, traces: Sequence[int | str] = ()
 ) -> list[Derivation]:
-    """Keep what an abstraction makes of the stored graphs, so that queries can name it.
+    """Store the graphs of an abstraction under its name, for use in queries.
 
-    That of ``roadscene2vec``, or of a client's own function: nodes of the scene graph, and edges labelled
-    with relations. Nodes that it makes up, and other labels, are in ``graph(frame, abstraction=…)`` only.
+    This works for ``roadscene2vec`` and for a client's own function. The set contains nodes of the scene graph,
+    and edges labelled with relations. Artificial nodes and other labels are only in ``graph(frame,
+    abstraction=…)``.
 
     Parameters
     ----------
     store, traces
-        As :func:`derive` takes them.
+        As in :func:`derive`.
     name : str
-        Of the abstraction, and of the set.
+        Name of the abstraction and of the set.
 
     Returns
     -------
@@ -145,9 +146,9 @@ def keep_abstraction(
     Raises
     ------
     AbstractionError
-        There is no such abstraction, or queries can name it without this.
+        The abstraction does not exist, or queries can already use it.
     StoreError
-        There is no such store or trace, or others keep the store for too long.
+        The store or a trace does not exist, or another process locks the store for too long.
     """
     abstraction = abstraction_named(name)
     if abstraction.name in SUBSETS:
@@ -208,11 +209,12 @@ def _digest(config: Config) -> str:
 
 
 def _settings(trace: StoredTrace, wanted: Config) -> Config:
-    """The settings to derive with, if the states of a trace suffice.
+    """Return the settings for the derivation of a trace, after a check against its stored states.
 
     Raises
     ------
     ConfigError
+        The stored states do not suffice.
     """
     if "imported" in trace.report:
         raise ConfigError(
@@ -254,7 +256,7 @@ def _kinds(config: Config) -> set[str]:
 
 
 def _shown(settings: RangeSettings) -> dict[str, Any]:
-    """The settings of a range that say how far it reaches."""
+    """Return the settings that determine the extent of a range."""
     of_shape = {
         "radius": ("radius",),
         "rectangle": ("front", "rear", "side"),
@@ -267,7 +269,7 @@ def _shown(settings: RangeSettings) -> dict[str, Any]:
 
 
 def _covers(old: RangeSettings, new: RangeSettings) -> bool:
-    """Return whether all in the new range is in the old one, for certain."""
+    """True if the old range surely contains the new range."""
     if _shown(old) == _shown(new):
         return True
     for name in ("by", "static_by"):
@@ -280,7 +282,7 @@ def _covers(old: RangeSettings, new: RangeSettings) -> bool:
 
 
 def _reaches(old: RangeSettings, new: RangeSettings) -> bool:
-    """The same of the areas alone."""
+    """True if the area of the old range contains that of the new range, without heights."""
     if old.shape == new.shape == "corridor":
         return new.length <= old.length and new.width <= old.width
     if old.shape == "polygon":

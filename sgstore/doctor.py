@@ -1,4 +1,4 @@
-"""Check of recordings without a store: report what can be read, and any damage."""
+"""Check of recordings without a store: their contents and any damage."""
 
 from __future__ import annotations
 
@@ -29,33 +29,33 @@ class Examination:
     size : int
         Bytes.
     flavour : str
-        Name of the reader that recognises it; empty: none does.
+        Name of the matching reader; empty without one.
     digest : str
-        SHA-256 of the file; empty where it was not read so far.
+        SHA-256 of the file; empty if the file was not fully read.
     channels : list of dict
-        Of each ``topic``, ``schema``, ``message_encoding``, ``messages`` (how many can be read) and ``role``:
-        ``ground_truth``, ``map``, ``payload``; empty where the recording is of no flavour that is known.
+        ``topic``, ``schema``, ``message_encoding``, ``messages`` (number of readable messages) and ``role`` of
+        each: ``ground_truth``, ``map``, ``payload``, or empty without a matching reader.
     ego : str
-        The simulator's id of the ego; empty if there is none.
+        The simulator's id of the ego; empty without an ego.
     road_map : str
-        Name of the road map that it would be read with; empty: none.
+        Name of the road map for an ingest; empty without a map.
     frames, states : int
     seconds : float
-        From the first frame to the last; s.
+        Time from the first to the last frame; s.
     entities : dict
-        Kind → how many there are of it.
+        Number of entities by kind.
     unknown_types : dict
-        Type names that no mapping knows → how many entities bear them.
+        Number of entities by type name, for type names without a mapping.
     clock_jumps, gaps : int
-        How often its clock runs backwards, or further than 2.5 periods.
+        Number of backward steps of the clock, and of steps longer than 2.5 periods.
     clock_jumps_at, gaps_at : list of dict
-        The first of them, as :meth:`sgstore.segments.TraceTally.as_dict` has them.
+        The first of them, as in :meth:`sgstore.segments.TraceTally.as_dict`.
     warnings : list of str
-        What is odd but loses nothing.
+        Oddities without loss of data.
     losses : list of Loss
-        What cannot be used.
+        Unusable parts.
     error : str
-        Why nothing of it can be ingested; empty if something can.
+        Reason why the recording cannot be ingested; empty if it can.
     """
 
     path: Path
@@ -79,14 +79,14 @@ class Examination:
     error: str = ""
 
     def as_dict(self) -> dict[str, Any]:
-        """All of it, as plain values."""
+        """Return all fields as plain values."""
         return asdict(self)
 
 
 def examine(
     path: str | Path, *, config: Config | None = None, road_map: str | Path | None = None
 ) -> Examination:
-    """Read a recording as :func:`sgstore.ingest.ingest` would, and keep only what is told of it.
+    """Read a recording as :func:`sgstore.ingest.ingest` would, and return only the report.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def examine(
     try:
         with working_folder("recording") as held, near(found.path, held):
             _read(found, config, maps, _channels(found, report))
-    except Exception as error:  # noqa: BLE001  the other recordings are examined all the same
+    except Exception as error:  # noqa: BLE001  the other recordings must still be examined
         found.error = str(failure(error, found.path))
         found.warnings = found.warnings or report.warnings
         found.losses = found.losses or report.losses
@@ -116,7 +116,7 @@ def examine(
 
 
 def _channels(found: Examination, report: TraceReport) -> Counter[int]:
-    """Take note of the channels of a recording; how many messages of each, by its id, can be read."""
+    """Fill in the channels of a recording. Return the number of readable messages by channel id."""
     counts: Counter[int] = Counter()
     recording = open_recording(found.path)
     try:

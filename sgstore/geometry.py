@@ -1,14 +1,14 @@
-"""Plane geometry of many things at once, and the conventions that hold everywhere.
+"""Plane geometry on arrays, and the conventions of the project.
 
 Conventions
 -----------
 * Axes are OpenDRIVE's inertial axes: right-handed, x east, y north, z up; metres.
-* Angles are radians, counter-clockwise, heading 0 along +x. Outward (views, patterns, JSON): degrees.
+* Angles are radians, counter-clockwise, heading 0 along +x. Outputs (views, patterns, JSON) use degrees.
 * A *bearing* of b from a is the direction from a's centre to b's centre in a's axes: 0 dead ahead, positive
   to the left, in (-π, π].
 * Times are ``int64`` nanoseconds and end in ``_ns``; everything else is SI without suffix.
 * A box is an oriented rectangle in the plane: centre, heading, length along the heading, width across it.
-* A missing number is NaN and makes whatever is computed from it NaN.
+* A missing number is NaN. A result computed from NaN is NaN.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ Floats: TypeAlias = "NDArray[np.float64]"
 
 
 def wrapped(angle: Floats) -> Floats:
-    """Angles brought into (-π, π]; rad. What is not finite becomes NaN."""
+    """Return angles wrapped into (-π, π]; rad. An infinite angle becomes NaN."""
     with np.errstate(invalid="ignore"):
         turned = angle - 2 * np.pi * np.ceil((angle - np.pi) / (2 * np.pi))
-    return np.minimum(turned, np.pi)  # rounding may leave it a little above
+    return np.minimum(turned, np.pi)  # Rounding can exceed π slightly.
 
 
 def corners(boxes: Floats) -> Floats:
-    """Corners of boxes.
+    """Return the four corners of each box.
 
     Parameters
     ----------
@@ -54,20 +54,20 @@ def corners(boxes: Floats) -> Floats:
 
 
 def offsets(dx: Floats, dy: Floats, heading: Floats) -> tuple[Floats, Floats]:
-    """Longitudinal (ahead) and lateral (to the left) parts of vectors, in axes turned by ``heading``."""
+    """Return the longitudinal (ahead) and lateral (left) parts of vectors in axes rotated by ``heading``."""
     cos, sin = np.cos(heading), np.sin(heading)
     return dx * cos + dy * sin, dy * cos - dx * sin
 
 
 def bearings(dx: Floats, dy: Floats, heading: Floats) -> Floats:
-    """Directions of vectors in axes turned by ``heading``, in (-π, π]; rad. 0 for a vector of no length."""
-    # The difference of two angles is exact for the headings that people write (0, π/2, π), where the
-    # angle of turned components is not: the cosine of the double nearest to π/2 is 6e-17.
+    """Return the directions of vectors relative to ``heading``, in (-π, π]; rad. Zero vectors give 0."""
+    # The difference of two angles is exact for common headings (0, π/2, π). The angle of rotated components
+    # is not: the cosine of the double nearest to π/2 is 6e-17.
     return np.where((dx == 0) & (dy == 0), 0 * heading, wrapped(np.arctan2(dy, dx) - heading))
 
 
 def gap_to_points(boxes: Floats, x: Floats, y: Floats) -> Floats:
-    """Shortest distance between each box and its point; 0 in or on the box.
+    """Return the shortest distance between each box and its point; 0 in or on the box.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ Corner = Sequence[float]
 
 
 def is_simple(corners: Sequence[Corner]) -> bool:
-    """Return whether a polygon's sides meet at its corners only, one after another."""
+    """True if the polygon does not cross or touch itself."""
     sides = list(zip(corners, (*corners[1:], corners[0]), strict=True))
     folded_back = any(
         _turn(*one, other[1]) == 0 and not _between(*one, other[1], ahead=True)
@@ -101,7 +101,7 @@ def is_simple(corners: Sequence[Corner]) -> bool:
 
 
 def _meet(one: tuple[Corner, Corner], other: tuple[Corner, Corner]) -> bool:
-    """Return whether two sides have a point in common."""
+    """True if two sides have a common point."""
     ends = ((*one, other[0]), (*one, other[1]), (*other, one[0]), (*other, one[1]))
     turns = [_turn(*three) for three in ends]
     if turns[0] * turns[1] < 0 and turns[2] * turns[3] < 0:
@@ -110,7 +110,7 @@ def _meet(one: tuple[Corner, Corner], other: tuple[Corner, Corner]) -> bool:
 
 
 def _between(a: Corner, b: Corner, c: Corner, *, ahead: bool = False) -> bool:
-    """Return whether c, on the line through a and b, lies between them; or ``ahead``: beyond b, seen from a."""
+    """True if c lies between a and b on their line. With ``ahead``: true if c lies beyond b."""
     if ahead:
         return (b[0] - a[0]) * (c[0] - b[0]) + (b[1] - a[1]) * (c[1] - b[1]) > 0
     return all(min(p, q) <= r <= max(p, q) for p, q, r in zip(a, b, c, strict=True))

@@ -1,6 +1,6 @@
-"""Ingest: recordings into a store, in one process or several.
+"""Ingest of recordings into a store, in one or more processes.
 
-Which recordings are meant by the names that people give.
+Resolution of names, folders, patterns and URLs to recordings.
 """
 
 from __future__ import annotations
@@ -45,23 +45,24 @@ __all__ = ["ingest", "recordings"]
 
 
 def recordings(names: Iterable[str | Path]) -> list[Path]:
-    """The files that are meant: each once, in the order in which they are named.
+    """Return the recordings for file names, folders, patterns and URLs, each once.
+
+    The result has the order of the names. The contents of a folder and the matches of a pattern are sorted.
 
     Parameters
     ----------
     names : iterable of str or Path
-        Files; folders, which stand for the recordings in them and below; bags, by their folder or their
-        ``metadata.yaml``; and patterns (``drives/*/day?.mcap``, ``**`` for any depth) that no shell has
-        expanded. What is in a folder or fits a pattern is sorted. URLs are such names, too:
-        ``s3://bucket/drives/``, ``s3://bucket/*/day?.mcap``, ``https://host/a.mcap`` (a file or a bag: a web
-        server does not tell what else it has).
+        Files; folders, searched recursively; bags, by their folder or their ``metadata.yaml``; and patterns
+        that the shell has not expanded (``drives/*/day?.mcap``; ``**`` matches any depth). URLs are allowed,
+        too: ``s3://bucket/drives/``, ``s3://bucket/*/day?.mcap``, ``https://host/a.mcap``. An ``https`` URL
+        must name one file or bag, because a web server does not list its files.
 
     Raises
     ------
     StoreError
-        A folder holds no recording, or nothing fits a pattern.
+        A folder contains no recording, or a pattern has no match.
     TraceError
-        An object store does not tell what it has.
+        An object store does not list its objects.
     """
     return list(dict.fromkeys(path for name in names for path in _meant(Path(name))))
 
@@ -89,7 +90,7 @@ def _meant(path: Path) -> Iterator[Path]:
 
 
 def _inside(folder: Path) -> Iterator[Path]:
-    """The recordings in a folder and below it; the files that a bag consists of are none themselves."""
+    """Yield the recordings in a folder and its subfolders. A bag counts once, without its files."""
     bags = {path.parent for path in folder.rglob(METADATA) if bag_folder(path.parent) is not None}
     own = {part.path for bag in bags for part in _parts(bag)}
     yield from bags
@@ -99,7 +100,7 @@ def _inside(folder: Path) -> Iterator[Path]:
 
 
 def _meant_by(url: str) -> list[str]:
-    """The recordings that a URL means: itself, those below it, or those that fit it as a pattern."""
+    """Return the recordings of a URL: the file itself, those below it, or the matches of its pattern."""
     pattern = has_magic(url)
     if url.startswith("http") or not (pattern or not url.lower().endswith(ENDINGS)):
         return [url]
@@ -124,7 +125,7 @@ def _meant_by(url: str) -> list[str]:
 
 
 def _fits(url: str, pattern: str) -> bool:
-    """Tell whether a URL, or a folder that it is in, fits a pattern; ``**`` stands for folders at any depth."""
+    """True if a URL or one of its parent folders matches a pattern. ``**`` matches any depth."""
     words = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
 
     def word(found: re.Match[str]) -> str:
@@ -138,27 +139,27 @@ def _fits(url: str, pattern: str) -> bool:
 
 
 def _parts(bag: Path) -> tuple[BagPart, ...]:
-    """The files of a bag; of one that cannot be read none, and reading it says why."""
+    """Return the files of a bag; empty if the bag is unreadable. The later ingest reports the fault."""
     try:
         return parts_of(bag)
     except TraceError:
         return ()
 
 
-# Recordings read in several processes; what they built comes back in the order in which it was asked for ----
-# Processes are told apart from one another by nothing: whoever is free takes the next recording. One that dies
-# (out of memory, say) costs the recording that it was reading, and another takes its place.
+# Reading in several processes. Results come back in the order of the request.
+# All processes are equal: a free process takes the next recording. If a process dies (for example, out of
+# memory), its current recording fails, and a new process replaces it.
 
 _AHEAD: Final = 2
-"""Recordings that a process has been told of: the one that it reads, and the next."""
+"""Recordings assigned to a process at once: the current one and the next."""
 
 _WAITING: Final = 64
-"""Recordings for each process that may be read before the first of them is published."""
+"""Recordings per process that may be read before the first of them is published."""
 
 
 @dataclass(eq=False)
 class _Worker:
-    """A process, and the numbers of the recordings that it was told to read."""
+    """Reader process with the numbers of the recordings assigned to it."""
 
     process: subprocess.Popen[str]
     tasks: deque[int] = field(default_factory=deque[int])
@@ -170,36 +171,37 @@ class _Worker:
             try:
                 stdin.write(f"{json.dumps(values)}\n")
                 stdin.flush()
-            except OSError:  # it has died: that is told where its stdout ends
+            except OSError:  # The process has died; the end of its stdout reports it.
                 return
 
     def end(self) -> int:
-        """End the process if it still runs; its exit code."""
+        """Kill the process if it still runs, and return its exit code."""
         self.process.kill()
         code = self.process.wait()
         if self.listener is not None:
             self.listener.join()
         for pipe in (self.process.stdin, self.process.stdout):
-            with suppress(OSError):  # what was not written is for nobody
+            with suppress(OSError):  # The process has exited; unflushed data can be dropped.
                 if pipe is not None:
                     pipe.close()
         return code
 
 
 class Workers:
-    """Processes that read recordings.
+    """Pool of processes that read recordings.
 
     Parameters
     ----------
     job : Job
     count : int
-        How many.
+        Number of processes.
     on_block : function
-        Called with the number of a recording, the frames done of it, about how many bytes, and its size.
+        Called after each block with the number of the recording, its frames done, its bytes done (approximate)
+        and its size.
 
     Notes
     -----
-    Use it as a context manager: the processes end with it, and with this process, however that ends.
+    Use it as a context manager. The processes end with the context, and also if this process dies.
     """
 
     def __init__(
@@ -221,7 +223,7 @@ class Workers:
             worker.end()
 
     def read(self, paths: list[Path], folder: Path) -> Iterator[Views]:
-        """Yield the outcomes of recordings, in order; segments are built in folders below the one given."""
+        """Yield the outcomes of the recordings, in order. Segments are built in subfolders of ``folder``."""
         waiting, done, given = deque(range(len(paths))), dict[int, "Views"](), 0
         while given < len(paths):
             self._hire(min(self._count, len(waiting) + len(self._workers)))
@@ -250,7 +252,7 @@ class Workers:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 encoding="utf-8",
-                **separate,  # Ctrl-C is for us to deal with
+                **separate,  # The parent process handles Ctrl-C.
             )
             worker = _Worker(process)
             self._workers.append(worker)
@@ -264,7 +266,7 @@ class Workers:
         self._events.put((worker, None))
 
     def _assign(self, waiting: deque[int], paths: list[Path], folder: Path, end: int) -> None:
-        """Give the next recordings to those who have the fewest."""
+        """Assign the next recordings to the processes with the fewest assigned recordings."""
         while waiting and waiting[0] < end:
             worker = min(self._workers, key=lambda one: len(one.tasks), default=None)
             if worker is None or len(worker.tasks) >= _AHEAD:
@@ -277,7 +279,7 @@ class Workers:
     def _replace(
         self, worker: _Worker, waiting: deque[int], paths: list[Path], done: dict[int, Views]
     ) -> None:
-        """A process has died: what it was reading has failed, what it should have read next is still to do."""
+        """Remove a dead process. Its current recording fails; its other recordings return to the queue."""
         self._workers.remove(worker)
         code = worker.end()
         if worker.tasks:
@@ -289,15 +291,15 @@ class Workers:
         waiting.extendleft(reversed(worker.tasks))
 
 
-# The run: recordings are read, here or in other processes, and published in the order that was given ----
-# So the store is the same whatever the number of processes, and a run that was killed and begun again ends with
-# the same store as one that was not.
+# The run: recordings are read, here or in other processes, and published in the given order.
+# The store is therefore the same for any number of processes. A run that is killed and started again gives the
+# same store as an uninterrupted run.
 
 BLOCK_FRAMES: Final = 4 * BUCKET_FRAMES
-"""Frames that are worked on at once: whole buckets, so that a mask is one row."""
+"""Frames per block: whole buckets, so that a mask is one row."""
 
 
-def ingest(  # noqa: PLR0913  as many options as there are ways to read
+def ingest(  # noqa: PLR0913  one option per way to read
     store: str | Path,
     traces: Sequence[str | Path],
     *,
@@ -312,7 +314,9 @@ def ingest(  # noqa: PLR0913  as many options as there are ways to read
     dry_run: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> list[TraceOutcome]:
-    """Read recordings into a store, which is made if there is none and something comes into it.
+    """Read recordings into a store and return the outcomes.
+
+    If the store does not exist, the first successful trace creates it.
 
     Parameters
     ----------
@@ -320,36 +324,36 @@ def ingest(  # noqa: PLR0913  as many options as there are ways to read
     traces : sequence of str or Path
         Files; :func:`sgstore.ingest.recordings` finds them in folders and by patterns.
     road_map : str or Path, optional
-        An OpenDRIVE or Lanelet2 file for the recordings that carry no map of their own, or a folder of such
-        files for those that say what their map is called.
+        An OpenDRIVE or Lanelet2 file for recordings without their own map, or a folder of such files for
+        recordings that contain the name of their map.
     config : Config, optional
     egos : sequence of str, optional
-        Ids, roles or names of several egos, each of which makes a trace of its own; ``all``: every vehicle.
-        By default what the config says.
+        Ids, roles or names of several egos; each makes its own trace. ``all``: every vehicle. Default: the
+        egos of the config.
     jobs : int
-        Processes that read at the same time, each a recording. The store is the same whatever their number.
+        Number of reader processes, each with one recording at a time. The store does not depend on it.
     since, until : float, optional
-        From and up to when frames are read; seconds since the first frame of a recording.
+        Start and end of the frames; seconds since the first frame of a recording.
     rate : float, optional
-        Frames that are kept of a second. By default what the config says.
+        Frames per second to keep. Default: the rate of the config.
     force : bool
-        Whether recordings that are in the store already are read anew, and replaced.
+        Read recordings again that the store already contains, and replace their traces.
     dry_run : bool
-        Whether it is only said what would be done.
+        Only report the outcomes; write nothing.
     on_progress : function, optional
         Called after every block of frames.
 
     Returns
     -------
     list of TraceOutcome
-        For each recording, in the order given, one for each ego.
+        For each recording, in the given order, one for each ego.
 
     Raises
     ------
     StoreError
-        What is at the place of the store is none, or one of another version; or nothing can be written there.
+        The file is not a store or has another version, or the folder is not writable.
     MapError
-        The file given for the road map cannot be read.
+        The given road map cannot be read.
     """
     config = config or Config()
     if egos:
@@ -375,7 +379,7 @@ def ingest(  # noqa: PLR0913  as many options as there are ways to read
     with ExitStack() as stack:
         folder = Path() if dry_run else stack.enter_context(Folder(job.store)).path
         if min(jobs, len(paths)) > 1:
-            Maps(job.road_map, config.signs)  # one that cannot be read stops the run at once
+            Maps(job.road_map, config.signs)  # An unreadable map stops the run at once.
             read = stack.enter_context(Workers(job, jobs, meter.see)).read(paths, folder)
         else:
             read = _one_by_one(job, paths, folder, meter)
@@ -405,7 +409,7 @@ def _one_by_one(job: Job, paths: list[Path], folder: Path, meter: _Meter) -> Ite
 def _published(
     job: Job, file: StoreFile | None, views: Views
 ) -> tuple[StoreFile | None, list[TraceOutcome]]:
-    """The store, made if there is none, with the segments of a recording; and what became of each view."""
+    """Publish the segments of one recording. Return the store (created if needed) and the outcomes."""
     outcomes = [outcome for outcome, _ in views]
     ready: dict[int, Sealed] = {}
     known: dict[int, str | None] = {}
@@ -441,7 +445,7 @@ def _published(
 
 
 class _Meter:
-    """Progress of a run."""
+    """Progress counter of one ingest."""
 
     def __init__(self, paths: list[Path], on_progress: Callable[[Progress], None] | None) -> None:
         self._paths = paths
@@ -452,7 +456,7 @@ class _Meter:
         self._done = 0
 
     def see(self, number: int, frames: int, reached: int, size: int) -> None:
-        """A block of a recording has been read."""
+        """Add one block of a recording, and call the progress function."""
         self._frames[number], self._bytes[number] = frames, reached
         if self._on_progress is not None:
             progress = Progress(
@@ -469,7 +473,7 @@ class _Meter:
             self._on_progress(progress)
 
     def finish(self, number: int) -> None:
-        """A recording is done."""
+        """Mark a recording as done."""
         self._done += 1
         self._bytes[number] = self._sizes[number]
 
@@ -477,5 +481,5 @@ class _Meter:
 def _size(path: Path) -> int:
     try:
         return mark_of(path)[0]
-    except (OSError, SgstoreError):  # told when it is opened
+    except (OSError, SgstoreError):  # The opening reports it.
         return 0

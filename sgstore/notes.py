@@ -1,7 +1,8 @@
-"""Tags and notes of people: a CSV file beside the store, which is a cache and holds none of them.
+"""Tags and notes of users, in a CSV file beside the store.
 
-A line a tag: ``trace,seq,tag,note,who,at``. Lines are added, never changed; who takes a tag away adds the
-same line with ``-`` before the tag. So two people can write at once, and nothing is lost.
+The store is only a cache, so it does not contain them. Each line is one tag: ``trace,seq,tag,note,who,at``.
+Lines are only appended. The removal of a tag appends the same line with ``-`` before the tag. Two users can
+therefore write at the same time without loss.
 """
 
 from __future__ import annotations
@@ -19,9 +20,7 @@ from sgstore.errors import StoreError
 
 try:
     import fcntl
-except (
-    ImportError
-):  # not on Windows: there a line is written at once, too, but nobody is kept waiting
+except ImportError:  # not on Windows, where a line is also written at once, but without a lock
     fcntl = None
 
 if TYPE_CHECKING:
@@ -29,18 +28,18 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 ENDING: Final = ".notes.csv"
-"""What the name of the file ends in, behind that of the store."""
+"""Suffix of the file, after the name of the store."""
 
 MOST_BYTES: Final = 64 << 20
-"""Largest file that is read."""
+"""Largest file that can be read; bytes."""
 
 LONGEST: Final = {"tag": 100, "note": 2000}
-"""Longest texts; characters."""
+"""Maximum length of the texts; characters."""
 
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """A tag at a frame.
+    """Tag of one frame, with an optional note.
 
     Attributes
     ----------
@@ -50,7 +49,7 @@ class Note:
     who : str
         Name of the account that wrote it.
     at : str
-        When, by the clock of the machine; ISO 8601, UTC.
+        Time of writing, by the clock of the machine; ISO 8601, UTC.
     """
 
     trace: str
@@ -65,7 +64,7 @@ COLUMNS: Final = tuple(field.name for field in fields(Note))
 
 
 class NotesFile:
-    """Tags of a store.
+    """File with the tags of a store.
 
     Parameters
     ----------
@@ -76,7 +75,7 @@ class NotesFile:
         self.path = store.with_name(store.name + ENDING)
 
     def stamp(self) -> tuple[int, int]:
-        """Size and time of the file; zeros if there is none."""
+        """Return the size (bytes) and modification time (ns) of the file; zeros if it is missing."""
         try:
             found = self.path.stat()
         except OSError:
@@ -84,7 +83,7 @@ class NotesFile:
         return found.st_size, found.st_mtime_ns
 
     def add(self, note: Note, *, gone: bool = False) -> Note:
-        """Write a tag, or that it is gone; the note as it was written.
+        """Append a tag, or its removal if ``gone``, and return the written note.
 
         Raises
         ------
@@ -120,7 +119,7 @@ class NotesFile:
             os.close(file)
 
     def read(self) -> list[Note]:
-        """Tags that are there, those that were taken away left out; lines that are none are passed over.
+        """Return the current tags, without removed ones. Invalid lines are skipped.
 
         Raises
         ------
@@ -146,7 +145,7 @@ class NotesFile:
 
 
 def write_table(notes: list[Note], to: Path) -> None:
-    """Write tags as a table that queries can join: one row a frame, several tags of one divided by commas."""
+    """Write tags as a CSV table for queries: one row per frame, its tags separated by commas."""
     frames: dict[tuple[str, int], list[Note]] = {}
     for note in notes:
         frames.setdefault((note.trace, note.seq), []).append(note)

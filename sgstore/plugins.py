@@ -1,12 +1,12 @@
-"""Registries of what can be added: readers, relations, abstractions, exporters.
+"""Registries of extensions: readers, relations, abstractions, exporters.
 
-What this package has is listed here, name by name, with the place of its object; it is loaded when it is used.
-Other packages add theirs as entry points of the same groups (``pyproject.toml``)::
+A registry lists the objects of this package by name and place. An object is loaded at its first use. Other
+packages add objects as entry points of the same groups (``pyproject.toml``)::
 
     [project.entry-points."sgstore.relations"]
     besides = "my_package.besides:BESIDES"
 
-A name of this package cannot be taken by another one.
+Another package cannot take a name of this package.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ if TYPE_CHECKING:
 
 
 def entry_points(group: str) -> Iterable[EntryPoint]:
-    """Entry points of a group, of all packages that are installed."""
-    from importlib import metadata  # looking for them takes a while, and most processes need none
+    """Return the entry points of a group, of all installed packages."""
+    from importlib import metadata  # The search is slow, and most processes do not need it.
 
     return metadata.entry_points(group=group)
 
 
 @dataclass(frozen=True, slots=True)
 class Registry:
-    """Objects of one kind, by name: those of this package, then those of others.
+    """Objects of one kind by name: first those of this package, then those of other packages.
 
     Attributes
     ----------
     group : str
         Group of entry points.
     own : mapping
-        Name → place of the object, ``module:attribute``, in the order that counts.
+        Name → place of the object (``module:attribute``). The order matters.
     what : str
-        What one of them is called in messages.
+        Noun for one object in messages.
     """
 
     group: str
@@ -49,7 +49,7 @@ class Registry:
     _loaded: dict[str, Any] = field(default_factory=dict[str, Any], compare=False)
 
     def others(self) -> dict[str, EntryPoint]:
-        """Entry points of other packages, by name."""
+        """Return the entry points of other packages by name."""
         found: dict[str, EntryPoint] = {}
         for entry in entry_points(self.group):
             if entry.name not in self.own:
@@ -57,23 +57,23 @@ class Registry:
         return found
 
     def load(self, name: str) -> Any:
-        """Return the object of this package that has a name."""
+        """Load and return the object of this package with the given name."""
         if name not in self._loaded:
             module, _, attribute = self.own[name].partition(":")
             self._loaded[name] = getattr(import_module(module), attribute)
         return self._loaded[name]
 
     def load_other(self, entry: EntryPoint, error: type[SgstoreError]) -> Any:
-        """Return the object of another package.
+        """Load and return the object of another package.
 
         Raises
         ------
         SgstoreError
-            Of the type given: it cannot be loaded.
+            The object cannot be loaded. The error has the given type.
         """
         try:
             return entry.load()
-        except Exception as fault:  # whatever its import does
+        except Exception as fault:  # an import can raise anything
             reason = f"the {self.what} {entry.name!r} ({entry.value}) cannot be loaded: {fault!r}"
             raise error(reason) from fault
 
@@ -102,7 +102,7 @@ READERS: Final = Registry(
     ),
     "flavour",
 )
-"""Flavours of recordings, in the order in which they are asked."""
+"""Flavours of recordings, in the order of their tests."""
 
 RELATIONS: Final = Registry(
     "sgstore.relations",
@@ -135,7 +135,7 @@ RELATIONS: Final = Registry(
     ),
     "relation",
 )
-"""Relations. The first 24 are those of ``schema.sql``, in its order; a new one comes behind them."""
+"""Relations. The first 24 are those of ``schema.sql``, in its order; new ones come after them."""
 
 ABSTRACTIONS: Final = Registry(
     "sgstore.abstractions",
@@ -154,4 +154,4 @@ ABSTRACTIONS: Final = Registry(
 """Abstractions: functions from columns of graphs to labelled graphs."""
 
 EXPORTERS: Final = Registry("sgstore.exporters", {}, "format")
-"""Formats of other packages; those of this one are listed in :data:`sgstore.exporters.EXPORTERS`."""
+"""Formats of other packages; :data:`sgstore.exporters.EXPORTERS` lists those of this package."""

@@ -1,8 +1,8 @@
-"""A store made anew from its recordings: ``rebuild``.
+"""Rebuild of a store from its recordings.
 
-A store is a cache of its traces: when the tables change with a version, or somebody has altered them, it is
-made again from what it was made of. The new store grows beside the old one, in ``STORE.rebuild``; a run that
-was stopped goes on there. It takes the old one's place when it has everything that the old one had, not before.
+A store is a cache of its traces. A rebuild is needed after a change of the table format or of the tables. The
+new store grows beside the old one in ``STORE.rebuild``. A stopped run continues there. The new store replaces
+the old one only after it contains everything.
 """
 
 from __future__ import annotations
@@ -33,24 +33,24 @@ if TYPE_CHECKING:
 
 try:
     import fcntl
-except ImportError:  # not on Windows: there two runs would meet at the file that both make
+except ImportError:  # not on Windows, where two runs would collide at the new file
     fcntl = None
 
 
 _SHOWN: Final = 10
-"""Recordings that a message names; the others are counted."""
+"""Maximum number of recordings in a message; further ones are only counted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rebuilt:
-    """A trace that was made anew.
+    """Rebuilt trace.
 
     Attributes
     ----------
     trace : str
         Its name, the same as before.
     status : str
-        ``added``; ``present``: a run before this one had made it.
+        ``added``; ``present``: an earlier, stopped run had added it.
     frames : int
     path : Path
         Its recording.
@@ -64,7 +64,7 @@ class Rebuilt:
 
 @dataclass(frozen=True, slots=True)
 class _ReadingStep:
-    """Traces that are read in one go: with the same settings, part and map, as the same egos."""
+    """Traces to read together: same settings, part and map."""
 
     config: Config
     part: tuple[float | None, float | None]
@@ -80,35 +80,34 @@ def rebuild(
     jobs: int = 1,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> list[Rebuilt]:
-    """Make a store anew from its recordings, with the settings, parts, maps, egos and names that it has.
+    """Rebuild a store from its recordings, with the same settings, parts, maps, egos and names.
 
-    Sets that were derived and classes that were asked for are made again, too. The old store stays until the
-    new one has everything; a run that was stopped goes on where it was.
+    Derived sets and requested classes are rebuilt, too. The old store stays until the new one is complete. A
+    stopped run continues at its last trace.
 
     Parameters
     ----------
     store : str or Path
-        Of this version or an older one; it may have been altered, if its table of traces can be read.
+        A store of this or an older version. Changed tables are allowed if the table of traces is readable.
     look_in : sequence of str or Path, optional
-        Folders in which to look for recordings that are not where they were.
+        Folders to search for moved recordings.
     leave_out : sequence of str, optional
-        Names of traces that the new store is not to have: their recordings are gone, or, of graphs that an
-        older version imported, nobody knows how.
+        Names of traces to drop, for example because their recordings are missing.
     jobs : int
-        Recordings that are read at the same time.
+        Number of recordings read at the same time.
     on_progress : function, optional
-        As :func:`sgstore.ingest.ingest` takes it.
+        As in :func:`sgstore.ingest.ingest`.
 
     Returns
     -------
     list of Rebuilt
-        The traces, in the order in which they came into the old store.
+        The traces, in the order of the old store.
 
     Raises
     ------
     StoreError
-        Recordings are gone or have changed: it names them; one of them cannot be read as before; or there are
-        tables in the store that are none of ours. Then the store is left as it was.
+        Recordings are missing, changed or unreadable (the message names them), or the store contains other
+        tables. The old store is then unchanged.
     """
     path = Path(store)
     whole = remains_of(path)
@@ -147,7 +146,7 @@ def rebuild(
 
 
 def _without(path: Path, whole: Remains, leave_out: Sequence[str]) -> Remains:
-    """Return the contents of a store without some traces."""
+    """Return the contents of a store without the traces to drop."""
     names = [one.name for one in whole.traces]
     strange = [name for name in leave_out if name not in names]
     if strange:
@@ -162,7 +161,7 @@ def _without(path: Path, whole: Remains, leave_out: Sequence[str]) -> Remains:
 
 @contextmanager
 def _alone(fresh: Path) -> Generator[None]:
-    """No other process makes the same store anew."""
+    """Context manager with a lock against a second rebuild of the same store."""
     lock = fresh.with_name(f"{fresh.name}-lock")
     try:
         held = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
@@ -181,18 +180,15 @@ def _alone(fresh: Path) -> Generator[None]:
         os.close(held)
 
 
-# Recordings -------------------------------------------------------------------------------------------------
-
-
 def _found(
     path: Path, traces: Sequence[OldTrace], look_in: Sequence[str | Path]
 ) -> dict[int, Path]:
-    """Find the recording of each trace.
+    """Return the recording of each trace, by trace id.
 
     Raises
     ------
     StoreError
-        Some are gone or have changed; it names them.
+        Recordings are missing or changed; the message names them.
     """
     known: dict[tuple[Path, str], Path | str] = {}
     candidates = _by_size(look_in)
@@ -213,7 +209,7 @@ def _found(
 
 
 def _place(trace: OldTrace, candidates: dict[int, list[Path]]) -> Path | str:
-    """Return the place of a recording, or the reason why it cannot be used."""
+    """Return the path of a trace's recording, or the reason why it is unusable."""
     reason = "changed since it was ingested"
     try:
         mark = mark_of(trace.path)
@@ -233,7 +229,7 @@ def _place(trace: OldTrace, candidates: dict[int, list[Path]]) -> Path | str:
 
 
 def _by_size(folders: Sequence[str | Path]) -> dict[int, list[Path]]:
-    """The recordings in some folders, by their sizes."""
+    """Return the recordings in some folders, grouped by file size."""
     found: dict[int, list[Path]] = {}
     for path in recordings(folders) if folders else ():
         with suppress(OSError, TraceError):
@@ -243,11 +239,8 @@ def _by_size(folders: Sequence[str | Path]) -> dict[int, list[Path]]:
     return found
 
 
-# Steps ------------------------------------------------------------------------------------------------------
-
-
 def _resume(fresh: Path, old: Remains) -> None:
-    """Keep of a run that was stopped what belongs to the new store; forget it if it cannot be used."""
+    """Prepare the file of a stopped run: keep its valid traces, or delete an unusable file."""
     if not fresh.exists():
         return
     try:
@@ -267,7 +260,7 @@ def _resume(fresh: Path, old: Remains) -> None:
 
 
 def _check_settings(path: Path, traces: Sequence[OldTrace]) -> None:
-    """Refuse settings that this version does not know, before anything is read."""
+    """Raise if this version does not support the settings of a trace."""
     try:
         for one in traces:
             _settings(one)
@@ -282,7 +275,7 @@ def _settings(trace: OldTrace) -> Config:
 def _steps(
     traces: Sequence[OldTrace], places: dict[int, Path]
 ) -> Iterator[_ReadingStep | OldTrace]:
-    """Return the steps, in the order of the traces: what was read alike is read together."""
+    """Yield the steps in the order of the traces. Traces with equal settings are read together."""
     steps: list[_ReadingStep | OldTrace] = []
     alike = groupby(traces, key=lambda t: (t.digest, t.settings, t.since, t.until, t.map_id))
     for _, views in alike:
@@ -302,7 +295,7 @@ def _steps(
 
 
 def _as_egos(path: Path, views: Sequence[OldTrace]) -> Config:
-    """The settings with which a recording gives the egos that it gave."""
+    """Return the settings that give the same egos for a recording as before."""
     config = _settings(views[0])
     if len(views) > 1:
         return replace(config, egos=tuple(one.ego for one in views))
@@ -318,7 +311,7 @@ def _read(
     jobs: int,
     on_progress: Callable[[Progress], None] | None,
 ) -> None:
-    """Read recordings into the new store; those that are in it already stay."""
+    """Read the recordings of a step into the new store. Traces already present stay."""
     with _map_file(maps.get(step.map_id) if step.map_id is not None else None) as road_map:
         outcomes = ingest(
             fresh,
@@ -342,19 +335,19 @@ def _stopped(fresh: Path, wrong: list[str]) -> str:
 
 @contextmanager
 def _map_file(road_map: OldMap | None) -> Generator[Path | None]:
-    """A map of the old store as a file, for recordings that carry none of their own."""
+    """Yield a map of the old store as a temporary file, for recordings without their own map."""
     if road_map is None or not road_map.text.lstrip("\ufeff \t\r\n").startswith("<"):
         yield None
         return
     with working_folder("map") as folder:
         path = folder / "map.xodr"
-        # With a mark of its order, so that no encoding that the text names is taken for its own.
+        # The byte order mark overrides the encoding in the text.
         path.write_bytes(road_map.text.encode("utf-16", "surrogatepass"))
         yield path
 
 
 def _import(fresh: Path, trace: OldTrace, path: Path, maps: dict[int, OldMap]) -> None:
-    """Bring in graphs of another tool as they were."""
+    """Import the graphs of another tool again, with the same options."""
     how: dict[str, Any] = {"relations": trace.answers, "period_s": trace.period_ns / 1e9 or 1.0}
     how |= trace.imported or {}
     form, words = how.pop("form"), how.pop("words", {})
@@ -376,7 +369,7 @@ def _import(fresh: Path, trace: OldTrace, path: Path, maps: dict[int, OldMap]) -
 
 
 def _complete(path: Path, fresh: Path, old: Remains) -> None:
-    """Make the sets that were derived and the classes that were asked for; see that nothing is missing."""
+    """Rebuild the derived sets and requested classes, and check that all traces are present."""
     file = StoreFile(fresh)
     there = {one.trace_id for one in file.traces()}
     missing = [f"{one.name}: {one.path}" for one in old.traces if one.trace_id not in there]
@@ -389,7 +382,7 @@ def _complete(path: Path, fresh: Path, old: Remains) -> None:
         else:
             derive(fresh, from_dict(one.settings), one.name, traces, replace_old=True)
     for name in old.abstractions:
-        with suppress(SgstoreError):  # one of a client's own: its classes are made when asked for
+        with suppress(SgstoreError):  # A client's own abstraction is computed on demand.
             file.abstracted.complete(name)
     if set(there) != {one.trace_id for one in old.traces}:
         raise StoreError(f"{path}: left as it is: {fresh} holds other traces; remove that file")

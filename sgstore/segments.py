@@ -1,10 +1,10 @@
-"""One recording to sealed segments, one for each ego, with outcome and counts.
+"""Conversion of one recording into sealed segments, one per ego.
 
-What is told of an ingest: how far it has come, and what became of each recording.
+Types for the progress and the outcome of an ingest.
 
-``python -m sgstore.segments`` is a process that reads recordings for another. It is told what to do on stdin, a
-line of JSON each: the job first, then recordings. It answers on stdout, a line of JSON each: how far it has
-come, and what became of a recording. It ends when stdin does, whatever it is doing: nobody would publish it.
+``python -m sgstore.segments`` is a worker process that reads recordings for its parent process. Input (stdin)
+and output (stdout) have one JSON value per line. The first input is the job; each further input is a
+recording. The outputs are progress and outcomes. The process ends at once when stdin ends.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Work done on a recording, and all that there is.
+    """Progress within one recording and within the whole ingest.
 
     Attributes
     ----------
@@ -59,11 +59,11 @@ class Progress:
     frames : int
         Frames done of this recording.
     bytes_done, size : int
-        About how much of the file has been read, and its size.
+        Bytes read of the file (approximate), and its size.
     all_frames, all_bytes, all_size : int
-        The same of all recordings together.
+        The same numbers, summed over all recordings.
     files_done, files : int
-        Recordings that are done, and how many there are.
+        Recordings done, and their total number.
     """
 
     path: Path
@@ -79,35 +79,35 @@ class Progress:
 
 @dataclass(slots=True, repr=False)
 class TraceOutcome:
-    """Outcome of a recording for one ego.
+    """Outcome of the ingest of one recording for one ego.
 
     Attributes
     ----------
     path : Path
     status : str
-        ``added``; ``replaced``: read anew; ``present``: the store had it already, read with the same settings;
-        ``new``: it would be added, if this were no trial; ``failed``.
+        ``added``; ``replaced``: read again; ``present``: the store already had the trace with the same
+        settings; ``new``: a real run would add it (dry run); ``failed``.
     name : str
-        Of the trace in the store; empty if it failed.
+        Name of the trace in the store; empty if it failed.
     ego : str
-        The simulator's id of the ego; empty if there is none or it is not known.
+        The simulator's id of the ego; empty without a known ego.
     frames : int
     entities : dict
-        Kind → how many entities there are of it, in and out of range.
+        Number of entities by kind, in and out of range.
     unknown_types : dict
-        Type names that no mapping knows → how many entities bear them.
+        Number of entities by type name, for type names without a mapping.
     clock_jumps, gaps : int
-        How often the clock of the recording runs backwards, or further than 2.5 periods.
+        Number of backward steps of the recording's clock, and of steps longer than 2.5 periods.
     seconds : float
-        How long it took.
+        Duration of the ingest; s.
     warnings : list of str
-        What is odd but lost nothing.
+        Oddities without loss of data.
     losses : list of Loss
-        What of the recording could not be used.
+        Unusable parts of the recording.
     scope : dict
-        States that settings cut, as the report of the trace counts them; empty if it failed.
+        Number of states cut by the settings, as in the report of the trace; empty if it failed.
     error : SgstoreError or None
-        Why it failed.
+        Reason of the failure.
     """
 
     path: Path
@@ -132,7 +132,7 @@ class TraceOutcome:
         return f"<TraceOutcome {self.name or self.path.name!r}: {self.status}, {about}>"
 
     def as_dict(self) -> dict[str, Any]:
-        """The outcome as plain values, from which :meth:`from_dict` makes it again."""
+        """Return the outcome as JSON values; :meth:`from_dict` is the inverse."""
         told = {"class": type(self.error).__name__, "message": str(self.error)}
         return asdict(self) | {
             "path": place_named(self.path),
@@ -141,7 +141,7 @@ class TraceOutcome:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
-        """The outcome that plain values describe; an error keeps its class and its message."""
+        """Return the outcome for JSON values. An error keeps its class and message."""
         told = values["error"]
         error = getattr(errors, told["class"])(told["message"]) if told else None
         changed: dict[str, Any] = {
@@ -152,28 +152,28 @@ class TraceOutcome:
         return cls(**(values | changed))
 
 
-# What is to be done with recordings, as a value that another process can be given ---------------
+# Settings of a run, as a value for another process.
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Settings by which recordings are read.
+    """Settings for the reading of recordings.
 
     Attributes
     ----------
     store : Path
-        Need not be there yet.
+        The store; the file may be missing.
     road_map : Path or None
         A file, or a folder of them; see :class:`sgstore.map_files.Maps`.
     config : Config
     part : TracePart
-        Which frames are read.
+        Time span and rate of the frames to read.
     force : bool
-        Whether what the store has already is read anew.
+        Read recordings again that the store already contains.
     dry_run : bool
-        Whether it is only said what would be done.
+        Only report the outcomes; write nothing.
     block_frames : int
-        Frames that are worked on at once.
+        Frames per block.
     """
 
     store: Path
@@ -185,7 +185,7 @@ class Job:
     block_frames: int = 120
 
     def as_dict(self) -> dict[str, Any]:
-        """The job as plain values."""
+        """Return the job as JSON values; :meth:`from_dict` is the inverse."""
         return {
             "store": str(self.store),
             "road_map": None if self.road_map is None else str(self.road_map),
@@ -198,7 +198,7 @@ class Job:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
-        """The job that plain values describe."""
+        """Return the job for JSON values."""
         road_map = values["road_map"]
         changed: dict[str, Any] = {
             "store": Path(values["store"]),
@@ -209,21 +209,21 @@ class Job:
         return cls(**(values | changed))
 
 
-# What is counted while a trace is read: frames, entities by kind, and how its clock runs --------
+# Counters during the reading of a trace: frames, entities by kind, steps of the clock.
 
 SHOWN: Final = 20
-"""Jumps and gaps that are listed; the others are counted."""
+"""Maximum number of listed jumps and gaps; further ones are only counted."""
 
 
 @dataclass(slots=True)
 class TraceTally:
-    """Counts of a trace.
+    """Counter of the frames and entities of a trace, with the frame times.
 
     Attributes
     ----------
     frames : int
     kinds : Counter
-        Code of a kind → entities of it.
+        Number of entities by kind code.
     times : array
         Simulation times of the frames, 8 bytes each; ns.
     """
@@ -233,30 +233,31 @@ class TraceTally:
     times: array[int] = field(default_factory=lambda: array("q"))
 
     def see(self, frames: FrameBlock) -> None:
-        """Count the next frames."""
+        """Add the counts of the next frames."""
         self.frames += len(frames)
         self.kinds.update(frames.entities.kind.tolist())
         self.times.frombytes(frames.time_ns.astype(np.int64).tobytes())
 
     @property
     def entities(self) -> dict[str, int]:
-        """Kind → how many entities there are of it, in the vocabulary's order."""
+        """Number of entities by kind, in the order of the vocabulary."""
         return {KINDS[code]: self.kinds[code] for code in sorted(self.kinds)}
 
     @property
     def seconds(self) -> float:
-        """From the first frame to the last; s."""
+        """Time from the first to the last frame; s."""
         return (self.times[-1] - self.times[0]) / 1e9 if self.times else 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the counts as plain values.
+        """Return the counts as JSON values.
 
         Returns
         -------
         dict
-            ``entities``; ``clock_jumps``, ``gaps``: how often the clock runs backwards, or further than 2.5
-            median periods; ``clock_jumps_at``, ``gaps_at``: the first of them, each with the number of the
-            frame behind (``seq``), its time since the trace began (``t``), and the step (``seconds``).
+            ``entities``; ``clock_jumps``: number of backward steps of the clock; ``gaps``: number of steps
+            longer than 2.5 median periods; ``clock_jumps_at``, ``gaps_at``: the first ones, each with the
+            number of the frame after the step (``seq``), its time since the start of the trace (``t``), and the
+            step (``seconds``).
         """
         times = np.frombuffer(self.times, np.int64)
         steps = np.diff(times)
@@ -278,21 +279,31 @@ class TraceTally:
         return report
 
 
-# One recording → sealed segments, one for each ego ----------------------------------------------
+# One recording → sealed segments, one per ego.
 
 EGOS_AT_ONCE: Final = 8
-"""Egos whose graphs are built in one pass over a recording: each needs the memory of a segment."""
+"""Egos per pass over a recording; each needs the memory of one segment."""
 
 _VEHICLES: Final = np.array([KIND_CODE[kind] for kind in kinds_labelled("Vehicle") or ()])
 
 
 @dataclass(slots=True)
 class _EgoView:
-    """A recording as one ego has it.
+    """View of a recording from one ego.
 
-    What became of it; what is known of it, with its ego; the folder of its segment, if one was built; the
-    node ids of the ego, of which each frame has one; whether a frame had it; the frames that have too many
-    pairs.
+    Attributes
+    ----------
+    outcome : TraceOutcome
+    info : TraceInfo
+        Facts of the recording, with this ego.
+    sealed : Path or None
+        Folder of the segment; ``None`` means not built.
+    nodes : list of int
+        Node ids of the ego; each frame has at most one of them.
+    met : bool
+        True if a frame contains the ego.
+    crowds : Crowds
+        Frames with too many pairs.
     """
 
     outcome: TraceOutcome
@@ -304,18 +315,18 @@ class _EgoView:
 
 
 class SegmentReader:
-    """Reads recordings, one after another.
+    """Reader of recordings, one after another, into segments.
 
     Parameters
     ----------
     job : Job
     on_block : function
-        Called after every block with the frames done, about how many bytes of the file were read, and its size.
+        Called after every block with the frames done, the bytes of the file read (approximate), and its size.
 
     Raises
     ------
     MapError
-        The road map that is given cannot be read.
+        The road map of the job cannot be read.
     """
 
     def __init__(self, job: Job, on_block: Callable[[int, int, int], None]) -> None:
@@ -326,9 +337,10 @@ class SegmentReader:
         self._on_map: OnMap | None = None
 
     def read(self, path: Path, folder: Path) -> list[tuple[TraceOutcome, Path | None]]:
-        """Read a recording; segments are built in folders below the one that is given, which need not exist.
+        """Read a recording and build its segments in subfolders of ``folder``.
 
-        For each ego it returns the outcome, and the folder of its segment, if one was built.
+        ``folder`` is created if needed. The result has one entry per ego: the outcome, and the folder of the
+        segment or ``None``.
         """
         start = time.perf_counter()
         views: list[_EgoView] = []
@@ -337,7 +349,7 @@ class SegmentReader:
             check_name(path)
             with near(path, folder / "copy"):
                 self._read(path, folder, views)
-        except Exception as error:  # noqa: BLE001  the other recordings are read all the same
+        except Exception as error:  # noqa: BLE001  the other recordings must still be read
             failed = failure(error, path)
             if failed is not error:
                 _log.debug("%s: %s", path, traceback.format_exc())
@@ -353,7 +365,7 @@ class SegmentReader:
         if self._file is None and job.store.exists():
             self._file = StoreFile(job.store)
         store = None if job.force else self._file
-        digest = store.known_digest(path) if store else ""  # then it need not be hashed
+        digest = store.known_digest(path) if store else ""  # A known digest saves the hashing.
         with open_trace(path, ego=config.ego, digest=digest, mapping=config.mapping) as trace:
             _log.debug("%s: a recording of flavour %s", path, trace.info.flavour)
             road_map, odd = self._maps.of(trace.info)
@@ -364,7 +376,7 @@ class SegmentReader:
                 for one in self._wanted(trace, views)
                 if store is None or self._is_new(store, one, road_map)
             ]
-            if store is not None and wanted:  # who publishes need not wait for this process
+            if store is not None and wanted:  # The publishing process can then write at once.
                 store.close()
             if wanted and not job.dry_run:
                 config = replace(config, exclude_ids=self._excluded(trace))
@@ -378,10 +390,8 @@ class SegmentReader:
                 if not job.dry_run:
                     self._build(trace, group, road_map, config, folder / str(first))
 
-    # Which views ----------------------------------------------------------------------------------------------
-
     def _wanted(self, trace: MessageTrace, views: list[_EgoView]) -> Iterator[_EgoView]:
-        """The views of a recording that are asked for; one whose ego is not in it has an error."""
+        """Yield the requested views of a recording. The outcome of an unknown ego gets an error."""
         info, egos = trace.info, self._job.config.egos
         if not egos:
             views.append(_EgoView(TraceOutcome(info.path, ego=info.ego), info))
@@ -396,14 +406,14 @@ class SegmentReader:
                 view.outcome.error = error
                 views.append(view)
                 continue
-            if found not in seen:  # else they are two names of one
+            if found not in seen:  # Otherwise, two names mean the same ego.
                 seen.add(found)
                 view.outcome.ego, view.info = found, replace(info, ego=found)
                 views.append(view)
                 yield view
 
     def _excluded(self, trace: MessageTrace) -> tuple[str, ...]:
-        """The ids of what is to be left out; what is no role or name of a vehicle is an id."""
+        """Return the ids of the entities to exclude. Each name may be a role, a vehicle name or an id."""
         found: list[str] = []
         for name in self._job.config.exclude_ids:
             with suppress(SgstoreError):
@@ -412,7 +422,7 @@ class SegmentReader:
         return tuple(dict.fromkeys(found))
 
     def _ident(self, trace: MessageTrace, name: str) -> str:
-        """The id of the ego that a name means, as the reader of the recording understands it."""
+        """Return the id of the ego for a name, as resolved by the reader of the recording."""
         info = trace.info
         try:
             found = trace.ego_named(name)
@@ -425,7 +435,7 @@ class SegmentReader:
             return again.info.ego
 
     def _vehicles(self, trace: MessageTrace) -> list[str]:
-        """The ids of all vehicles of a recording."""
+        """Return the ids of all vehicles of a recording."""
         found: list[str] = []
         for block in trace.blocks(self._job.block_frames):
             entities = self._meant(block).entities
@@ -436,7 +446,7 @@ class SegmentReader:
         return found
 
     def _is_new(self, store: StoreFile, view: _EgoView, road_map: RoadMap | None) -> bool:
-        """Return whether a store lacks the trace of an ego."""
+        """True if the store lacks the trace of this ego. Otherwise set the outcome."""
         job, outcome = self._job, view.outcome
         try:
             shown = map_of_graphs(road_map, job.config)
@@ -451,8 +461,6 @@ class SegmentReader:
         outcome.frames, outcome.scope = stored.frames, stored.report.get("scope", {})
         return False
 
-    # Building -------------------------------------------------------------------------------------------------
-
     def _build(
         self,
         trace: MessageTrace,
@@ -461,7 +469,7 @@ class SegmentReader:
         config: Config,
         folder: Path,
     ) -> None:
-        """Build the segments of some views in one pass over the recording."""
+        """Build the segments of several egos in one pass over the recording."""
         job, size = self._job, self._job.block_frames
         generator = SceneGraphGenerator(road_map, config)
         tally = TraceTally()
@@ -502,7 +510,7 @@ class SegmentReader:
         group: list[_EgoView],
         segments: list[Segment],
     ) -> None:
-        # Origins do not depend on the ego, so all segments keep the same numbers.
+        # Origins do not depend on the ego, so all segments store the same numbers.
         kept, *_ = [segment.as_kept(block) for segment in segments]
         egos = [kept.ego]
         if self._job.config.egos:
@@ -515,7 +523,7 @@ class SegmentReader:
                 graph = next(graphs)
                 one.crowds.see(graph)
                 segment.append(graph)
-                del graph  # the next one is made when nobody holds this one
+                del graph  # Free this graph before the next one is built.
 
     def _seal(
         self,
@@ -546,12 +554,12 @@ class SegmentReader:
             outcome.status = "sealed"
 
     def _meant(self, block: FrameBlock) -> FrameBlock:
-        """The frames, their entities as the client says that type names are meant."""
+        """Apply the configured type mapping to the entities of a block."""
         return replace(block, entities=renamed(block.entities, self._job.config.types))
 
 
 def _ego_of(block: FrameBlock, one: _EgoView) -> Ints:
-    """(F,) int64: node id of an ego in each frame, -1 where it is absent."""
+    """Return the node id of the ego in each frame: (F,) int64, -1 if absent."""
     idents = enumerate(block.entities.ident, start=block.entities.first)
     one.nodes += [node for node, ident in idents if ident == one.info.ego]
     rows = np.isin(block.states.node, one.nodes)
@@ -562,19 +570,19 @@ def _ego_of(block: FrameBlock, one: _EgoView) -> Ints:
 
 
 def _reached(frames: FrameBlock, size: int) -> int:
-    """About how much of a file has been read with a block."""
+    """Return the approximate number of file bytes read up to this block."""
     messages = frames.messages
     places = np.where(messages.chunk_offset < 0, messages.offset, messages.chunk_offset)
     return min(int(places.max(initial=0)), size)
 
 
-# A process that reads recordings for another -----------------------------------------------------
+# Worker process that reads recordings for its parent.
 
 
 def main() -> None:
-    """Do what stdin says until it ends."""
+    """Read recordings on request: requests on stdin, results on stdout, until stdin ends."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    sys.stdout = sys.stderr  # what anything prints is no answer
+    sys.stdout = sys.stderr  # Printed text must not mix with the results.
     told: SimpleQueue[dict[str, Any]] = SimpleQueue()
     threading.Thread(target=_listen, args=(told,), daemon=True).start()
 

@@ -1,18 +1,18 @@
-"""The scene graph generator: frames of a trace and a road map in, scene graphs out, a block at a time.
+"""Scene graph generator: converts frames and a road map into scene graphs, block by block.
 
-What is in a graph. The range of an ego is a disc about its centre, or another area, as
-:mod:`sgstore.relations._extent` says; an entity is in it when its footprint meets it. What has no extent counts
-as a point, and what has no position is in no range; the ego always is. *Frames without an ego*, or with one
-whose position is missing, have no range: their graphs hold all entities and the whole map, and no relations of
-an ego. Parts of the map are present as :meth:`sgstore.relations._map_context.LaneContact.ground` says; the
-static edges among them are the map's own. What the client does not want (:mod:`sgstore.relations._registry`)
-is as if it were not there.
+*Contents of a graph.* The range of an ego is a disc around its centre or another area; see
+:mod:`sgstore.relations._extent`. An entity is in range if its footprint meets the area. An entity without a
+size counts as a point. An entity without a position is out of range, except the ego. *Frames without an ego*,
+or with an ego without a position, have no range: their graphs contain all entities and the whole map, and no
+ego relations. :meth:`sgstore.relations._map_context.LaneContact.ground` selects the map parts; the static edges
+among them come from the map. Excluded entities and relations (:mod:`sgstore.relations._registry`) are
+treated as absent.
 
-Beyond a graph. What is within ``[range] world`` of the ego and not in its graph is known all the same: states,
-static entities, parts of the map and places in lanes, by the same functions, but no edges.
+*Surroundings of a graph.* Entities within ``[range] world`` of the ego, but outside its graph. The same
+functions compute their states, static entities, map parts and lane places, but no edges.
 
-A relation that cannot be computed, because a heading or a position is missing, is absent; what a trace cannot
-answer at all is said by :attr:`SceneGraphGenerator.answers`.
+A relation that needs a missing heading or position is absent. :attr:`SceneGraphGenerator.answers` lists the
+relations that the trace can answer.
 """
 
 from __future__ import annotations
@@ -82,28 +82,28 @@ if TYPE_CHECKING:
 
 
 _OTHER_EDGES: Final = 8
-"""Edges of a body, beside those of its pairs, for which there is room at once."""
+"""Edges per body, without the edges of pairs, that the initial table can hold."""
 
 
 class SceneGraphGenerator:
-    """Scene graphs of one trace.
+    """Generator of the scene graphs of one trace.
 
     Parameters
     ----------
     road_map : RoadMap or None
-        None: there are no parts of a map in the graphs, and no relation that needs one. The nodes and static
-        edges of the graphs are those of :func:`map_of_graphs`.
+        ``None`` means graphs without map parts and without relations that need a map. :func:`map_of_graphs`
+        returns the map with the nodes and static edges of the graphs.
     config : Config
 
     Attributes
     ----------
     answers : tuple of str
-        The relations that these graphs can hold, in the vocabulary's order; of the others nothing is known.
+        Relations that these graphs can contain, in the order of the vocabulary. Other relations are unknown.
 
     Notes
     -----
-    Blocks come in the order of the trace. Between them the generator keeps what it must know of the entities
-    it has met (kinds, scenery) and no more; a block of one frame gives the same graph as a block of many.
+    Blocks come in the order of the trace. Between blocks, the generator stores only the facts that it needs
+    about earlier entities (kinds, scenery). A block of one frame gives the same graph as a block of many.
     """
 
     def __init__(self, road_map: RoadMap | None, config: Config) -> None:
@@ -145,54 +145,53 @@ class SceneGraphGenerator:
 
     @property
     def parked(self) -> Codes:
-        """(n,) int8: of each entity whether it is parked, as all graphs so far tell: 1 or 0; -1: not known."""
+        """State of each entity over all graphs so far, (n,) int8: 1 parked, 0 not parked, -1 unknown."""
         return self._parking.parked
 
     @property
     def world_parked(self) -> Codes:
-        """(n,) int8: the same, as all that is known beyond the graphs tells, too."""
+        """Parking state as in :attr:`parked`, but including the surroundings of the graphs."""
         return self._parking.world_parked
 
     def pieces(self, frames: FrameBlock, egos: int = 1) -> Iterator[FrameBlock]:
-        """The next frames as blocks whose graphs fit into memory, however crowded they are.
+        """Split the next frames into blocks whose graphs fit into memory.
 
         Parameters
         ----------
         frames : FrameBlock
         egos : int
-            For how many egos graphs are made.
+            Number of egos, each with its own graphs.
         """
         entities = renamed(frames.entities, self._config.types)
         kinds = np.concatenate([self._kinds[: entities.first], entities.kind])
         return pieces(frames, kinds, self._config, egos)
 
     def block(self, frames: FrameBlock) -> GraphBlock:
-        """The scene graphs of the next frames, as their ego has them.
+        """Return the scene graphs of the next frames for the ego of the frames.
 
         Raises
         ------
         ConfigError
-            A relation of another package gives edges that it does not declare.
+            A relation of another package returns undeclared edges.
         ValueError
-            A state belongs to a node that no block has introduced, or nodes are not introduced one after
-            another: a defect of the reader.
+            A state has an unknown node, or new node ids are not consecutive. This is a defect of the reader.
         """
         return self.blocks(frames, [frames.ego])[0]
 
     def blocks(self, frames: FrameBlock, egos: Sequence[Ints]) -> list[GraphBlock]:
-        """The scene graphs of the next frames as several egos have them; work that they share is done once.
+        """Return the scene graphs of the next frames for several egos, with shared work done once.
 
         Parameters
         ----------
         frames : FrameBlock
-            Its own ego does not count.
+            Its own ego is ignored.
         egos : sequence of (F,) int64
-            Of each ego its node id in each frame, -1 where it is absent.
+            Node id of each ego in each frame; -1 if absent.
 
         Returns
         -------
         list of GraphBlock
-            One for each ego, the same as of a generator of its own.
+            One for each ego, the same as from a separate generator.
 
         Raises
         ------
@@ -202,12 +201,12 @@ class SceneGraphGenerator:
         return list(self.one_by_one(frames, egos))
 
     def one_by_one(self, frames: FrameBlock, egos: Sequence[Ints]) -> Iterator[GraphBlock]:
-        """The same, one after another: who lets go of each needs the memory of one."""
+        """Yield the same blocks as :meth:`blocks`, one at a time, to save memory."""
         views, world = self._views(frames, egos)
         for view in views:
             yield self._graphs(view, world)
 
-    # Positions come from files and may be absurd; what cannot be computed of them is absent.
+    # Positions come from files and may be absurd; results that overflow are absent.
     @np.errstate(over="ignore", invalid="ignore")
     def _views(self, frames: FrameBlock, egos: Sequence[Ints]) -> tuple[list[_View], _World]:
         frames = replace(frames, entities=renamed(frames.entities, self._config.types))
@@ -226,7 +225,7 @@ class SceneGraphGenerator:
         named = frames.states.node == np.repeat(frames.ego, np.diff(frames.offsets))
         kept = np.flatnonzero(held | named)
         here = np.where(ego < 0, -1, np.searchsorted(kept, ego))
-        # An ego that is named but has no state is no node of its graph.
+        # An ego without a state is not a node of its graph.
         seen = np.zeros(len(frames), np.bool_)
         seen[frames.frame_of[named]] = True
         frames = replace(frames, ego=np.where(seen, frames.ego, -1))
@@ -240,7 +239,7 @@ class SceneGraphGenerator:
     def _counted(
         self, frames: FrameBlock, named: Bools, drawn: int, beyond: _Beyond | None
     ) -> LeftOut:
-        """How many states are left out of graphs that have so many of them."""
+        """Count the states that the graphs leave out, by reason."""
         kind = self._kinds[frames.states.node]
         wanted = self._wanted(frames.states.node, kind) | named
         known = 0 if beyond is None else len(beyond.frames.states)
@@ -253,11 +252,11 @@ class SceneGraphGenerator:
         )
 
     def _wanted(self, node: Ints, kind: Codes) -> Bools:
-        """Mask of what the client wants, wherever it is."""
+        """Return a mask of the states whose entity the settings include, in or out of range."""
         return self._keeping.entities(kind) & ~self._left_out[node]
 
     def _beyond(self, frames: FrameBlock, poses: EgoPoses, outer: Extent, keys: Ints) -> _Beyond:
-        """What is known beyond the graph of one ego, of which ``keys`` are."""
+        """Return the surroundings of one ego's graphs. ``keys`` are the rows in the graphs."""
         if self._config.range.boundless:
             nowhere = np.full(len(frames), np.nan)
             poses = EgoPoses(nowhere, nowhere, nowhere, nowhere)
@@ -269,7 +268,7 @@ class SceneGraphGenerator:
         return _Beyond(_reduced(frames, kept), areas, others)
 
     def _world(self, frames: FrameBlock, keys: Ints, every: Ints) -> _World:
-        """Part of the world in graphs, which ``keys`` are, and all that is known: ``every``."""
+        """Return the world for all egos: the rows in graphs (``keys``) and with surroundings (``every``)."""
         bodies = self._bodies(frames, every)
         rows = every, len(frames.states), len(self._scenery)
         standing = None if self._survey is None else self._survey.standing(bodies)
@@ -278,7 +277,7 @@ class SceneGraphGenerator:
         whole = _World(every, bodies, rows, nothing, nothing, standing)
         part = whole.of(keys)
         bodies = part.bodies
-        if len(frames) > 1:  # nobody who waits for a frame is to wait for a compiler
+        if len(frames) > 1:  # Online steps must not wait for the compiler.
             compiled.count(int((np.bincount(bodies.frame) ** 2).sum()))
         if self._survey is not None and part.standing is not None and standing is not None:
             self._parking.stand(bodies, part.standing, self._survey.driving)
@@ -293,7 +292,7 @@ class SceneGraphGenerator:
 
     @staticmethod
     def _uneven(known: Bodies) -> int:
-        """What there is among all that is known that is no pair of bodies; bits of ``UNEVEN``."""
+        """Return the ``UNEVEN`` bits of the bodies: flat bodies, different storeys, carried bodies."""
         flat = ~IS_UPRIGHT[known.kind] & (known.height == 0)
         low, high = known.low_and_high
         near = known.moves | IS_USER[known.kind]
@@ -307,7 +306,7 @@ class SceneGraphGenerator:
         return sum(UNEVEN[name] for name, holds in found.items() if holds)
 
     def _near(self, bodies: Bodies, rows: tuple[Ints, int, int], frames: int) -> Gathered:
-        """Pairs of bodies that are near one another, ``rows`` as of :meth:`StillPairs.among`."""
+        """Return the pairs of nearby bodies. ``rows`` are as in :meth:`StillPairs.among`."""
 
         def chunks(unwanted: Bools) -> Iterator[tuple[Rows, Rows]]:
             yield from near_pairs(bodies, self._config, unwanted)
@@ -316,7 +315,11 @@ class SceneGraphGenerator:
         return gathered(chunks, bodies.frame, frames)
 
     def _of_view(self, view: _View, world: _World) -> _World:
-        """The part of the world that one ego sees; what is a crowd for all of them need be none for it."""
+        """Return the world in the range of one ego.
+
+        A frame may be too crowded for all egos together, but not for this one. Its pairs are then
+        computed again.
+        """
         part = world.of(view.keys)
         if part is world:
             return world
@@ -368,7 +371,7 @@ class SceneGraphGenerator:
     def _world_of(
         self, view: _View, whole: _World | None, ground: MapContext | None, edges: Edges
     ) -> WorldBlock | None:
-        """What is known beyond the graphs of one ego, whose map is ``ground``, and whose edges are these."""
+        """Return the surroundings of one ego's graphs. ``ground`` and ``edges`` belong to the graphs."""
         beyond = view.beyond
         if beyond is None or whole is None:
             return None
@@ -391,7 +394,7 @@ class SceneGraphGenerator:
     def _beyond_edges(
         self, bodies: Bodies, around: MapContext | None, edges: Edges
     ) -> tuple[Edges, LaneGaps]:
-        """In which edges all that is known differs from the graph, and the gaps of those that it has more."""
+        """Return the edges that differ between graph and surroundings, and the gaps of the additional edges."""
         if around is None:
             return Edges.chained([]), gaps(bodies, None)
         none = np.zeros(0, np.intp)
@@ -410,7 +413,7 @@ class SceneGraphGenerator:
         return Edges.chained([fresh, taken(drawn, gone)]), taken(following, here)
 
     def _refuse_undeclared(self, edges: Edges) -> None:
-        """Refuse edges of another package that no relation asked for declares: no store has room for them."""
+        """Raise if another package returns undeclared edges, which the store cannot hold."""
         names = [tuple(RELATIONS)[code] for code in np.unique(edges.relation)]
         strange = sorted({*names} - {*self.answers} - {*OWN_RELATIONS})
         if strange:
@@ -423,7 +426,7 @@ class SceneGraphGenerator:
     def _crowded(
         self, bodies: Bodies, over: Mapping[str, Bools]
     ) -> tuple[tuple[str, int, int], ...]:
-        """The frames with too many pairs, and their bodies; none where no such relation is wanted."""
+        """Return the frames with too many pairs and their number of bodies, if pairs are needed."""
         found: list[tuple[str, int, int]] = []
         for what, frames in over.items():
             wanted = {"overlaps"} if what == TOUCHING else self._of_pairs
@@ -432,37 +435,37 @@ class SceneGraphGenerator:
         return tuple(found)
 
     def step(self, frame: Frame) -> SceneGraph:
-        """The scene graph of the next frame, for a client that owns the loop; the same as of a recording.
+        """Return the scene graph of the next frame, for a client with its own loop.
 
-        As :meth:`steps`, for the frame's ego.
+        The graph is the same as for a recording. For several egos, see :meth:`steps`.
         """
         return self.steps(frame)[0]
 
     def steps(self, frame: Frame, egos: Sequence[str] = ("",)) -> list[SceneGraph]:
-        """The scene graphs of the next frame as several egos have them; work that they share is done once.
+        """Return the scene graphs of the next frame for several egos, with shared work done once.
 
         Parameters
         ----------
         frame : Frame
             See :class:`sgstore.step.Frame`.
         egos : sequence of str
-            Ids of the egos. Empty: the ego of the frame, else that of the config.
+            Ids of the egos. An empty id means the ego of the frame, else that of the config.
 
         Returns
         -------
         list of SceneGraph
-            One for each ego, as a store gives it, and ``ident``, the client's own id, for each entity.
-            ``trace`` is ``online``, ``frame_id`` is ``seq``: the number of the step.
+            One for each ego, as from a store. Each entity also has ``ident``, the client's own id. ``trace`` is
+            ``online``; ``frame_id`` is ``seq``, the number of the step.
 
         Raises
         ------
         ValueError
-            Two entities of the frame share an id, or what was static moves or the other way round; the frame
-            is as if it had not been given.
+            Two entities of the frame have the same id, a static entity moves, or a moving one is now static.
+            The frame is then ignored.
 
         Notes
         -----
-        Memory does not grow with time: see :mod:`sgstore.step`. Steps and blocks do not know of one another.
+        Memory does not grow with time: see :mod:`sgstore.step`. Steps and blocks are independent of each other.
         """
         if self._online is None:
             fresh = partial(SceneGraphGenerator, self._road_map, self._config)
@@ -475,29 +478,29 @@ class SceneGraphGenerator:
 
     @property
     def losses(self) -> list[Loss]:
-        """Losses of the steps so far: pairs of crowded frames, sizes and speeds that no body has."""
+        """Losses of the steps so far: pairs in crowded frames, and implausible sizes and speeds."""
         faults = self._online.faults.losses() if self._online is not None else []
         return [*self._crowds.losses(self._config), *faults]
 
     def class_of(self, abstraction: str = "RSV", number: int = 0) -> str | None:
-        """The class of the graph of the last step in an abstraction; the one that it would have in a store.
+        """Return the class of the last step's graph in an abstraction, the same as in a store.
 
         Parameters
         ----------
         abstraction : str
             Its name.
         number : int
-            Of the graph: which of the egos' it is, from 0.
+            Number of the ego whose graph is used, from 0.
 
         Returns
         -------
         str or None
-            32 hexadecimal digits; ``None`` where the graph is so symmetric that it was given up.
+            32 hexadecimal digits. ``None`` means that the graph is too symmetric to compute a class.
 
         Raises
         ------
         AbstractionError
-            There is no such abstraction.
+            The abstraction does not exist.
         ValueError
             There was no step yet.
         """
@@ -506,17 +509,17 @@ class SceneGraphGenerator:
         return found or None
 
     def roles_of(self, number: int = 0) -> dict[int, str]:
-        """Roles of the lanes of the last step for an ego: ``Ego Lane``, ``Left 1 of Ego Lane`` and so on.
+        """Return the lane roles in the last step for an ego, such as ``Ego Lane`` and ``Left 1 of Ego Lane``.
 
         Parameters
         ----------
         number : int
-            Which of the egos, from 0.
+            Number of the ego, from 0.
 
         Returns
         -------
         dict
-            By node id, of the lanes of which it can be said; see :func:`sgstore.abstractions.lane_roles`.
+            Role by node id, for lanes with a known role; see :func:`sgstore.abstractions.lane_roles`.
 
         Raises
         ------
@@ -527,7 +530,7 @@ class SceneGraphGenerator:
         return dict(zip(lanes.tolist(), roles, strict=True))
 
     def _seen(self, number: int) -> GraphColumns:
-        """A graph of the last step as abstractions see it."""
+        """Return a graph of the last step in the form for abstractions."""
         if self._online is None or self._online.last is None:
             raise ValueError("there was no step yet")
         graphs, kinds = self._online.last
@@ -538,11 +541,14 @@ class SceneGraphGenerator:
 
     @property
     def kinds(self) -> Codes:
-        """(n,) int8: kinds of the entities met so far, by node id."""
+        """Kinds of all entities so far, by node id: (n,) int8."""
         return self._kinds
 
     def _learn(self, frames: FrameBlock) -> FrameBlock:
-        """Take note of what is new in the next frames; return them with what carries what."""
+        """Store the new entities and scenery of a block.
+
+        Return the block with the carriers of carried entities.
+        """
         entities, nodes = frames.entities, frames.states.node
         if len(entities):
             if entities.first != len(self._kinds):
@@ -569,7 +575,7 @@ class SceneGraphGenerator:
         return replace(frames, states=replace(frames.states, carrier=carrier))
 
     def _scenery_in_range(self, areas: Areas) -> Ints:
-        """What of the scenery is in range, numbered frame by frame: all of it where there is no ego."""
+        """Return the scenery in range, numbered frame by frame. Without an ego, all scenery is in range."""
         scenery = self._scenery
         if not len(scenery):
             return np.zeros(0, np.int64)
@@ -581,14 +587,14 @@ class SceneGraphGenerator:
         return frame[held] * len(scenery) + row[held]
 
     def _held(self, frames: FrameBlock, areas: Areas) -> Bools:
-        """Mask of the states that are in range."""
+        """Return a mask of the states in range."""
         states = frames.states
         kind = self._kinds[states.node]
         held = areas.hold(frames.frame_of, _boxes(states), _bottom(states), hung=IS_SIGNAL[kind])
         return held & self._wanted(states.node, kind)
 
     def _bodies(self, frames: FrameBlock, keys: Ints) -> Bodies:
-        """The states of a block and the scenery that stands in it, as rows of one table."""
+        """Return the states of a block and its scenery as rows of one table."""
         states, scenery = frames.states, self._scenery
         count = int(np.searchsorted(keys, len(states)))
         rows = keys[:count]
@@ -616,7 +622,7 @@ class SceneGraphGenerator:
 
 
 def map_of_graphs(road_map: RoadMap | None, config: Config) -> RoadMap | None:
-    """The map whose nodes and static edges are those of the graphs that a config makes: the one to store."""
+    """Return the map to store: the one with the nodes and static edges of the graphs."""
     waypoints = waypoints_of(road_map, config.lanes)
     road_map = road_map if waypoints is None else waypoints.road_map
     if road_map is None or config.lanes.sections:
@@ -633,13 +639,13 @@ class _View:
     frames : FrameBlock
         With only the states in range.
     ego : (F,) intp
-        Rows of the ego among these; -1 where it has no state, or no position.
+        Rows of the ego among these; -1 without a state or a position.
     areas : Areas
-        What its range covers.
+        Areas of its range.
     keys : int64
-        What is in range, ascending: rows of the block's states, and beyond them the scenery, frame by frame.
+        Rows in range, ascending: first the states of the block, then the scenery, frame by frame.
     beyond : _Beyond or None
-        What is known beyond it.
+        Surroundings of the graphs.
     left_out : LeftOut
     """
 
@@ -653,7 +659,7 @@ class _View:
 
 @dataclass(frozen=True, slots=True)
 class _Beyond:
-    """What is known beyond the graphs of one ego: ``frames`` with its states, what it is in, and its keys."""
+    """Surroundings of the graphs of one ego: ``frames`` with their states, their areas and row keys."""
 
     frames: FrameBlock
     areas: Areas
@@ -662,9 +668,9 @@ class _Beyond:
 
 @dataclass(frozen=True, slots=True)
 class _World:
-    """Part of the world in the range of any ego, and all of it that does not depend on the ego.
+    """Part of the world in the range of any ego, with all results that do not depend on the ego.
 
-    ``whole``: the same of what is known beyond the graphs, too, but without its pairs.
+    ``whole`` is the same with the surroundings of the graphs, but without pairs.
     """
 
     keys: Ints
@@ -677,7 +683,7 @@ class _World:
     uneven: int = 0
 
     def of(self, keys: Ints) -> _World:
-        """The part of it that is in the range of one ego."""
+        """Return the part in the range of one ego."""
         if len(keys) == len(self.keys):
             return self
         rows = np.searchsorted(self.keys, keys)
@@ -695,25 +701,25 @@ class _World:
 
 
 def _united(keys: Sequence[Ints]) -> Ints:
-    """All keys of several ascending ones, ascending, each once."""
+    """Return the sorted union of several ascending key arrays."""
     if len(keys) == 1:
         return keys[0]
     every = np.concatenate([np.zeros(0, np.int64), *keys])
-    every.sort(kind="stable")  # of a few ascending runs quicker than their values one by one
+    every.sort(kind="stable")  # A stable sort is fast for a few ascending runs.
     first = np.ones(len(every), np.bool_)
     np.not_equal(every[1:], every[:-1], out=first[1:])
     return every[first]
 
 
 def _in_ascending(keys: Ints, some: Ints) -> Bools:
-    """Mask of those that are among keys, which ascend."""
+    """Return a mask of the values that occur in the ascending ``keys``."""
     if not len(keys):
         return np.zeros(len(some), np.bool_)
     return keys[np.minimum(np.searchsorted(keys, some), len(keys) - 1)] == some
 
 
 def _reduced(frames: FrameBlock, kept: Rows) -> FrameBlock:
-    """The frames with some of their states only."""
+    """Return the frames with only the given states."""
     states = frames.states
     return replace(
         frames,
@@ -730,7 +736,7 @@ def _of_codes(edges: Edges, codes: tuple[int, ...]) -> Edges:
 
 
 def _rows_apart(one: Edges, other: Edges) -> tuple[Rows, Rows]:
-    """Rows of edges of the first that the second has not, and of the second that the first has not."""
+    """Return the rows of the first edges that the second lack, and the other way round."""
     a, b = _keys(*((of.frame, of.relation, of.src, of.dst) for of in (one, other)))
     return (
         np.flatnonzero(~_in_ascending(np.sort(b), a)),
@@ -739,7 +745,7 @@ def _rows_apart(one: Edges, other: Edges) -> tuple[Rows, Rows]:
 
 
 def _keys(one: tuple[Whole | Codes, ...], other: tuple[Whole | Codes, ...]) -> tuple[Ints, Ints]:
-    """A number for each row of two tables of the same columns, the same where all of them are."""
+    """Return one number per row of two tables. Equal rows get equal numbers."""
     keys = np.zeros(len(one[0]) + len(other[0]), np.int64)
     for columns in zip(one, other, strict=True):
         column = np.concatenate(columns, dtype=np.int64)
@@ -749,14 +755,14 @@ def _keys(one: tuple[Whole | Codes, ...], other: tuple[Whole | Codes, ...]) -> t
 
 
 def _among(place: Rows, pairs: tuple[Rows, Rows]) -> tuple[Rows, Rows]:
-    """The pairs of which neither is left out, by their new rows."""
+    """Return the new row numbers of the pairs whose two rows are both kept."""
     a, b = place[pairs[0]], place[pairs[1]]
     both = (a >= 0) & (b >= 0)
     return a[both], b[both]
 
 
 def _ego_rows(frames: FrameBlock) -> Rows:
-    """(F,): row of the ego's state in each frame; -1 where it has none, or no position."""
+    """Return the row of the ego's state in each frame; -1 without a state or a position."""
     states = frames.states
     rows = np.flatnonzero(states.node == np.repeat(frames.ego, np.diff(frames.offsets)))
     rows = rows[np.isfinite(states.x[rows]) & np.isfinite(states.y[rows])]
@@ -766,7 +772,7 @@ def _ego_rows(frames: FrameBlock) -> Rows:
 
 
 def _places(frames: FrameBlock, ego: Rows) -> EgoPoses:
-    """Poses of the egos of the frames; NaN where there is none."""
+    """Return the poses of the ego in each frame; NaN without an ego."""
     of = frames.states
     columns = (of.x, of.y, of.heading, _bottom(of))
     return EgoPoses(*(np.append(column, np.nan)[ego] for column in columns))
@@ -778,12 +784,12 @@ def _boxes(states: States) -> Floats:
 
 
 def _bottom(states: States) -> Floats:
-    """Heights of the lower sides of boxes; what has no height is all at ``z``."""
+    """Return the bottom height of each box. A box without a height lies at ``z``."""
     return states.z - np.nan_to_num(states.height) / 2
 
 
 def _presence(bodies: Bodies, present: Bools | None) -> StaticPresence:
-    """The static nodes of the graphs: scenery, and parts of the map."""
+    """Return the static nodes of the graphs: scenery and map nodes."""
     still = np.flatnonzero(~bodies.moves)
     frame, column = np.nonzero(present) if present is not None else (still[:0], still[:0])
     return StaticPresence(

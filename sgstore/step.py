@@ -1,6 +1,6 @@
-"""Online generation: plain frames in, one scene graph after another out.
+"""Online generation of scene graphs, frame by frame.
 
-Frames from plain values: what a client, or a recording, says of one instant.
+Also the frame type, built from plain values by a client or from a recording.
 """
 
 from __future__ import annotations
@@ -76,12 +76,12 @@ _NAN: Final = math.nan
 _LIGHT: Final = 1
 NUMBERS: Final = (*POSE, *INPUTS)
 WHOLE: Final = ("lights", "light_state", "derived")
-"""Columns of :attr:`Entity.numbers` and of :attr:`Entity.whole`, as :class:`sgstore.world.States` has them."""
+"""Columns of :attr:`Entity.numbers` and :attr:`Entity.whole`, named as in :class:`sgstore.world.States`."""
 _ANGLES: Final = {"heading", "pitch", "roll", "yaw_rate"}
 
 
 class Entity(NamedTuple):
-    """State of one entity in a frame: inside units (rad), codes as in :class:`sgstore.world.States`."""
+    """State of one entity in a frame: angles in radians, codes as in :class:`sgstore.world.States`."""
 
     ident: str
     kind: int
@@ -96,11 +96,11 @@ class Entity(NamedTuple):
 
     @property
     def constants(self) -> tuple[int, str, str]:
-        """Attributes that may not change while the entity is known."""
+        """Attributes that must stay the same while the entity exists."""
         return self.kind, self.special, self.subkind
 
     def meant(self, told: TypeMeaning | None) -> Entity:
-        """Return the entity with the kind that the meaning of its type gives; unchanged without a meaning."""
+        """Return the entity with the kind of its configured type meaning; unchanged for ``None``."""
         if told is None:
             return self
         kind = KIND_CODE[told.kind]
@@ -108,28 +108,29 @@ class Entity(NamedTuple):
 
 
 class Frame:
-    """One instant of a scene. A caller adds its entities, lights and events.
+    """One instant of a scene. The caller adds its entities, lights and events.
 
     Parameters
     ----------
     time_ns : int
-        Simulation time; ns. Any number: nothing is computed from it.
+        Simulation time; ns. Any number: no result depends on it.
     ego : str or int, optional
-        Id of the ego, one of those that are added; none: nobody is the ego.
+        Id of the ego, which must be one of the added entities. ``None`` means a frame without an ego.
 
     Attributes
     ----------
     time_ns : int
     ego : str
-        Empty: none.
+        Id of the ego; empty without an ego.
     entities : list of Entity
         In the order in which they were added.
     events : list of (str, str, str)
-        What has happened: its kind, to whom, and with whom; empty: nobody, or not known.
+        Kind of the event, and the ids of its first and second entity. An empty id means no entity or an unknown
+        one.
     recorded : frozenset of str
-        Kinds of events that would be among them if they had happened. Of others nothing is known.
+        Kinds of events that the frame records. Events of other kinds are unknown.
     losses : list of (str, str)
-        Id and fault of each number that no body has, which is therefore missing: ``("7", "length is -4.5 m")``.
+        Id and fault of each implausible number, which is treated as missing: ``("7", "length is -4.5 m")``.
     """
 
     __slots__ = ("ego", "entities", "events", "losses", "recorded", "time_ns")
@@ -146,7 +147,7 @@ class Frame:
         return len(self.entities)
 
     def meant(self, types: Mapping[str, TypeMeaning]) -> Frame:
-        """The frame, its entities of the kinds that type names (in lower case) are said to mean."""
+        """Return the frame with the configured kinds of its type names (lower case)."""
         if not types:
             return self
         frame = Frame(self.time_ns, self.ego)
@@ -160,25 +161,25 @@ class Frame:
         return f"Frame({self.time_ns}, ego={self.ego!r}, {len(self)} entities)"
 
     def happened(self, kind: str, ident: str | int = "", other: str | int = "") -> None:
-        """Take note of something that has happened: ``HAPPENS kind(a, b)`` is true of this frame.
+        """Add an event: ``HAPPENS kind(a, b)`` becomes true in this frame.
 
         Parameters
         ----------
         kind : str
             ``collision``, ``lane_invasion`` or ``environment``.
         ident, other : str or int
-            Ids of the entities to which it has; empty: nobody, or not known.
+            Ids of the first and second entity of the event. Empty: no entity, or an unknown one.
 
         Raises
         ------
         ValueError
-            There are no such events.
+            The kind of event is unknown.
         """
         self.events.append(
             (_one_of("kind of event", kind, tuple(EVENT_KINDS)), str(ident), str(other))
         )
 
-    def add(  # noqa: PLR0913  an entity has as many properties
+    def add(  # noqa: PLR0913  one argument per property
         self,
         ident: str | int,
         kind: str,
@@ -218,7 +219,7 @@ class Frame:
         Parameters
         ----------
         ident : str or int
-            The client's own id. An entity keeps it from frame to frame; no two share one.
+            The client's own id, unique in the frame and the same in all frames.
         kind : str
             One of :data:`sgstore.vocabulary.ENTITY_KINDS`, or another label of one: ``Pedestrian``.
         x, y, z : float
@@ -232,35 +233,35 @@ class Frame:
         yaw_rate : float
             degrees/s.
         light_state : str, optional
-            What a traffic light shows: one of :data:`sgstore.vocabulary.LIGHT_STATES`.
+            State of a traffic light: one of :data:`sgstore.vocabulary.LIGHT_STATES`.
         lights : iterable of str, optional
-            Lights of a vehicle that are on, of :data:`sgstore.vocabulary.VEHICLE_LIGHTS`; ``None``: not known.
+            Active lights of a vehicle, of :data:`sgstore.vocabulary.VEHICLE_LIGHTS`. ``None`` means unknown.
         steer, throttle, brake : float
             Control inputs; -1 … 1 (positive to the left), 0 … 1, 0 … 1.
         gear : int, optional
             1, 2, …; 0: neutral; below 0: backwards.
         hand_brake : bool, optional
-            Whether it is on.
+            True if the hand brake is on.
         special, subkind, type_name : str
             Special kind, subkind, the simulator's own type name; see :class:`sgstore.world.Entities`.
         static : bool
-            Whether it never moves. It is added once, in any frame, and stays for good.
+            True if the entity never moves. Add it once, in any frame; it stays for all later frames.
         map_ref : str
-            Id of the OpenDRIVE signal or object that it is; for a traffic light this tells which lanes
-            it controls.
+            Id of its signal or object in the OpenDRIVE map. For a traffic light, it determines the controlled
+            lanes.
         trailer : str or int
-            Id of the trailer that it pulls when it is added first; empty: none, or not known.
+            Id of the trailer that it pulls when it is first added. Empty: no trailer, or an unknown one.
 
         Raises
         ------
         ValueError
-            The kind, a light or a state of one is unknown; it says what is known.
+            The kind, a light or a light state is unknown. The message lists the known ones.
 
         Notes
         -----
-        Whatever is left out or not finite is not known, which is not 0: an entity without a size is a
-        point, one without a heading has no front. A size below 0 or above 1 km and a speed above 150 m/s are
-        not known, either; :attr:`losses` has them.
+        A missing or infinite number is unknown, not 0. An entity without a size is a point. An entity without a
+        heading has no front. Sizes below 0 or above 1 km and speeds above 150 m/s are unknown, too;
+        :attr:`losses` lists them.
         """
         pose = (x, y, z, heading, pitch, roll, vx, vy, vz, ax, ay, az, yaw_rate)
         pose = self._plausible(str(ident), (*pose, length, width, height))
@@ -282,7 +283,7 @@ class Frame:
         )
 
     def _plausible(self, ident: str, pose: tuple[float, ...]) -> tuple[float, ...]:
-        """The numbers :data:`POSE` of an entity without those that no body has, which are losses."""
+        """Return the pose numbers without implausible ones, which are added to the losses."""
         if is_plausible(*pose[6:9], *pose[13:]):
             return pose
         kept, faults = without_implausible(np.array([pose], np.float64))
@@ -291,7 +292,7 @@ class Frame:
 
 
 def _inside(name: str, value: float) -> float:
-    """A number as it is kept inside: radians, and NaN for whatever is not finite."""
+    """Return a number in internal units: angles in radians, NaN for infinite values."""
     value = float(value)
     if not math.isfinite(value):
         return _NAN
@@ -326,19 +327,19 @@ def _one_of(what: str, name: str, known: Sequence[str]) -> str:
 
 
 def replayed(blocks: Iterable[FrameBlock], recorded: Iterable[str] = ()) -> Iterator[Frame]:
-    """Frames of a recording one after the other, each with what happened in it.
+    """Yield the frames of a recording in order, each with its events.
 
     Parameters
     ----------
     blocks : iterable of FrameBlock
-        Of a whole trace.
+        All blocks of a trace.
     recorded : iterable of str
-        Kinds of events of which the recording would tell. Of others it does from the first one on.
+        Kinds of events that the recording contains from the start. Other kinds count from their first event on.
 
     Yields
     ------
     Frame
-        The last one of a block when the next block has come: what is told later may belong to it.
+        The last frame of a block comes after the next block is read, because later events may belong to it.
     """
     replay, known = Replay(), set(recorded)
     last: list[Frame] = []
@@ -360,7 +361,7 @@ def replayed(blocks: Iterable[FrameBlock], recorded: Iterable[str] = ()) -> Iter
 
 
 def _recording(frame: Frame, events: Iterable[Event], known: set[str]) -> Frame:
-    """Return a frame with its events. ``known`` gets their kinds; a recording has these from here on."""
+    """Add the events to a frame, and their kinds to ``known``. Return the frame."""
     frame.events += [(event.kind, event.ident, event.other) for event in events]
     known.update(kind for kind, _, _ in frame.events)
     frame.recorded = frozenset(known)
@@ -368,9 +369,10 @@ def _recording(frame: Frame, events: Iterable[Event], known: set[str]) -> Frame:
 
 
 class Replay:
-    """Frames of a recording as :class:`Frame`, as a client would have made them from the simulator.
+    """Converter of the blocks of a recording into single :class:`Frame` objects.
 
-    Memory grows with the number of distinct entities, as that of any reader does.
+    The frames are the same as those of a client at the simulator. Memory grows with the number of distinct
+    entities, as for any reader.
     """
 
     def __init__(self) -> None:
@@ -378,7 +380,7 @@ class Replay:
         self._trailers: list[str] = []
 
     def frames(self, block: FrameBlock) -> Iterator[Frame]:
-        """The frames of the next block of a trace, exactly: no number changes."""
+        """Yield the frames of the next block of a trace, with exactly the same numbers."""
         new = block.entities
         columns = (new.ident, new.kind.tolist(), new.special, new.subkind, new.type_name)
         columns = (*columns, new.static.tolist(), new.map_ref)
@@ -391,7 +393,7 @@ class Replay:
             frame = Frame(time, self._known[ego][0] if ego >= 0 else None)
             start, stop = block.offsets[row : row + 2].tolist()
             there = self._entities(block.states, start, stop)
-            if standing:  # in the order of the node ids, so that a client gives the same ones
+            if standing:  # In the order of the node ids, so that a client assigns the same ids.
                 nodes = [*block.scenery.node.tolist(), *block.states.node[start:stop].tolist()]
                 order = np.argsort(nodes, kind="stable").tolist()
                 there = [(*standing, *there)[i] for i in order]
@@ -415,22 +417,22 @@ class Replay:
         ]
 
 
-# A block's graph of one frame as records: the same as a store gives of it, and each entity's own id ----
+# Graph of one frame as records: the same as from a store, plus each entity's own id.
 
 TRACE: Final = "online"
-"""What the graphs of the online mode have for the name of a trace."""
+"""Trace name of the graphs in online mode."""
 
 _BOX: Final = ("x", "y", "z", "length", "width", "height")
 _MOTION: Final = ("vx", "vy", "vz", "ax", "ay", "az")
 _STILL: Final = dict.fromkeys(("speed", "vx", "vy", "vz"), 0.0)
-"""What stands for ever has velocity 0."""
+"""Velocity of static entities."""
 _DERIVED: Final = ("derived_velocity", "derived_acceleration", "derived_yaw_rate")
 _MAP_TEXTS: Final = ("name", "lane_type", "road", "junction", "turn")
 _MAP_NUMBERS: Final = ("x", "y", "z", "heading", "length", "width", "speed_limit", "curvature")
 
 
 class EntityConstants(NamedTuple):
-    """Attributes of an entity that do not change."""
+    """Constant attributes of an entity."""
 
     node: int
     ident: str
@@ -441,7 +443,7 @@ class EntityConstants(NamedTuple):
     lifetime: int = 1
 
     def attributes(self, *, is_ego: bool, is_static: bool) -> Attributes:
-        """As they stand in a graph."""
+        """Return the attributes in the form of a scene graph."""
         texts = {
             "type_name": self.type_name,
             "special": self.special,
@@ -459,12 +461,12 @@ class EntityConstants(NamedTuple):
 
 
 class Records:
-    """Makes records of graphs.
+    """Converter of graph blocks into :class:`sgstore.graph.SceneGraph` records.
 
     Parameters
     ----------
     road_map : RoadMap or None
-        The map that they lie on. What is known of its nodes is put together when they are first met.
+        The map of the graphs. The attributes of a map node are collected at its first use.
     """
 
     def __init__(self, road_map: RoadMap | None) -> None:
@@ -478,7 +480,7 @@ class Records:
             self._map = MapRecords(about, edges.src, edges.relation, edges.dst, reach)
 
     def stand(self, known: EntityConstants, states: States, row: int) -> None:
-        """Take note of what stands: its pose comes once."""
+        """Store the attributes of a static entity, whose pose comes only once."""
         numbers = {name: float(getattr(states, name)[row]) for name in _BOX}
         numbers["heading"] = _degrees(states.heading[row : row + 1])[0]
         about = known.attributes(is_ego=False, is_static=True)
@@ -487,16 +489,16 @@ class Records:
     def graph(
         self, graph: GraphBlock, outer: Ints, known: dict[int, EntityConstants]
     ) -> SceneGraph:
-        """The graph of a block's only frame.
+        """Return the scene graph of a block with one frame.
 
         Parameters
         ----------
         graph : GraphBlock
             Of one frame.
         outer : int64
-            Node id of the block → node id of the records; those of the map are the same.
+            Node id of the block → node id of the records. Map nodes keep their ids.
         known : dict
-            Node id of the records → entity, of all that move in the frame.
+            Node id of the records → entity, for all moving entities of the frame.
         """
         found = self._graph(graph, (graph,), graph.edges, outer, known)
         excluded = frozenset(KINDS[code] for code, _ in graph.left_out.excluded)
@@ -518,7 +520,7 @@ class Records:
         outer: Ints,
         known: dict[int, EntityConstants],
     ) -> SceneGraph:
-        """A graph of what some parts have: the graph, and what is known beyond it."""
+        """Return the scene graph for several parts: the graph, and optionally its surroundings."""
         frames = graph.frames
         states = chained([part.frames.states for part in parts])
         presence = chained([part.presence for part in parts])
@@ -551,11 +553,11 @@ class Records:
 
 
 def _map_node(road_map: RoadMap, node: int) -> Attributes:
-    """Attributes of a part of a map."""
+    """Return the attributes of a map node."""
     nodes, row = road_map.nodes, -1 - node
     texts = {name: getattr(nodes, name)[row] for name in _MAP_TEXTS}
     numbers = {name: float(getattr(nodes, name)[row]) for name in _MAP_NUMBERS}
-    # A store keeps these in 32 bits.
+    # A store has 32 bits for these numbers.
     numbers |= {
         name: float(np.float32(numbers[name])) for name in ("length", "width", "speed_limit")
     }
@@ -570,7 +572,7 @@ def _map_node(road_map: RoadMap, node: int) -> Attributes:
 
 
 def _moving(states: States) -> list[Attributes]:
-    """Attributes of states, in outward units: of whole columns first, then row by row."""
+    """Return the attributes of each state, in output units (degrees, m/s)."""
     columns: dict[str, Floats] = {
         name: getattr(states, name) for name in (*_BOX, *_MOTION, *INPUTS[:3])
     }
@@ -592,7 +594,7 @@ def _moving(states: States) -> list[Attributes]:
 
 
 def _coded(lights: int, light: int, derived: int, gear: float, hand_brake: float) -> Attributes:
-    """Return the attributes that are stored as codes: lights, derived flags, gear and hand brake."""
+    """Return the attributes with coded values: lights, derived flags, gear and hand brake."""
     about: Attributes = {}
     if lights >= 0:
         about |= {name: bool(lights >> bit & 1) for bit, name in enumerate(VEHICLE_LIGHTS)}
@@ -606,7 +608,7 @@ def _coded(lights: int, light: int, derived: int, gear: float, hand_brake: float
 
 
 def _lanes(lanes: LaneStates, outer: Ints) -> Iterator[tuple[int, int, int, Attributes]]:
-    """Attributes of ``isIn`` edges, with their frame and ends."""
+    """Yield frame, source, target and attributes of each ``isIn`` edge."""
     told = (lanes.overlap, lanes.offset, lanes.heading_error, lanes.along)
     columns = (
         *(lanes.frame.tolist(), _outward(lanes.node, outer).tolist(), lanes.lane.tolist()),
@@ -626,7 +628,7 @@ def _lanes(lanes: LaneStates, outer: Ints) -> Iterator[tuple[int, int, int, Attr
 
 
 def _gaps(gaps: LaneGaps, outer: Ints) -> Iterator[tuple[int, int, int, Attributes]]:
-    """Attributes of ``follows`` edges, with their frame and ends."""
+    """Yield frame, source, target and attributes of each ``follows`` edge."""
     src, dst = _outward(gaps.src, outer).tolist(), _outward(gaps.dst, outer).tolist()
     for frame, a, b, gap in zip(
         gaps.frame.tolist(), src, dst, number(gaps.gap).tolist(), strict=True
@@ -635,64 +637,63 @@ def _gaps(gaps: LaneGaps, outer: Ints) -> Iterator[tuple[int, int, int, Attribut
 
 
 def _outward(nodes: Whole, outer: Ints) -> Ints:
-    """Node ids of the records for those of a block."""
+    """Return the node ids of the records for node ids of a block."""
     return np.where(nodes >= 0, outer[np.maximum(nodes, 0)], nodes)
 
 
 def _degrees(heading: Floats) -> list[float]:
-    """Headings in (-180, 180]."""
+    """Return headings in degrees, in (-180, 180]."""
     return np.degrees(wrapped(heading)).tolist()
 
 
 def _numbers(values: dict[str, float]) -> Attributes:
-    """Numbers that are known."""
     return {name: value for name, value in values.items() if math.isfinite(value)}
 
 
-# Frame after frame to scene graph after scene graph, in bounded memory --------------------------
-# Node ids are given in the order of appearance and never to two entities. The tables of a generator grow with
-# every entity that it meets, so it is made anew when most of those it knows are gone; what it keeps between
-# blocks saves work and changes no graph, so nobody can tell. What has been absent while :data:`REMEMBERED`
-# others came is forgotten, and would come back as somebody new.
+# Online generation in bounded memory.
+# Node ids are assigned in the order of appearance and never used twice. The tables of a generator grow with
+# every new entity. The generator is therefore replaced after most of its entities are gone. Its tables only
+# save work, so the graphs do not change. An absent entity is forgotten after :data:`REMEMBERED` other
+# entities; if it returns, it is a new entity.
 
 REMEMBERED: Final = 20_000
-"""Entities that are absent and still known by their ids; some 5 MB."""
+"""Absent entities that are still known by their ids; about 5 MB."""
 
 SPARE: Final = 2048
-"""Entities that may be gone before a generator is made anew."""
+"""Absent entities that are allowed before a generator is replaced."""
 
 
 class Generator(Protocol):
-    """Maker of graphs from blocks: :class:`sgstore.sgg.SceneGraphGenerator`."""
+    """Protocol of the graph generator; see :class:`sgstore.sgg.SceneGraphGenerator`."""
 
     @property
     def kinds(self) -> Codes:
-        """Kinds of the entities that it has met, by node id."""
+        """Kinds of all entities so far, by node id."""
         ...
 
     def blocks(self, frames: FrameBlock, egos: Sequence[Ints]) -> list[GraphBlock]:
-        """The graphs of the next frames, as each ego has them."""
+        """Return the graphs of the next frames, one block per ego."""
         ...
 
 
 class Stepper:
-    """Frame after frame to scene graph after scene graph.
+    """Online generator: one frame in, its scene graphs out.
 
     Parameters
     ----------
     make : callable
-        Makes a generator that has seen nothing yet.
+        Makes a new generator.
     road_map : RoadMap or None
-        The map that its graphs lie on.
+        The map of the graphs.
     ego : str
-        The ego of frames that name none.
+        Default ego for frames without an ego.
 
     Attributes
     ----------
     last : tuple or None
         The last graphs as blocks, and the kinds of their entities by the blocks' node ids.
     faults : FaultTally
-        Sizes and speeds of the frames that no body has.
+        Implausible sizes and speeds in the frames.
     """
 
     def __init__(
@@ -710,21 +711,21 @@ class Stepper:
         self._moving: OrderedDict[str, Lives[EntityConstants]] = OrderedDict()
         self.faults = FaultTally()
         self._time_ns: int | None = None
-        self._run = 0  # of the clock: it ends where the clock jumps back
+        self._run = 0  # Run of the clock; a backward step starts the next run.
         self._standing: dict[str, tuple[Entity, EntityConstants]] = {}
-        # Node id → the generator's own one, which begins anew with it; and the other way round.
+        # Node id → node id inside the current generator, and the inverse.
         self._inner: dict[int, int] = {}
         self._introduced = 0
         self._outer: Ints = np.zeros(64, np.int64)
 
     def step(self, frame: Frame, egos: Sequence[str]) -> list[SceneGraph]:
-        """The scene graphs of the next frame; see :meth:`sgstore.sgg.SceneGraphGenerator.step`.
+        """Return the scene graphs of the next frame, one per ego.
 
         Parameters
         ----------
         frame : Frame
         egos : sequence of str
-            Whose graphs; an empty id means the ego of the frame, else that of the config.
+            Ids of the egos. An empty id means the ego of the frame, else that of the config.
         """
         moving, new = self._met(frame)
         if self._introduced > 2 * (len(moving) + len(self._standing)) + SPARE:
@@ -738,7 +739,7 @@ class Stepper:
         nodes = [
             self._inner[self._moving[ego].last.entity.node] if ego in here else -1 for ego in named
         ]
-        self.last = None  # let go of the graphs before this one: of a crowd they are large
+        self.last = None  # Free the previous graphs, which are large for a crowd.
         graphs = self._generator.blocks(block, [np.array([node]) for node in nodes])
         self._seq += 1
         self.last = graphs, self._generator.kinds
@@ -754,7 +755,7 @@ class Stepper:
             return [replace(one, events=happened) for one in found]
 
     def _happened(self, frame: Frame) -> dict[str, list[tuple[int | None, int | None]]]:
-        """Events of a frame by kind, of nodes instead of ids; of what is recorded an entry anyway."""
+        """Return the events of a frame by kind, with node ids. Each recorded kind has an entry."""
         found: dict[str, list[tuple[int | None, int | None]]] = {k: [] for k in frame.recorded}
         for kind, *idents in frame.events:
             a, b = (self._node_of(ident) for ident in idents)
@@ -767,9 +768,9 @@ class Stepper:
         return self._moving[ident].last.entity.node if ident in self._moving else None
 
     def _met(self, frame: Frame) -> tuple[list[Entity], list[Entity]]:
-        """Entities of a frame that move, and those that stand and were not known.
+        """Return the moving entities of a frame, and its new static entities.
 
-        Everything is checked before anything is remembered: a frame that is refused has not been.
+        All checks come first: a rejected frame changes nothing.
         """
         check_entities(frame, self._is_static)
         if self._time_ns is not None and frame.time_ns < self._time_ns:
@@ -782,7 +783,7 @@ class Stepper:
         for entity in frame.entities:
             if entity.static and entity.ident not in self._standing:
                 new.setdefault(entity.ident, entity)
-        # Node ids as of a recording: first those of new ids, then those of ids that have returned.
+        # Same node ids as for a recording: first the new ids, then the ids that have returned.
         for entity in frame.entities:
             if entity.ident not in self._moving and entity.ident not in self._standing:
                 known = self._enter(entity)
@@ -806,7 +807,7 @@ class Stepper:
         return known
 
     def _follow(self, entity: Entity, time_ns: int) -> None:
-        """Note where an entity is; it is another one if its id has returned."""
+        """Record the place of an entity. An id that has returned starts a new entity."""
         lives = self._moving[entity.ident]
         place = (_NAN,) * 3 if entity.whole[_LIGHT] >= 0 else entity.numbers[:3]
         here = Sight(place, time_ns, self._run)
@@ -814,7 +815,7 @@ class Stepper:
         self._moving.move_to_end(entity.ident)
 
     def _block(self, frame: Frame, moving: list[Entity], standing: list[Entity]) -> FrameBlock:
-        """A frame as a block, in the generator's own node ids."""
+        """Return a frame as a block with the node ids of the generator."""
         first = self._introduced
         new = [*standing, *(e for e in moving if self._node(e) not in self._inner)]
         self._introduced += len(new)
@@ -830,14 +831,14 @@ class Stepper:
             log_time_ns=time,
             offsets=np.array([0, len(moving)]),
             states=self._states(moving),
-            ego=np.array([-1]),  # it is told apart from the block
+            ego=np.array([-1]),  # The ego is passed separately.
             entities=_entities(first, new),
             scenery=self._states(standing),
             messages=MessageRefs(none, none, none, none, none),
         )
 
     def _kept(self, block: FrameBlock) -> FrameBlock:
-        """A block with the numbers that a store would keep of it, if these frames were its trace."""
+        """Round the numbers of a block as a store does."""
         self._origin = self._origin or origin_of(block)
         return quantize(block, self._origin or Origin(0.0, 0.0, 0.0))
 
@@ -860,18 +861,18 @@ class Stepper:
 
 
 def check_entities(frame: Frame, is_static: Callable[[str], bool | None]) -> None:
-    """Refuse a frame that contradicts itself or those before it; nothing of it need be remembered then.
+    """Raise if a frame contradicts itself or earlier frames.
 
     Parameters
     ----------
     frame : Frame
     is_static : callable
-        Of an id: whether the entity that had it before is static; None if there was none.
+        Returns for an id: True if the known entity is static, False if it moves, None for an unknown id.
 
     Raises
     ------
     ValueError
-        Two entities have one id, or one that moved is static or the other way round.
+        Two entities have the same id, or a moving entity is now static, or a static one moves.
     """
     here: dict[str, Entity] = {}
     for entity in frame.entities:
@@ -885,11 +886,11 @@ def check_entities(frame: Frame, is_static: Callable[[str], bool | None]) -> Non
 
 
 class GcPaused:
-    """No garbage is looked for meanwhile, if it is at all.
+    """Context manager that pauses garbage collection, if it is enabled.
 
-    The records of a graph are thousands of small objects, none of them garbage. Python would look through them
-    several times while they are made, and every few frames through all that the client has: 30 ms and more.
-    What is let go again before the end is never looked through: Python counts what is more than it was.
+    The records of a graph are thousands of small objects and no garbage. Python would scan them several times
+    during their creation, and every few frames all objects of the client: 30 ms and more. Objects freed inside
+    the context are never scanned, because Python counts the net growth.
     """
 
     def __enter__(self) -> None:

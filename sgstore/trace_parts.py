@@ -1,4 +1,7 @@
-"""Parts of a trace: from a time, up to a time, at a lower rate. Frames that are left are numbered anew."""
+"""Selection of a part of a trace: a time span and a lower frame rate.
+
+The selected frames get new numbers.
+"""
 
 from __future__ import annotations
 
@@ -21,25 +24,25 @@ if TYPE_CHECKING:
 _NONE: Final = np.zeros(0, np.intp)
 
 MAX_MESSAGES: Final = 200_000
-"""References of messages that wait for a block to be full."""
+"""Maximum number of message references in an incomplete block."""
 
 _SLACK_NS: Final = TOLERANCE_NS
-"""How early a frame may come and still be that of its step: simulators round their clocks; ns."""
+"""Tolerance for an early frame of a step, because simulators round their clocks; ns."""
 _SLACK: Final = _SLACK_NS / 1e9
-"""The same in seconds: how far a frame may miss the ends of the part. The median period is not known yet."""
+"""The same in seconds; also the tolerance at both ends of the part. The median period is not known yet."""
 
 
 @dataclass(frozen=True, slots=True)
 class TracePart:
-    """Part of a trace: a span of time, and a rate.
+    """Part of a trace: a time span and a frame rate.
 
     Attributes
     ----------
     since, until : float or None
-        From the first frame at or after ``since``, up to the last one before the first frame that comes after
-        ``until``; seconds since the first frame of the recording.
+        The part begins with the first frame at or after ``since``. It ends before the first frame after
+        ``until``. Seconds since the first frame of the recording.
     rate : float
-        Frames of a second: the first at or after each step of 1/rate. 0: all.
+        Frames per second: the first frame at or after each step of 1/rate. 0: all frames.
     """
 
     since: float | None = None
@@ -47,14 +50,15 @@ class TracePart:
     rate: float = 0.0
 
     def blocks(self, blocks: Iterator[FrameBlock], size: int) -> Iterator[FrameBlock]:
-        """The frames of the part, ``size`` at a time; the last block, and those with many messages, have fewer.
+        """Yield the frames of the part in blocks of ``size`` frames.
 
-        Entities keep their node ids, and those that appear only in frames that are left out stay known.
+        The last block and blocks with many messages are smaller. Entities keep their node ids. Entities that
+        appear only in dropped frames stay in the list of entities.
 
         Raises
         ------
         TraceError
-            No frame is in the part.
+            The part contains no frame.
         """
         if self == TracePart():
             yield from blocks
@@ -78,7 +82,7 @@ class TracePart:
 
 
 class _Clock:
-    """Selection of frames at a lower rate, one block after another."""
+    """Selector of frames by time span and rate, one block after another."""
 
     def __init__(self, part: TracePart) -> None:
         self._part = part
@@ -89,7 +93,7 @@ class _Clock:
         self.over = False
 
     def within(self, time_ns: int) -> bool:
-        """Return whether a time is in the part, once frames up to it were seen."""
+        """True if a time is in the part. Frames up to this time must have been processed before."""
         since = (time_ns - (self._zero or 0)) / 1e9
         part = self._part
         return (
@@ -99,7 +103,7 @@ class _Clock:
         )
 
     def kept(self, time_ns: Ints) -> Bools:
-        """Return for each frame whether it is kept."""
+        """Return a mask of the frames to keep."""
         part = self._part
         self._zero = int(time_ns[0]) if self._zero is None else self._zero
         since = (time_ns - self._zero) / 1e9
@@ -108,7 +112,7 @@ class _Clock:
         if part.rate:
             slack = (time_ns - self._zero + _SLACK_NS) / 1e9
             step = np.floor(slack * part.rate).astype(np.int64)
-            # Also where the clock runs back: another step is another frame.
+            # Also if the clock runs backwards: a different step is a different frame.
             kept = step != np.concatenate([[self._step], step[:-1]])
             self._step = int(step[-1])
         start = 0
@@ -118,7 +122,7 @@ class _Clock:
             start = int(found[0]) if len(found) else len(kept)
             kept[:start] = False
         if part.until is not None:
-            # Of a clock that runs back before the part begins nothing is over.
+            # A clock that runs backwards before the start of the part does not end the part.
             beyond = start + np.flatnonzero(since[start:] > part.until + _SLACK)
             self.over = bool(len(beyond))
             kept[int(beyond[0]) if len(beyond) else len(kept) :] = False
@@ -126,7 +130,7 @@ class _Clock:
 
 
 class _KeptFrames:
-    """Frames that were kept and not given yet, and what came with them."""
+    """Buffer of selected frames, with their messages, entities and events."""
 
     def __init__(self) -> None:
         self._blocks: list[FrameBlock] = []
@@ -137,7 +141,7 @@ class _KeptFrames:
         return self._frames
 
     def add(self, block: FrameBlock, kept: Bools) -> None:
-        if not self._frames:  # no frame refers to messages that long before
+        if not self._frames:  # No frame refers to messages from so long before.
             self._blocks = [_without_messages(one) for one in self._blocks]
             self.messages = 0
         self._blocks.append(_selected(block, kept))
@@ -145,7 +149,7 @@ class _KeptFrames:
         self.messages += len(block.messages)
 
     def take(self, count: int, first: int) -> FrameBlock:
-        """The first frames as one block, with all messages, entities and events that came so far."""
+        """Remove and return the first frames as one block, with all buffered messages, entities and events."""
         whole = _joined(self._blocks)
         now = _sliced(whole, 0, count)
         rest = _sliced(whole, count, len(whole))

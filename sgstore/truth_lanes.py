@@ -1,4 +1,4 @@
-"""Lanes of truth: where each part of a pattern holds in a trace, for the nodes of one match."""
+"""Truth lanes: the frames in which each part of a pattern holds, for the nodes of one match."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class TruthLane:
-    """Frames of a trace in which a part of a pattern holds for given nodes.
+    """Frames of a trace in which one part of a pattern holds for given nodes.
 
     Attributes
     ----------
     part : PatternPart
-        Its ``text``, its ``step`` in a sequence, and how it is drawn.
+        The part, with its ``text``, its ``step`` in a sequence, and its drawing.
     spans : tuple of (int, int)
-        First and last frame of each run, by number; both hold.
+        First and last frame number of each run; both belong to the run.
     unknown : tuple of str
-        Relations of the part of which nothing is known in the trace: it cannot be told where it holds.
+        Relations of the part that the trace does not record. The frames of the part are then unknown.
     """
 
     part: PatternPart
@@ -42,13 +42,13 @@ class TruthLane:
 
 @dataclass(frozen=True, slots=True)
 class TruthLanes:
-    """Lanes of truth: each part of a pattern over a whole trace, for the nodes of one match.
+    """Truth lanes of all parts of a pattern over a whole trace, for the nodes of one match.
 
     Attributes
     ----------
     trace : str
     binding : mapping of str to int
-        Node ids of the variables that are given; of the others a lane asks that there be some.
+        Node ids of the bound variables. For the other variables, any node may match.
     lanes : tuple of TruthLane
         In reading order, step by step.
     """
@@ -59,11 +59,11 @@ class TruthLanes:
 
     @property
     def steps(self) -> tuple[int, ...]:
-        """Numbers of the steps that have lanes; 0 for a pattern of single frames."""
+        """Numbers of the steps with lanes; 0 for a pattern of single frames."""
         return tuple(dict.fromkeys(lane.part.step for lane in self.lanes))
 
     def together(self, step: int = 0) -> tuple[tuple[int, int], ...]:
-        """Runs of frames in which all parts of a step hold: its matches with this binding."""
+        """Return the runs of frames in which all parts of a step hold."""
         spans = [lane.spans for lane in self.lanes if lane.part.step == step]
         found = spans[0] if spans else ()
         for others in spans[1:]:
@@ -71,7 +71,7 @@ class TruthLanes:
         return found
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values: ``trace``, ``binding``, ``lanes``; ``together``: runs by step, as :meth:`together`."""
+        """Return JSON values: ``trace``, ``binding``, ``lanes``, and ``together`` (the runs by step)."""
         lanes = [
             {name: getattr(lane.part, name) for name in ("text", "step", "nodes", "conditions")}
             | {"edges": [*map(asdict, lane.part.edges)]}
@@ -86,7 +86,7 @@ class TruthLanes:
 def _intersection(
     one: tuple[tuple[int, int], ...], other: tuple[tuple[int, int], ...]
 ) -> Iterator[tuple[int, int]]:
-    """Runs that are in both of two lists of runs, in order."""
+    """Yield the intersections of two lists of runs, in order."""
     a, z = 0, 0
     while a < len(one) and z < len(other):
         first, last = max(one[a][0], other[z][0]), min(one[a][1], other[z][1])
@@ -105,24 +105,24 @@ def truth_lanes(
     given: Mapping[str, int],
     numbers: Callable[[Query], NDArray[np.generic]],
 ) -> TruthLanes:
-    """The lanes of a query in a trace.
+    """Return the truth lanes of a query in a trace.
 
     Parameters
     ----------
     query : Query
-        As the binder gave it.
+        A bound query.
     trace : str
     facts : TraceFacts, optional
-        ``None``: nothing is known of the trace, so that no lane holds.
+        Facts of the trace. ``None`` means that the trace has no facts; all lanes are then empty.
     given : mapping of str to int
         Node ids of some of its variables.
     numbers : callable
-        Numbers of the frames of the trace in which a query holds; in any order, some more than once.
+        Returns the numbers of the frames in which a query holds, in any order; duplicates are allowed.
 
     Raises
     ------
     QueryNameError
-        The pattern has no such variable.
+        The pattern does not contain the variable.
     """
     lanes: list[TruthLane] = []
     for part in parts_of(query, given):
@@ -137,7 +137,7 @@ def truth_lanes(
 
 
 def _runs_of(seq: NDArray[np.generic]) -> tuple[tuple[int, int], ...]:
-    """First and last of the runs of consecutive numbers among some; they need not be in order."""
+    """Return the first and last number of each run of consecutive numbers. The input may be unsorted."""
     numbers = np.unique(np.ma.getdata(seq)).astype(np.int64)
     if not len(numbers):
         return ()
