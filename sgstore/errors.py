@@ -228,7 +228,7 @@ class QueryError(SgstoreError):
         super().__init__(_with_carets(reason, text, span, hint))
 
     def as_dict(self) -> dict[str, object]:
-        """Return the error as data: ``error``, ``reason``, ``hint``, ``start``, ``end``, ``line``, ``column``."""
+        """Return error data: ``error``, ``reason``, ``hint``, ``start``, ``end``, ``line``, ``column``."""
         line, column = position(self.text, self.span.start) if self.span else (None, None)
         return {
             "error": type(self).__name__,

@@ -1,4 +1,4 @@
-"""The store: one DuckDB file, and the only room that knows DuckDB.
+"""The store: one DuckDB file. Only this package uses DuckDB.
 
 Reading: ``_file`` is the face, :class:`StoreFile`. ``_locking`` lets readers and writers share the file,
 and ``_schema`` compares it with ``schema.sql`` before anything is read. ``_rows`` runs statements, users'

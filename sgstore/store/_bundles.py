@@ -1,4 +1,4 @@
-"""Bundles: traces of one store or of several as a store of their own, sorted, under given names.
+"""Bundles: new stores with sorted, renamed traces of one or several stores.
 
 Numbers of traces, maps, recordings and settings come from digests, so they are the same in every store: rows
 are copied as they are. What is said of a bundle in the catalogue of a collection is read here, too, and the
@@ -59,7 +59,7 @@ _SORTED: Final = frozenset({*STATES, *REPEATED, *REPEATED.values(), "frame", *MA
 def write_bundle(
     source: Path, to: Path, traces: Mapping[int, str], maps: Mapping[str, str] | None = None
 ) -> None:
-    """Copy traces of a store into a new one, sorted over all of them.
+    """Copy traces of a store into a new store, sorted across all traces.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def write_bundle(
 def join_bundles(
     sources: Sequence[Path], to: Path, traces: Mapping[int, str], maps: Mapping[str, str]
 ) -> None:
-    """Copy traces of several stores, which nobody writes to, into a new one.
+    """Copy traces of several stores into a new store. No process may write to the sources.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def _copied(
     *,
     whole: bool = True,
 ) -> None:
-    """Fill a new store with traces of those that are attached under some names."""
+    """Fill a new store with traces of attached stores."""
     attach_empty(connection, to)
     for database in sources:
         words = {enum: shape.labels_of(connection, database, enum) for enum in NAMES}
@@ -173,7 +173,7 @@ def _copied(
 def _choose(
     connection: DuckDBPyConnection, traces: Mapping[int, str], maps: Mapping[str, str]
 ) -> None:
-    """Make the tables of the traces that are taken, and of new names of maps."""
+    """Create temporary tables of the selected traces and of the new map names."""
     for table, kind, values in (("chosen", "BIGINT", traces), ("named", "VARCHAR", maps)):
         connection.execute(
             f"CREATE OR REPLACE TEMP TABLE {table} AS SELECT unnest(CAST($1 AS {kind}[])) AS key,"
@@ -187,7 +187,7 @@ _ONCE: Final = {table: owner for owner, tables in SHARED.items() for table in ta
 
 
 def _chosen(table: str, database: str) -> str:
-    """The rows of a table of an attached store that belong to the traces that are taken."""
+    """Return SQL for the rows of an attached store's table that belong to the selected traces."""
     inside = f"{quoted(database)}.inside"
     traces = f"(SELECT t.* FROM {inside}.trace t WHERE t.trace_id IN (SELECT key FROM chosen))"
     if table == "trace":
@@ -323,7 +323,7 @@ _INFO: Final = "SELECT key, value FROM store_info"
 
 
 def facts_of(file: StoreFile, bundle: str, size: int) -> Facts:
-    """Rows of a catalogue that say what is in a store.
+    """Return the catalogue rows that describe the content of a store.
 
     Of triples beyond the graphs, ``moving`` is NULL.
 
@@ -390,19 +390,19 @@ def _words(bundle: str, catalog: Any) -> Iterator[tuple[Any, ...]]:
 
 
 def answers_of(text: str) -> tuple[str, ...]:
-    """The relations that a trace of a catalogue can answer."""
+    """Return the relations that a trace in a catalogue can answer."""
     return tuple(map(str, json.loads(text)))
 
 
 def names_of_traces(path: Path) -> dict[int, tuple[str, str, str]]:
-    """Id → name, digest of the recording, and ego of each trace of a store, by name in natural order."""
+    """Return trace id → (name, recording digest, ego) of a store, sorted by name in natural order."""
     with Access(path).reading() as connection:
         found = stored_traces(connection)
     return {one.trace_id: (one.name, one.digest, one.ego) for one in found}
 
 
 def maps_of_traces(path: Path, traces: Iterable[int]) -> dict[str, str]:
-    """Digest → name of the road maps of some traces of a store."""
+    """Return the road maps of some traces: map digest → map name."""
     sql = (
         "SELECT DISTINCT m.digest, m.name FROM trace t JOIN map m ON m.map_id = t.map_id"
         " WHERE t.trace_id IN (SELECT unnest(CAST($1 AS BIGINT[])))"
@@ -412,7 +412,7 @@ def maps_of_traces(path: Path, traces: Iterable[int]) -> dict[str, str]:
 
 
 def parquet_rows(path: Path, columns: Iterable[str]) -> list[tuple[Any, ...]]:
-    """Rows of a Parquet file of ours, columns of some names; NULL for those of :data:`LATER` that it lacks.
+    """Return named columns of a sgstore Parquet file. Missing columns of :data:`LATER` are NULL.
 
     Raises
     ------

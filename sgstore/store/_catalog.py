@@ -1,4 +1,4 @@
-"""The catalog of a store, as the compiler of queries needs it, with one of each abstraction.
+"""Catalog of a store for the query compiler, including the catalog of each abstraction.
 
 Under an abstraction a query sees other tables under the same names: *shadows*, which stand before its
 statement.
@@ -33,7 +33,7 @@ _NUMBERS: Final = frozenset({"BIGINT", "UBIGINT", "HUGEINT", "DOUBLE"})
 
 
 def catalog_of(connection: DuckDBPyConnection) -> Catalog:
-    """The catalog of a store, with those of its abstractions in it."""
+    """Return the catalog of a store, including the catalogs of its abstractions."""
 
     def kinds(of: str) -> frozenset[str]:
         found = connection.execute(f"SELECT DISTINCT kind FROM {of}").fetchall()
@@ -86,12 +86,12 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
 
 
 def subset_catalogs() -> dict[str, Callable[[Catalog], Catalog]]:
-    """Abstractions that have some of the nodes and edges: what makes the catalog of each from a store's."""
+    """Return functions that derive the catalog of each subset abstraction from a store's catalog."""
     return {name: partial(_narrowed, name=name, of=of) for name, of in SUBSETS.items()}
 
 
 def _sets(connection: DuckDBPyConnection) -> tuple[DerivedSet, ...]:
-    """The derived sets of a store; few have any, and what makes them takes long to import."""
+    """Return the derived sets of a store. Most stores have none, so the slow import is avoided."""
     if connection.execute("SELECT 1 FROM derived LIMIT 1").fetchone() is None:
         return ()
     from sgstore.store._derive import sets_of
@@ -100,7 +100,9 @@ def _sets(connection: DuckDBPyConnection) -> tuple[DerivedSet, ...]:
 
 
 def known_range(scope: Mapping[str, Any] | None) -> float:
-    """How far around the ego all is known that was recorded; m. Infinite where nothing was left out.
+    """Return the distance from the ego within which all recorded objects are stored; m.
+
+    Infinite means everything.
 
     Parameters
     ----------
@@ -117,7 +119,7 @@ _KNOWN: Final = ("state", "node", "lane_state", "lane_gap")
 
 
 def _beyond(connection: DuckDBPyConnection) -> dict[str, Any]:
-    """Fields of the catalog about what is known beyond the graphs; none where nothing is."""
+    """Return the catalog fields for data outside the graphs. The result is empty without such data."""
     tables = ("world_state", "world_node", "world_edge")
     there = " UNION ALL ".join(f"(SELECT 1 FROM {table} LIMIT 1)" for table in tables)
     if connection.execute(there).fetchone() is None:
@@ -131,7 +133,7 @@ def _beyond(connection: DuckDBPyConnection) -> dict[str, Any]:
 
 
 def _own(connection: DuckDBPyConnection, whose: str) -> dict[str, Type]:
-    """Attributes of a client's own of nodes or edges, with their types: see :func:`sgstore.lang.own_type`.
+    """Return the types of user-defined node or edge attributes; see :func:`sgstore.lang.own_type`.
 
     In a trace they are numbers or truth values if all values are, else texts.
     """
@@ -151,7 +153,10 @@ def _own(connection: DuckDBPyConnection, whose: str) -> dict[str, Type]:
 
 
 def _type_of(traces: list[tuple[Type, bool, bool]]) -> Type:
-    """The type of an attribute: of each trace its type, and whether its values are whole, and some large."""
+    """Return the common type of an attribute.
+
+    Each trace adds its type and two flags: whole values, large values.
+    """
     kind = own_type([one for one, _, _ in traces])
     numbers = [flags for one, *flags in traces if one is Type.number]
     exact = all(whole for whole, _ in numbers) and any(large for _, large in numbers)
@@ -164,7 +169,7 @@ def _counted(connection: DuckDBPyConnection, table: str) -> dict[Triple, int]:
 
 
 def _narrowed(whole: Catalog, name: str, of: Subset) -> Catalog:
-    """The catalog under an abstraction that has some of the nodes and edges."""
+    """Return the catalog of an abstraction that has a subset of the nodes and edges."""
     kinds = of.kinds
     if kinds is None:
         return replace(whole, name=name)
@@ -211,7 +216,7 @@ def _narrowed(whole: Catalog, name: str, of: Subset) -> Catalog:
 def _derived(
     connection: DuckDBPyConnection, whole: Catalog, name: str, of: list[DerivedSet]
 ) -> dict[str, Any]:
-    """Fields in which the catalog under a derived set, of the traces that have it, differs from the store's."""
+    """Return the catalog fields that a derived set changes, for the traces with this set."""
     answers = {one.trace_id: frozenset(one.answers) for one in of}
     reaches = {one.trace_id: RelationScope.of(one.settings) for one in of}
     word = literal(name)
@@ -255,7 +260,7 @@ def _derived(
 
 
 def _beyond_derived(beyond: dict[str, str], shadows: dict[str, str], word: str) -> dict[str, str]:
-    """Tables in scope ``world`` under a derived set: all that is known, and its edges for those of graphs."""
+    """Return the tables of scope ``world`` for a derived set: its edges replace the edges of the graphs."""
     if not beyond:
         return {}
     traces = f"(SELECT d.trace_id FROM derived AS d WHERE d.name = {word})"
@@ -274,7 +279,7 @@ def _beyond_derived(beyond: dict[str, str], shadows: dict[str, str], word: str) 
 def _relations(
     connection: DuckDBPyConnection, whole: Catalog, of: list[DerivedSet]
 ) -> frozenset[str] | None:
-    """The relations that a derived set has by its settings; ``None``: that is not known.
+    """Return the relations of a derived set according to its settings. ``None`` means unknown.
 
     What no trace of it answers is lacking, if one of them has a road map: it is all that a relation may need
     beside settings. Without one, what the traces themselves answer is.
@@ -294,7 +299,7 @@ def _relations(
 def relations_of_set(
     answered: frozenset[str], known: frozenset[str], *, mapped: bool
 ) -> frozenset[str]:
-    """The relations that a derived set has by its settings.
+    """Return the relations of a derived set according to its settings.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The classes of frames in each abstraction: on their way into a store, and made when asked for.
+"""Frame classes of each abstraction: written at ingest, or computed at the first query.
 
 Classes are masks like edges: one row for each class of a bucket, because driving repeats itself. Those that
 are made at ingest are published with their trace; others wait until they are asked for, and are then kept.
@@ -64,7 +64,7 @@ _FEW_EDGES: Final = 1 << 16
 
 
 class TraceClasses:
-    """Classes of the frames of one trace, block by block.
+    """Frame classes of one trace, computed block by block.
 
     Parameters
     ----------
@@ -78,11 +78,11 @@ class TraceClasses:
         self._known: OrderedDict[bytes, list[str]] = OrderedDict()
 
     def columns(self, seen: GraphColumns, trace_id: int, seq: Ints) -> Columns:
-        """Table ``later_class``, of frames whose numbers are ``seq``."""
+        """Return columns of table ``later_class`` for the frames with numbers ``seq``."""
         return self._columns(self._named(seen), trace_id, seq)
 
     def ingested(self, seen: GraphColumns, trace_id: int, seq: Ints) -> Columns:
-        """Table ``frame_class``, of a frame like one before they are known."""
+        """Return columns of table ``frame_class``. Frames with equal content reuse their classes."""
         contents = contents_of(seen)
         rows = {content: row for row, content in enumerate(contents) if content not in self._known}
         fresh = sorted(rows.values())
@@ -96,7 +96,7 @@ class TraceClasses:
         return self._columns([*zip(*of_frames, strict=True)], trace_id, seq)
 
     def _named(self, seen: GraphColumns) -> list[tuple[str, ...]]:
-        """For each abstraction the classes of the frames."""
+        """Return the classes of the frames for each abstraction."""
         # Not those of a crowd together, which would take the memory.
         together = len(self._of) if len(seen.frame) < _FEW_EDGES else 1
         named: list[str] = []
@@ -128,14 +128,14 @@ class TraceClasses:
 
 
 class IngestedClasses:
-    """The classes of a trace that is being ingested on a map, if it has one; and the roles of its lanes."""
+    """Frame classes and lane roles of a trace during ingest."""
 
     def __init__(self, road_map: RoadMap | None) -> None:
         self._grounds = None if road_map is None else MapColumns.of(road_map)
         self._classes = TraceClasses()
 
     def tables(self, graph: GraphBlock, trace_id: int, kinds: Codes) -> dict[str, Columns]:
-        """Tables ``frame_class`` and ``lane_role``; ``kinds`` are those of the entities so far, by node id."""
+        """Return tables ``frame_class`` and ``lane_role``; ``kinds`` are the entity kinds by node id."""
         seen = GraphColumns.of(graph, kinds, self._grounds)
         seq = graph.frames.seq
         return {
@@ -159,7 +159,7 @@ def _role_columns(seen: GraphColumns, trace_id: int, seq: Ints) -> Columns:
 
 
 class Abstracted:
-    """The frames of a store as abstractions have them. Made by :attr:`StoreFile.abstracted`."""
+    """Frames of a store in abstractions. Created by :attr:`StoreFile.abstracted`."""
 
     def __init__(self, path: Path, access: Access) -> None:
         self._path = path
@@ -167,7 +167,7 @@ class Abstracted:
         self._graphs = Graphs()
 
     def complete(self, name: str) -> int:
-        """Compute the classes in an abstraction of the traces that lack them, and keep them.
+        """Compute and store the missing frame classes of an abstraction.
 
         Traces of some thousand frames are one transaction: what is done stays done, and another call goes on
         from there.
@@ -220,7 +220,7 @@ class Abstracted:
                         note(connection, trace_id, [_LATER])
 
     def classes(self, name: str, trace: int | str | None = None) -> dict[str, NDArray[np.generic]]:
-        """The class of each frame in an abstraction, computed where it was not.
+        """Return the class of each frame in an abstraction. Missing classes are computed.
 
         Returns
         -------
@@ -249,7 +249,10 @@ class Abstracted:
         return {"frame_id": found["frame_id"], "class": np.asarray(found["class"], object)}
 
     def class_of(self, frame_id: int, name: str) -> str | None:
-        """The class of a frame in an abstraction; ``None`` where it is not in the store, or was given up."""
+        """Return the class of a frame in an abstraction.
+
+        ``None`` means not stored, or abandoned as too symmetric.
+        """
         with self._access.reading() as connection:
             found = connection.execute(
                 "SELECT any_value(class) FROM classes WHERE frame_id = ? AND abstraction = ?",
@@ -258,7 +261,7 @@ class Abstracted:
         return found[0] if found else None
 
     def roles_of(self, frame_id: int) -> dict[int, str]:
-        """Roles of lanes for the ego of a frame, by node id: :func:`sgstore.abstractions.lane_roles`."""
+        """Return the lane roles relative to a frame's ego: node id → role."""
         with self._access.reading() as connection:
             found = connection.execute(
                 "SELECT node_id, role FROM roles WHERE frame_id = ?", [frame_id]
@@ -266,7 +269,7 @@ class Abstracted:
         return dict(found)
 
     def coded(self, name: str) -> CodedClasses:
-        """The class of each frame as a number, computed where it was not.
+        """Return the class of each frame as a number. Missing classes are computed.
 
         Raises
         ------
@@ -280,7 +283,7 @@ class Abstracted:
             return coded_classes(connection, abstraction_named(name).name)
 
     def masks(self, name: str) -> Iterator[tuple[str | None, int, int]]:
-        """The class of the frames of each bucket, and which frames: as they are kept, or else made anew.
+        """Yield (class, bucket, frame mask) for all frames. Missing classes are computed but not stored.
 
         Nothing is kept of what is made.
         """
@@ -296,17 +299,17 @@ class Abstracted:
                     yield from ((own or None, *rest) for own, *rest in zip(*of, strict=True))
 
     def times(self) -> tuple[Ints, Ints]:
-        """Ids of all frames, ascending, and their simulation times; ns."""
+        """Return the ids of all frames in ascending order, and their simulation times; ns."""
         with self._access.reading() as connection:
             return times(connection)
 
     def imported_names(self) -> dict[str, int]:
-        """Names of graphs in imported files, and the ids of the frames that these became."""
+        """Return graph names from imported files: graph name → frame id."""
         with self._access.reading() as connection:
             return imported_names(connection)
 
     def features(self, name: str, frame_id: Ints) -> Iterator[tuple[Ints, Triples]]:
-        """Features of the graphs of frames in an abstraction, some frames at a time.
+        """Yield graph features of frames in an abstraction, in groups of frames.
 
         Parameters
         ----------
@@ -331,7 +334,7 @@ class Abstracted:
                 yield rows, triples(function(seen))
 
     def frames(self, name: str, first: int, last: int) -> tuple[Ints, GraphColumns, Labelled]:
-        """The frames of one trace from one id to another: numbers, graphs, and what is made of these.
+        """Return numbers, graphs and abstracted graphs of a range of frames of one trace.
 
         Raises
         ------
@@ -346,7 +349,7 @@ class Abstracted:
         return seq, seen, function(seen)
 
     def labelled(self, ref: int | str, name: str) -> tuple[Labelled, dict[str, int | str]]:
-        """A frame as an abstraction has it, as the only one in columns; and what is known of the frame.
+        """Return one frame as an abstracted graph in columns, and its id, trace, number and time.
 
         Raises
         ------
@@ -370,7 +373,7 @@ class Abstracted:
 
 
 def _missing(connection: DuckDBPyConnection, name: str, catalog: str = "") -> dict[int, int]:
-    """Traces of which the classes in an abstraction are not kept, and their numbers of frames."""
+    """Return the traces without stored classes of an abstraction: trace id → number of frames."""
     return dict(connection.execute(_MISSING.format(catalog), {"name": name}).fetchall())
 
 
@@ -394,7 +397,7 @@ _TIMES: Final = "SELECT frame_id, time_ns FROM frame ORDER BY frame_id"
 
 @dataclass(frozen=True, slots=True)
 class CodedClasses:
-    """The class of each frame in an abstraction.
+    """Frame classes of an abstraction as numbers.
 
     Attributes
     ----------
@@ -412,7 +415,7 @@ class CodedClasses:
 
 
 def coded_classes(connection: DuckDBPyConnection, name: str) -> CodedClasses:
-    """The classes in an abstraction that a store keeps.
+    """Return the stored frame classes of an abstraction.
 
     Parameters
     ----------
@@ -426,7 +429,7 @@ def coded_classes(connection: DuckDBPyConnection, name: str) -> CodedClasses:
 def classes_coded(
     connection: DuckDBPyConnection, kept: str, values: dict[str, Any] | None = None
 ) -> CodedClasses:
-    """The classes that the rows of a statement name: ``class``, ``bucket``, ``mask``."""
+    """Return the frame classes selected by an SQL statement with columns ``class``, ``bucket``, ``mask``."""
     names = connection.execute(_NAMES.format(kept), values).fetchnumpy()["name"]
     rows = connection.execute(_MASKS.format(kept), values).fetchnumpy()
     frame_id, row = frames_of(rows["bucket"].astype(np.int64), rows["mask"].astype(np.int64))
@@ -436,19 +439,19 @@ def classes_coded(
 
 
 def times(connection: DuckDBPyConnection) -> tuple[Ints, Ints]:
-    """Ids of all frames, ascending, and their simulation times; ns."""
+    """Return the ids of all frames in ascending order, and their simulation times; ns."""
     rows = connection.execute(_TIMES).fetchnumpy()
     return rows["frame_id"].astype(np.int64), rows["time_ns"].astype(np.int64)
 
 
 def imported_names(connection: DuckDBPyConnection) -> dict[str, int]:
-    """Names of graphs in imported files, and the frames that these became; of several the last one."""
+    """Return graph names from imported files: graph name → frame id. The last frame wins."""
     return dict(connection.execute(_IMPORTED).fetchall())
 
 
 @dataclass(frozen=True, slots=True)
 class Triples:
-    """Features of graphs; one row for each frame and feature.
+    """Graph features, one row per frame and feature.
 
     Attributes
     ----------
@@ -469,7 +472,7 @@ class Triples:
 
 
 def triples(graphs: Labelled) -> Triples:
-    """Count nodes by their labels, and edges by their own and those of both ends, frame by frame."""
+    """Count, per frame, nodes by label and edges by the labels of edge and both ends."""
     size = len(graphs.labels)
     of_node = graphs.node_frame.astype(np.int64), graphs.node_label.astype(np.int64)
     ends = [
@@ -496,7 +499,7 @@ def triples(graphs: Labelled) -> Triples:
 
 
 def _single(graphs: Labelled) -> tuple[Ints, Ints]:
-    """Edges with several labels as several: the edge, and its label."""
+    """Split edges with several labels: return one row of edge and label for each label."""
     bundles = [np.array(one, np.int64) for one in graphs.bundles]
     label = graphs.label.astype(np.int64)
     many = np.ones(len(label), np.int64)
@@ -514,7 +517,7 @@ def _single(graphs: Labelled) -> tuple[Ints, Ints]:
 
 
 def _counted(of: tuple[Ints, Ints]) -> tuple[Ints, Ints, Ints]:
-    """Pairs of numbers, each once, and how often each comes."""
+    """Return the distinct pairs of numbers, and the count of each pair."""
     frame, key = of
     span = int(key.max(initial=0)) + 1
     both, often = np.unique(frame * span + key, return_counts=True)

@@ -1,4 +1,4 @@
-"""Connections of DuckDB's own to a store, for clients that write their statements for it."""
+"""Plain DuckDB connections to a store, for clients with their own SQL."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def duckdb(path: str | Path) -> DuckDBPyConnection:
-    """Connect DuckDB to a store, read-only, without the optimizers that give wrong rows of its views.
+    """Open a read-only DuckDB connection to a store. Optimizers that return wrong rows are disabled.
 
     Close the connection before another process writes to the store.
 

@@ -1,4 +1,4 @@
-"""Columns of the tables of a store as arrays: their types, their order, and checksums of their rows.
+"""Columns of store tables as arrays: types, sort order, and checksums of rows.
 
 Checksums of rows: the same for the same rows in any order, in any version of the database.
 
@@ -53,7 +53,7 @@ _FLOATS: Final = {"FLOAT": np.dtype(np.float32), "DOUBLE": np.dtype(np.float64)}
 
 @cache
 def types_of(table: str) -> Mapping[str, str]:
-    """Columns of a table of ``schema.sql`` with their types; of an enumeration ``ENUM``."""
+    """Return the column types of a table in ``schema.sql``. Enumerations have type ``ENUM``."""
     if table == "message":
         return MESSAGES
     found: dict[str, str] = {}
@@ -72,7 +72,7 @@ def types_of(table: str) -> Mapping[str, str]:
 
 
 def kept(table: str, name: str, values: NDArray[Any]) -> NDArray[Any]:
-    """A column of numbers as it is staged: what is missing is NaN or :data:`MISSING`.
+    """Convert a numeric column to its staged form. Missing values become NaN or :data:`MISSING`.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def kept(table: str, name: str, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def blank(table: str, name: str, count: int) -> NDArray[Any]:
-    """A staged column in which nothing is known."""
+    """Return a staged column with only missing values."""
     kind = types_of(table)[name]
     if kind in _FLOATS:
         return np.full(count, np.nan, _FLOATS[kind])
@@ -107,7 +107,7 @@ def blank(table: str, name: str, count: int) -> NDArray[Any]:
 
 
 def missing_of(table: str, name: str, values: NDArray[Any]) -> NDArray[np.bool_] | None:
-    """Mask of what is missing in a staged column; ``None`` if nothing is."""
+    """Return a mask of the missing values in a staged column. ``None`` means all values are present."""
     if types_of(table)[name] in TEXTS:
         missing = values < 0
     elif values.dtype.kind == "f":
@@ -170,7 +170,7 @@ REPEATED: Final = {
 
 @cache
 def _keys(table: str) -> tuple[tuple[str, int, bool], ...]:
-    """Columns by which a table is sorted: how far each is shifted to the right, and whether it descends."""
+    """Return the sort columns of a table: (name, right shift in bits, True if descending)."""
     if table not in ORDERS:
         names = [name for name in types_of(table) if name != "mask" or table not in MASKS]
         return tuple((name, 0, False) for name in names)
@@ -183,7 +183,7 @@ def _keys(table: str) -> tuple[tuple[str, int, bool], ...]:
 
 
 def in_order(table: str, columns: Columns, texts: Sequence[str]) -> Columns:
-    """The rows of a table, sorted; those that differ in their masks only as one.
+    """Sort the rows of a table. Merge rows that differ only in their masks.
 
     Parameters
     ----------
@@ -225,7 +225,7 @@ def in_order(table: str, columns: Columns, texts: Sequence[str]) -> Columns:
 
 
 def parted(columns: Columns) -> tuple[Columns, Columns]:
-    """Sorted rows, a row a frame, as those that are single and those that are repeated.
+    """Split sorted rows (one per frame) into single rows and repeated rows.
 
     Parameters
     ----------
@@ -249,7 +249,7 @@ def parted(columns: Columns) -> tuple[Columns, Columns]:
 
 
 def marked(columns: Columns) -> Columns:
-    """Sorted states with the column ``repeated``, in the order that has it."""
+    """Add the column ``repeated`` to sorted states, and sort them by it."""
     bucket = columns["frame_id"] >> FRAME_BITS
     values = {name: of for name, of in columns.items() if name != "frame_id"}
     same = _as_before({"bucket": bucket, **values})
@@ -259,7 +259,7 @@ def marked(columns: Columns) -> Columns:
 
 
 def _as_before(columns: Columns) -> NDArray[np.bool_]:
-    """Of each row but the first: whether all its values are those of the row before."""
+    """Return a mask of the rows that equal the row before, without the first row."""
     same = np.ones(len(next(iter(columns.values()))) - 1, np.bool_)
     for values in columns.values():
         if not same.any():
@@ -270,7 +270,7 @@ def _as_before(columns: Columns) -> NDArray[np.bool_]:
 
 
 def chained(table: str, blocks: Sequence[Columns]) -> Columns:
-    """Staged rows of a table one behind the other, with all columns that any of them has."""
+    """Concatenate staged rows of a table. The result has the columns of all blocks."""
     if len(blocks) == 1:
         return blocks[0]
     return {
@@ -308,7 +308,7 @@ _ASSIGNED: Final = {
 
 @dataclass(slots=True)
 class Checksum:
-    """Checksum of some rows.
+    """Checksum of table rows.
 
     Attributes
     ----------
@@ -321,7 +321,10 @@ class Checksum:
     value: int = 0
 
     def add(self, columns: Mapping[str, NDArray[Any] | None]) -> None:
-        """Add rows, as columns of numbers and truth values, masked where missing; ``None``: all are missing."""
+        """Add rows given as masked columns of numbers and truth values.
+
+        ``None`` means an all-missing column.
+        """
         count = next((len(values) for values in columns.values() if values is not None), 0)
         hashes, words, shifted = (np.empty(min(count, _AT_ONCE), np.uint64) for _ in range(3))
         for first in range(0, count, _AT_ONCE):
@@ -351,7 +354,7 @@ def _mix(words: Words, spare: Words) -> None:
 
 
 def _words(values: NDArray[Any], out: Words) -> None:
-    """The bits of values as words of 64."""
+    """Write the bits of values as 64-bit words."""
     plain = np.ma.getdata(values)
     if plain.dtype.kind == "f":
         plain = plain + plain.dtype.type(0)  # one zero: DuckDB 1.5 does not keep the sign of it
@@ -363,7 +366,7 @@ def _words(values: NDArray[Any], out: Words) -> None:
 
 
 def as_summed(table: str, columns: Columns, texts: Sequence[str]) -> dict[str, NDArray[Any] | None]:
-    """Staged columns as :meth:`Checksum.add` takes them, those that are not there among them."""
+    """Return staged columns in the form of :meth:`Checksum.add`. Absent columns are ``None``."""
     enums = enums_of(table)
     found: dict[str, NDArray[Any] | None] = {}
     for name, kind in types_of(table).items():
@@ -386,14 +389,13 @@ def as_summed(table: str, columns: Columns, texts: Sequence[str]) -> dict[str, N
 
 @lru_cache(maxsize=1 << 14)
 def _number(kind: str, text: str) -> int:
-    """60 bits of the MD5 of a text, as the database writes it."""
     if kind == "UUID" and "-" not in text:
         text = "-".join((text[:8], text[8:12], text[12:16], text[16:20], text[20:]))
     return int.from_bytes(hashlib.md5(text.encode(), usedforsecurity=False).digest()[:8]) >> 4
 
 
 def _coded(enum: str, codes: NDArray[Any]) -> NDArray[Any]:
-    """Codes of an enumeration; of what ``schema.sql`` has not, a number that is the same in every store."""
+    """Return enumeration codes that are equal in every store. Codes of added names are hashed."""
     own = len(own_labels(enum))
     if codes.max(initial=0) < own:
         return codes
@@ -405,14 +407,14 @@ def _coded(enum: str, codes: NDArray[Any]) -> NDArray[Any]:
 def columns_of(
     connection: DuckDBPyConnection, table: str, catalog: str = ""
 ) -> list[tuple[str, str]]:
-    """Names and types of the columns of a table of the schema; ``duckdb_columns()`` would bind every view."""
+    """Return names and types of a table's columns. ``duckdb_columns()`` is slower: it binds every view."""
     place = f"{quoted(catalog)}.{INSIDE}" if catalog else INSIDE
     rows = connection.execute(f"DESCRIBE {place}.{quoted(table)}").fetchall()
     return [(name, kind) for name, kind, *_ in rows]
 
 
 def expressions(connection: DuckDBPyConnection, table: str, catalog: str = "") -> str:
-    """SQL of the columns of a table of the schema, or of a file of it, as :meth:`Checksum.add` takes them.
+    """Return SQL for the columns of a table, in the form of :meth:`Checksum.add`.
 
     Numbers are as they are, enumerations their codes, texts 60 bits of their MD5.
     """

@@ -1,4 +1,4 @@
-"""Digests of the content of frames: equal exactly where the public views show the same, in every store.
+"""Digests of frame content. Two digests are equal if the public views of both frames are equal.
 
 Numbers count by their bits, texts by their letters, and a frame by its number in its trace, so that the digest
 of a part of a trace does not depend on the store that it is in, nor on what else is there.
@@ -85,7 +85,7 @@ TOGETHER: Final = 200_000
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """Settings and map that the graphs of a trace were made with.
+    """Settings and map behind the graphs of a trace.
 
     Attributes
     ----------
@@ -98,12 +98,12 @@ class Mark:
 
 
 def marks(file: StoreFile) -> dict[int, Mark]:
-    """Settings and maps of the traces of a store, by the ids of the traces."""
+    """Return the settings and maps of the traces of a store by trace id."""
     return {row[0]: Mark(*row[1:]) for row in file.rows(_MARKS).values}
 
 
 def graph_digests(file: StoreFile, frames: Sequence[Ints]) -> list[str]:
-    """A digest of the graphs of each of some groups of frames.
+    """Return one digest of the graphs for each group of frames.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def graph_digests(file: StoreFile, frames: Sequence[Ints]) -> list[str]:
 
 
 def _windows(sizes: Sequence[int]) -> Iterator[tuple[int, int]]:
-    """Ranges of groups of about :data:`GRAPHS` frames together, one group at least."""
+    """Yield ranges of groups with about :data:`GRAPHS` frames in total, at least one group each."""
     low = together = 0
     for high, size in enumerate(sizes):
         if together + size > GRAPHS and high > low:
@@ -141,7 +141,7 @@ def _windows(sizes: Sequence[int]) -> Iterator[tuple[int, int]]:
 
 
 def _labels(file: StoreFile, view: str, columns: Sequence[str]) -> dict[str, Words]:
-    """The words of the texts of columns that are enumerations, by their codes."""
+    """Return the hash words of enumeration values for each column, indexed by code."""
     found: dict[str, Words] = {}
     for name, kind, *_ in file.rows(f"DESCRIBE SELECT * FROM {view}").values:
         if name in columns and kind.startswith("ENUM"):
@@ -157,7 +157,7 @@ def _rows(
     labels: Mapping[str, Words],
     wanted: Ints,
 ) -> tuple[Ints, Words]:
-    """The rows of a view: the frame of each, and words; in an order that depends on them alone."""
+    """Return the rows of a view as frame ids and hash words, in an order that depends only on the values."""
     listed = ", ".join(
         f'enum_code(v."{name}") AS "{name}"' if name in labels else f'v."{name}"'
         for name in columns
@@ -180,7 +180,7 @@ def _rows(
 
 
 def _like_before(order: NDArray[np.intp], *columns: NDArray[Any]) -> Bools:
-    """(N,): which rows, in an order, are like the one before them."""
+    """Return a mask (N,) of the ordered rows that equal the row before."""
     like = np.ones(len(order), np.bool_)
     like[:1] = False
     for column in columns:
@@ -193,7 +193,7 @@ _MISSING_DIGEST: Final = np.uint64(0x6E756C6C6E756C6C)
 
 
 def _words(values: NDArray[Any], labels: Words | None) -> Words:
-    """Values as 64 bits each; codes by the words of what they stand for."""
+    """Return values as 64-bit words. Codes become the words of their names."""
     plain = np.ma.getdata(values)
     missing = np.ma.getmaskarray(values)
     if labels is not None:
@@ -231,7 +231,7 @@ def _add(digest: Any, rows: tuple[Ints, Words], group: Ints, *, always: bool) ->
 
 @dataclass(frozen=True, slots=True)
 class MessagePlaces:
-    """Messages that belong to frames, by their places in the recording, in order of these.
+    """Positions in the recording of the messages of frames, in order of position.
 
     Attributes
     ----------
@@ -250,7 +250,7 @@ class MessagePlaces:
 
 
 def messages_of(file: StoreFile, frame_id: Ints) -> MessagePlaces:
-    """The messages that belong to some frames of one trace, a message once for each of its frames."""
+    """Return the messages of frames of one trace, one row per frame and message."""
     found = file.arrays(_MESSAGES, {"frames": frame_id.tolist()})
     frame, channel, *numbers = found.values()
     return MessagePlaces(
@@ -261,13 +261,13 @@ def messages_of(file: StoreFile, frame_id: Ints) -> MessagePlaces:
 
 
 class FileOfFrames(Protocol):
-    """A store's file, or what asks the bundles of a collection."""
+    """Interface of a store file, or of the bundles of a collection."""
 
     def arrays(self, sql: str, parameters: Any) -> dict[str, NDArray[Any]]: ...
 
 
 def lengths_of_messages(file: FileOfFrames, frame_id: Ints) -> Iterator[tuple[Ints, Ints]]:
-    """Bytes of messages that belong to frames, whose ids ascend; a message once, with its first frame."""
+    """Yield message sizes for ascending frame ids; bytes. Each message counts once, for its first frame."""
     ends = np.append(np.flatnonzero(np.diff(trace_of(frame_id))) + 1, len(frame_id))
     low = 0
     while low < len(frame_id):

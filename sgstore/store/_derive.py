@@ -1,4 +1,4 @@
-"""Sets of relations beside the one of ingest.
+"""Derived sets of relations, in addition to the relations computed at ingest.
 
 Stored states come out as the generator saw them, and what it makes of them under other settings goes in.
 """
@@ -86,7 +86,7 @@ _HERE: Final = "bucket = $bucket AND mask & $bit <> 0"
 
 @dataclass(frozen=True, slots=True)
 class DerivedSet:
-    """A set of relations of a trace that was made from its states.
+    """Derived set of relations of one trace, computed from its stored states.
 
     Attributes
     ----------
@@ -112,19 +112,19 @@ class DerivedSet:
 
 
 class Deriving:
-    """The derived sets of a store. Made by :attr:`StoreFile.deriving`."""
+    """Derived sets of a store. Created by :attr:`StoreFile.deriving`."""
 
     def __init__(self, path: Path, access: Access) -> None:
         self._path = path
         self._access = access
 
     def sets(self) -> tuple[DerivedSet, ...]:
-        """All there are, by name and trace."""
+        """Return all derived sets by name and trace."""
         with self._access.reading() as connection:
             return sets_of(connection)
 
     def blocks(self, trace_id: int) -> Iterator[FrameBlock]:
-        """The frames of a trace, with the states that are in the store; no more than two buckets at a time.
+        """Yield the frames of a trace with their stored states, at most two buckets at a time.
 
         An entity is introduced when it is known for the first time, or before one that is: what the
         generator did not know then, it does not know now.
@@ -134,16 +134,16 @@ class Deriving:
             yield from reader.blocks()
 
     def seen(self, trace_id: int) -> Iterator[tuple[Ints, GraphColumns]]:
-        """The graphs of a trace as they were ingested: numbers of frames, and what abstractions see of them."""
+        """Yield the ingested graphs of a trace: frame numbers, and graph columns for abstractions."""
         with self._access.reading() as connection:
             yield from Graphs().of_trace(connection, trace_id)
 
     def building(self, name: str, trace_id: int) -> Building:
-        """A place for a new set of a trace; a context manager."""
+        """Return a context manager that builds a new set for a trace."""
         return Building(self._path, self._access, name, trace_id)
 
     def remove(self, name: str) -> tuple[str, ...]:
-        """Delete a set, of all traces; the names of these.
+        """Delete a derived set from all traces, and return the names of these traces.
 
         Raises
         ------
@@ -160,7 +160,7 @@ class Deriving:
         return tuple(one.trace for one in gone)
 
     def graph(self, whole: SceneGraph, name: str) -> SceneGraph:
-        """A frame's graph with the nodes and edges of a derived set.
+        """Return a frame's graph with the nodes and edges of a derived set.
 
         Parameters
         ----------
@@ -222,7 +222,7 @@ class Deriving:
 
 
 def sets_of(connection: DuckDBPyConnection) -> tuple[DerivedSet, ...]:
-    """All derived sets of a store."""
+    """Return all derived sets of a store."""
     rows = run(
         connection,
         "SELECT d.name, d.trace_id, t.name AS trace, d.settings, d.digest, d.answers"
@@ -234,7 +234,7 @@ def sets_of(connection: DuckDBPyConnection) -> tuple[DerivedSet, ...]:
 
 
 class Building:
-    """A derived set of one trace on its way into the store."""
+    """Builder of a derived set of one trace."""
 
     def __init__(self, path: Path, access: Access, name: str, trace_id: int) -> None:
         self._access = access
@@ -292,7 +292,7 @@ class Building:
         self._insert("derived_gap", packing.gap_columns(graph, self._trace_id))
 
     def append_labelled(self, seq: Ints, seen: GraphColumns, graphs: Labelled) -> None:
-        """Add the next frames as an abstraction has them: those of its nodes and edges that a store can hold.
+        """Add the next abstracted frames. Nodes and edges that a store cannot hold are dropped.
 
         These are nodes of the scene graph, and edges between them that are labelled with a relation.
         """
@@ -341,7 +341,7 @@ class Building:
         self._staging.insert(table, columns | {"set_name": named.repeat(count)})
 
     def publish(self, settings: Mapping[str, Any], digest: str, answers: tuple[str, ...]) -> None:
-        """Bring the set into the store, in one transaction; one of the same name goes.
+        """Write the set to the store in one transaction. It replaces a set of the same name.
 
         Raises
         ------
@@ -387,7 +387,7 @@ def _delete(connection: DuckDBPyConnection, name: str, trace_id: int) -> None:
 
 
 class _StateReader:
-    """The states of one trace, as blocks of frames."""
+    """Reader of the states of one trace, as blocks of frames."""
 
     def __init__(self, connection: DuckDBPyConnection, trace_id: int) -> None:
         self._connection = connection

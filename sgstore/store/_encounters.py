@@ -1,4 +1,4 @@
-"""Measures of what was recorded later: ``recorded('pet', trace_id, src, dst)`` in SQL, and a view of them.
+"""Measures of later encounters: ``recorded('pet', trace_id, src, dst)`` in SQL, and a view of them.
 
 They need the tracks of two entities, so they are no expression of SQL. DuckDB calls our function for each row
 that the rest of a statement leaves; a pair is worked out once, and kept as long as the file stays as it is. The
@@ -57,7 +57,7 @@ JOIN {INSIDE}.trace t ON t.trace_id = e.trace_id
 
 
 class _Known:
-    """What is kept of a file: tracks that were read last, and measures of pairs."""
+    """Cache of a store file: recently read tracks, and measures of pairs."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
@@ -71,7 +71,7 @@ class _Known:
         self.states += 0 if track is None else len(track)
 
     def forget(self) -> None:
-        """Let go of all tracks, if there are many."""
+        """Clear all tracks if they have too many states."""
         if self.states > MOST_STATES:
             self.tracks.clear()
             self.whole.clear()
@@ -79,7 +79,7 @@ class _Known:
 
 
 class _MeasuredQuestion:
-    """A connection whose statement asks for measures.
+    """Connection whose statement uses recorded measures.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class _MeasuredQuestion:
         self._reader.execute(f'USE "{at}".{INSIDE}')
 
     def value(self, measure: str, trace: int, src: int, dst: int) -> float | None:
-        """A measure of a pair; ``None``: not known, or there is none."""
+        """Return a measure of a pair. ``None`` means unknown or undefined."""
         if measure.removeprefix(KNOWN) not in RECORDED:
             raise ConfigError(f"no recorded measure: {measure!r}; expected {', '.join(RECORDED)}")
         key = measure, trace, src, dst
@@ -160,7 +160,7 @@ def _recorded(token: int, measure: Any, trace: Any, src: Any, dst: Any) -> float
 
 @contextmanager
 def recorded_measures(connection: DuckDBPyConnection, path: Path, sql: str) -> Generator[None]:
-    """Let a connection that reads a file have the measures, if its statement names them, or another one will.
+    """Provide recorded measures to a connection inside the block.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def recorded_measures(connection: DuckDBPyConnection, path: Path, sql: str) -> G
 
 
 def show_recorded(connection: DuckDBPyConnection, sql: str) -> None:
-    """Let a connection have the measures and the view, if its statement names them."""
+    """Add the function and the view of recorded measures to a connection, if its statement uses them."""
     path = _paths.get(id(connection))
     if path is None or _WANTED.search(sql) is None:
         return
@@ -221,6 +221,6 @@ def measured(
     src: int,
     dst: int,
 ) -> float | None:
-    """A measure of a pair of nodes of a trace, given what answers statements; ``None``: not known."""
+    """Return a measure of a pair of nodes in a trace. ``None`` means unknown."""
     ((value,),) = ask("SELECT recorded(?, ?, ?, ?)", [f"{scope}{measure}", trace_id, src, dst])
     return value

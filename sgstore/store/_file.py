@@ -1,4 +1,4 @@
-"""A store: one DuckDB file, which stays open for a while after each question.
+"""A store: one DuckDB file, kept open for a short time after each query.
 
 What only writing or drawing needs is imported where it is used: a question is shorter than its imports.
 """
@@ -79,7 +79,7 @@ def _damage(connection: DuckDBPyConnection, path: Path) -> str:
 
 
 class StoreFile:
-    """A store, by its path.
+    """Store, opened by its path.
 
     Its file stays open for a second after a question, unless a writer waits for it.
 
@@ -140,7 +140,7 @@ class StoreFile:
 
     @classmethod
     def together(cls, path: str | Path) -> StoreFile:
-        """A store that is opened together with others of its folder, which takes a quarter of the time.
+        """Open a store in one database shared with its neighbours in the folder. This is four times faster.
 
         Raises
         ------
@@ -154,7 +154,7 @@ class StoreFile:
 
     @classmethod
     def create(cls, path: str | Path, *, memory: int = 0, wait_s: float = WAIT_S) -> StoreFile:
-        """The store at a path, made empty if nothing is there.
+        """Open the store at a path. Create an empty store if the file is missing.
 
         Raises
         ------
@@ -170,17 +170,17 @@ class StoreFile:
         return cls(path, memory=memory, wait_s=wait_s, made=made)
 
     def snapshot(self) -> AbstractContextManager[object]:
-        """Keep the store open for several questions: they see the same state, and cost less."""
+        """Keep the store open for several queries. They see the same state and run faster."""
         return self.access.reading(idle=True)
 
     def close(self) -> None:
-        """Close the file, unless something is asked of it now; it is opened again with the next question."""
+        """Close the file if no query is running. The next query opens it again."""
         self.access.close()
 
     def rows(
         self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
     ) -> Rows:
-        """All rows of a statement of ours.
+        """Run a trusted SQL statement, and return all rows.
 
         Parameters
         ----------
@@ -207,7 +207,7 @@ class StoreFile:
         given: Iterable[Given] = (),
         plain: bool = False,
     ) -> dict[str, NDArray[np.generic]]:
-        """All columns of a statement of ours, as :meth:`rows` takes it; masked where something is NULL.
+        """Run a trusted SQL statement, and return all columns as arrays. NULL values are masked.
 
         ``plain``: none of them is an enumeration, so that the statement need not be planned to know that.
         """
@@ -218,7 +218,7 @@ class StoreFile:
     def table(
         self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
     ) -> Any:
-        """All rows of a statement of ours as Arrow; see :func:`sgstore.store._rows.table_of`."""
+        """Run a trusted SQL statement, and return an Arrow table; see :func:`sgstore.store._rows.table_of`."""
         with self._answered(lambda at, _: rows.table_of(at, sql, parameters), sql, given) as found:
             return found
 
@@ -231,7 +231,7 @@ class StoreFile:
         *,
         given: Iterable[Given] = (),
     ) -> Generator[Batches]:
-        """Rows of a statement of ours, as :meth:`rows` takes it, ``size`` at a time and never all in memory."""
+        """Run a trusted SQL statement, and stream its rows in batches of ``size``."""
         with self._answered(lambda at, _: Batches(at, sql, parameters, size), sql, given) as found:
             yield found
 
@@ -239,7 +239,7 @@ class StoreFile:
     def asked(
         self, step: Callable[[DuckDBPyConnection], T], given: Iterable[Given] = ()
     ) -> Generator[T]:
-        """Make what a step of ours makes with the connection, after what is made before."""
+        """Yield the result of a function that uses the connection, after the given tables are created."""
         with self._answered(lambda x, _: rows.interruptible(x, partial(step, x)), "", given) as y:
             yield y
 
@@ -247,7 +247,7 @@ class StoreFile:
     def record_batches(
         self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
     ) -> Generator[ArrowStream | None]:
-        """Rows of a statement of ours as a stream of Arrow; see :func:`sgstore.store._rows.record_batches`."""
+        """Stream the rows of a trusted SQL statement as Arrow batches."""
         with self._answered(lambda x, _: rows.record_batches(x, sql, parameters), sql, given) as y:
             yield y
 
@@ -259,7 +259,7 @@ class StoreFile:
         max_rows: int | None = None,
         given: UserTablesGiven | None = None,
     ) -> Rows:
-        """All rows of a statement of a user's.
+        """Run a user's SQL statement, and return all rows.
 
         Parameters
         ----------
@@ -296,7 +296,7 @@ class StoreFile:
         max_rows: int | None = None,
         given: UserTablesGiven | None = None,
     ) -> Rows:
-        """As :meth:`user_sql`; but of more rows than a batch, all are asked for when they are wanted.
+        """Run a user's SQL statement like :meth:`user_sql`. Load rows beyond one batch on demand.
 
         Raises
         ------
@@ -326,7 +326,7 @@ class StoreFile:
         timeout_s: float | None = None,
         given: UserTablesGiven | None = None,
     ) -> int:
-        """Write the rows of a statement of a user's to a Parquet file, as they come; how many there are.
+        """Stream the rows of a user's SQL statement to a Parquet file, and return their number.
 
         Raises
         ------
@@ -354,7 +354,7 @@ class StoreFile:
         step: Callable[[DuckDBPyConnection], T],
         given: UserTablesGiven | None,
     ) -> T:
-        """Answer of a statement of a user's that is read at once."""
+        """Run a user's SQL statement whose result is read at once."""
 
         def ask(connection: DuckDBPyConnection, until: ExitStack) -> T:
             rows.give_to_user(connection, given, sql, timeout_s)
@@ -373,7 +373,7 @@ class StoreFile:
         size: int = BATCH,
         given: UserTablesGiven | None = None,
     ) -> Generator[Batches]:
-        """The rows of a statement of a user's as a stream; see :meth:`user_sql`."""
+        """Stream the rows of a user's SQL statement; see :meth:`user_sql`."""
 
         def ask(connection: DuckDBPyConnection, until: ExitStack) -> Batches:
             rows.give_to_user(connection, given, sql, timeout_s)
@@ -384,12 +384,12 @@ class StoreFile:
             yield found
 
     def joined(self) -> dict[str, JoinedTable]:
-        """Joins of users' own tables with frames, by the names of the tables."""
+        """Return the joins of user tables with frames by table name."""
         with self.access.reading() as connection:
             return {} if self.tables is None else self.tables.joined(connection)
 
     def catalog(self) -> Catalog:
-        """The catalog of the store for the compiler of queries; remembered while its file stays as it is."""
+        """Return the catalog for the query compiler. It is cached until the file changes."""
         if self._known is not None and self._known[0] == stamp_of(self.path):
             return self._known[1]  # to open the store costs more than to compile a query
         from sgstore.store._catalog import catalog_of
@@ -402,12 +402,12 @@ class StoreFile:
             return catalog
 
     def traces(self) -> tuple[StoredTrace, ...]:
-        """All traces, in the order in which they came."""
+        """Return all traces in the order of their ingest."""
         with self.access.reading() as connection:
             return stored_traces(connection, self.path, self.access.root)
 
     def trace(self, ref: int | str) -> StoredTrace:
-        """A trace by its name, its id, or a unique beginning of its name.
+        """Return a trace by name, by id, or by a unique prefix of its name.
 
         Raises
         ------
@@ -425,7 +425,7 @@ class StoreFile:
             return found[0]
 
     def frame(self, ref: int | str) -> FrameRef:
-        """A frame by its id, ``TRACE#SEQ``, or ``TRACE@12.3s``: the last one at or before that time.
+        """Return a frame by id, ``TRACE#SEQ`` or ``TRACE@12.3s``: the last frame at or before that time.
 
         Parameters
         ----------
@@ -441,7 +441,7 @@ class StoreFile:
             return frame_named(connection, ref)
 
     def graph(self, ref: int | str) -> SceneGraph:
-        """The scene graph of a frame, as :meth:`frame` takes it: all that the views show of it.
+        """Return the scene graph of a frame with all data of the public views; see :meth:`frame`.
 
         Raises
         ------
@@ -454,18 +454,17 @@ class StoreFile:
         return replace(found, around=partial(self._known_graph, frame.frame_id))
 
     def _known_graph(self, frame_id: int) -> SceneGraph:
-        """The graph of a frame with all that is known beyond it."""
         with self.access.reading() as connection:
             return next(self._reader.scenes(connection, np.array([frame_id]), known=True))
 
     def graphs(self, frame_id: NDArray[np.int64]) -> Iterator[SceneGraph]:
-        """Scene graphs of some frames of one trace, whose ids ascend; their columns are in memory together."""
+        """Yield scene graphs of one trace for ascending frame ids. All columns are in memory together."""
         with self.access.reading() as connection:
             yield from self._reader.scenes(connection, frame_id)
 
     @property
     def _reader(self) -> Graphs:
-        """Reads scene graphs, and remembers maps."""
+        """Reader of scene graphs with a cache of maps."""
         if self._graphs is None:
             from sgstore.store._graphs import Graphs
 
@@ -473,7 +472,7 @@ class StoreFile:
         return self._graphs
 
     def states(self, trace: int | str, first: int, last: int) -> tuple[Columns, Columns]:
-        """Frames of a trace from one number to another, and the states in them, as plain columns.
+        """Return a range of frames of a trace, and their states, as plain columns.
 
         Returns
         -------
@@ -493,14 +492,14 @@ class StoreFile:
             return frame_times(connection, trace_id, first, last), states
 
     def states_at(self, frames: Sequence[tuple[int, int]]) -> Columns:
-        """States in frames, told by the trace's id and the number; ``at`` says which of these a row is of."""
+        """Return states in frames given as (trace id, number). Column ``at`` is the index of the frame."""
         from sgstore.store._states import states_at
 
         with self.access.reading() as connection:
             return states_at(connection, frames)
 
     def scenery(self, trace: int | str) -> Columns:
-        """Scenery of a trace, which never moves, beside its road map, as plain columns."""
+        """Return the static entities of a trace, without its road map, as plain columns."""
         from sgstore.store._states import scenery
 
         with self.access.reading() as connection:
@@ -509,7 +508,7 @@ class StoreFile:
     def series(
         self, trace: int | str, attribute: str, node: int, other: int | None = None
     ) -> Columns:
-        """An attribute of a node, or a number of a pair, over a trace: ``seq``, ``t`` and ``value``.
+        """Return a node attribute or a pair value over a trace: ``seq``, ``t`` and ``value``.
 
         Raises
         ------
@@ -524,21 +523,21 @@ class StoreFile:
             return series(connection, trace_id, attribute, node, other)
 
     def entity_names(self, trace: int | str) -> dict[int, tuple[str, ...]]:
-        """Kind, the simulator's id and type name of each entity of a trace, by node id."""
+        """Return kind, simulator id and type name of each entity of a trace, by node id."""
         from sgstore.store._states import names_of_nodes
 
         with self.access.reading() as connection:
             return names_of_nodes(connection, trace_named(connection, str(trace))[0])
 
     def places(self) -> dict[str, tuple[float, float, str, list[str]]]:
-        """By trace: the place that its positions are about, the digest of its map, cameras; see ``_states``."""
+        """Return origin, map digest and cameras of each trace; see ``_states``."""
         from sgstore.store._states import places
 
         with self.access.reading() as connection:
             return places(connection)
 
     def log_times(self, trace: int | str, first: int, last: int) -> NDArray[np.int64]:
-        """Log times of the frames of a trace from one number to another; ns."""
+        """Return the log times of a range of frames of a trace; ns."""
         with self.access.reading() as connection:
             trace_id, _ = trace_named(connection, str(trace))
             sql = "SELECT log_time_ns FROM frame WHERE trace_id = ? AND seq BETWEEN ? AND ? ORDER BY seq"
@@ -546,14 +545,14 @@ class StoreFile:
             return found["log_time_ns"].astype(np.int64)
 
     def codes(self) -> dict[str, list[str]]:
-        """Names of kinds and of states of lights, by their numbers in plain columns."""
+        """Return the names of kinds and light states, indexed by their code in plain columns."""
         from sgstore.store._states import kinds_of
 
         with self.access.reading() as connection:
             return kinds_of(connection)
 
     def road_map_text(self, trace: int | str) -> tuple[str, str] | None:
-        """Name and OpenDRIVE text of the map of a trace; ``None`` if it has none."""
+        """Return name and OpenDRIVE text of a trace's map, or ``None`` without such a text."""
         with self.access.reading() as connection:
             trace_id, _ = trace_named(connection, str(trace))
             sql = (
@@ -563,7 +562,7 @@ class StoreFile:
             return connection.execute(sql, [trace_id]).fetchone()
 
     def channels(self, trace: int | str) -> tuple[Channel, ...]:
-        """Channels of the recording of a trace; ``messages`` is -1."""
+        """Return the channels of a trace's recording. Their ``messages`` is -1: unknown."""
         with self.access.reading() as connection:
             trace_id, _ = trace_named(connection, str(trace))
             sql = (
@@ -573,7 +572,10 @@ class StoreFile:
             return tuple(Channel(*row) for row in connection.execute(sql, [trace_id]).fetchall())
 
     def context(self, trace: int | str) -> MessageRefs:
-        """Places of the messages that later ones of a trace depend on; ``channel`` counts :meth:`channels`."""
+        """Return the positions of messages that later messages depend on.
+
+        ``channel`` is an index into :meth:`channels`.
+        """
         with self.access.reading() as connection:
             trace_id, _ = trace_named(connection, str(trace))
             sql = (
@@ -587,7 +589,7 @@ class StoreFile:
             return MessageRefs(*(column.astype(np.int64) for column in columns.values()))
 
     def payload(self, ref: int | str, channel: str) -> bytes:
-        """The data of the message of a channel that belongs to a frame, read from the recording.
+        """Return the raw message of a channel at a frame, read from the recording.
 
         Parameters
         ----------
@@ -609,7 +611,7 @@ class StoreFile:
         return read_message(path, **place)
 
     def carried(self, ref: int | str, channel: str) -> Media:
-        """Content of the message of a channel for a frame: a picture, a video, or the message itself.
+        """Return the content of a channel's message at a frame: a picture, a video, or the raw message.
 
         Parameters
         ----------
@@ -634,7 +636,7 @@ class StoreFile:
         return read_carried(path, channel=channel_id, **place)
 
     def recorded(self, ref: int | str, channel: str) -> tuple[McapChannel, Schema | None, bytes]:
-        """The message of a channel that belongs to a frame, with its definitions in the recording.
+        """Return channel, schema and data of a channel's message at a frame.
 
         Parameters and errors are those of :meth:`payload`.
         """
@@ -647,7 +649,7 @@ class StoreFile:
             return known, recording.schemas.get(known.schema_id), data
 
     def _payload_place(self, ref: int | str, channel: str) -> tuple[Path, int, dict[str, int]]:
-        """Recording, channel's id and place of the message that belongs to a frame."""
+        """Return recording path, channel id and file position of a channel's message at a frame."""
         from sgstore.store._payloads import payload_place
 
         with self.access.reading() as connection:
@@ -665,7 +667,7 @@ class StoreFile:
     def _unchanged(
         self, uri: str, place: str | None, size: int, mtime_ns: int, digest: str
     ) -> Path:
-        """The path of a recording, if it is the file that was ingested. One of another time is hashed, once."""
+        """Return the path of the ingested recording. If its timestamp changed, check its hash once."""
         from sgstore.mcap import digest_of, mark_of
 
         path = located(uri, place, size, self.path, self.access.root)
@@ -686,7 +688,7 @@ class StoreFile:
         road_map: RoadMap | None,
         part: tuple[float | None, float | None] = (None, None),
     ) -> str | None:
-        """The name under which the store has a recording already; ``None`` if it has it not.
+        """Return the trace name of a recording that is already stored, or ``None``.
 
         Parameters
         ----------
@@ -711,7 +713,7 @@ class StoreFile:
         road_map: RoadMap | None = None,
         answers: tuple[str, ...] = (),
     ) -> Segment:
-        """A place to build the graphs of a trace, aside from the store, until they are published.
+        """Return a segment to build the graphs of a trace outside the store, before publication.
 
         Parameters
         ----------
@@ -729,7 +731,7 @@ class StoreFile:
         return Segment(self.path, info, identity, OnMap(road_map), answers)
 
     def publish(self, sealed: Sealed, *, replace: bool = False) -> str:
-        """Bring a trace into the store, in one transaction.
+        """Add a sealed trace to the store in one transaction.
 
         Parameters
         ----------
@@ -755,7 +757,7 @@ class StoreFile:
     def publish_each(
         self, sealed: Sequence[Sealed], *, replace: bool = False
     ) -> list[str | SgstoreError]:
-        """Bring traces into the store, each in a transaction of its own; the file is opened once.
+        """Add sealed traces to the store, one transaction per trace. The file is opened once.
 
         Returns
         -------
@@ -767,7 +769,7 @@ class StoreFile:
         return publish_each(self.access, sealed, replace=replace)
 
     def has(self, sealed: Sealed, *, as_it_is: bool = True) -> str | None:
-        """The name under which the store has the trace of a segment; ``None`` if it has it not.
+        """Return the stored name of a segment's trace, or ``None`` if it is not stored.
 
         Parameters
         ----------
@@ -785,7 +787,7 @@ class StoreFile:
             return found(connection, sealed.identity)
 
     def known_digest(self, path: Path) -> str:
-        """The digest of a recording that has been ingested from a path and looks the same since; else empty."""
+        """Return the digest of an ingested recording whose file looks unchanged, else an empty string."""
         from sgstore.mcap import mark_of
 
         try:
@@ -802,7 +804,7 @@ class StoreFile:
         return str(found[0]) if found and found[0] else ""
 
     def remove(self, *traces: int | str) -> tuple[StoredTrace, ...]:
-        """Delete traces, in one transaction, with the settings and the maps that no other trace has.
+        """Delete traces in one transaction, with the settings and maps that no other trace uses.
 
         Raises
         ------
@@ -821,7 +823,7 @@ class StoreFile:
 
     @property
     def abstracted(self) -> Abstracted:
-        """Frames as abstractions have them, and their classes."""
+        """Frames in abstractions, and their classes."""
         if self._abstracted is None:
             from sgstore.store._classes import Abstracted
 
@@ -830,13 +832,13 @@ class StoreFile:
 
     @property
     def deriving(self) -> Deriving:
-        """Sets of relations that were derived from the states."""
+        """Derived sets of relations."""
         from sgstore.store._derive import Deriving
 
         return Deriving(self.path, self.access)
 
     def verify(self, *, recordings: bool = False) -> Verification:
-        """Look whether everything is as it was published.
+        """Check that the store still contains all published data.
 
         Parameters
         ----------
@@ -848,7 +850,7 @@ class StoreFile:
         return verify_store(self.access, recordings=recordings)
 
     def settle(self) -> None:
-        """Work in what a writer that was killed left beside the store: it is safe, but no longer at rest.
+        """Merge the log of a killed writer into the store file.
 
         Nothing is done if there is nothing, or if others keep the store for too long.
         """
@@ -857,7 +859,7 @@ class StoreFile:
         settle(self.path, self.access, self.memory)
 
     def compact(self) -> None:
-        """Write the store anew, its large tables sorted over all traces, and put it in the old one's place.
+        """Rewrite the store with its large tables sorted across all traces, and replace the old file.
 
         Traces come one behind the other, so that a scan for one relation looks into all of them; and what was
         removed leaves holes. Answers are the same. It is worth its time after many traces have come or gone.
@@ -873,7 +875,7 @@ class StoreFile:
         compact(self.path, self.access, self.memory)
 
     def refuse_others(self) -> None:
-        """Raise a StoreError if there are tables or views of somebody else's: compacting would lose them."""
+        """Raise a StoreError if the store has user tables or views, which compaction would lose."""
         from sgstore.store._rebuild import refuse_others
 
         refuse_others(self.path, self.access)
@@ -887,7 +889,7 @@ class StoreFile:
         *,
         public: bool = False,
     ) -> Generator[T]:
-        """Answer of a question, while the store is open.
+        """Yield the result of a query while the store is open.
 
         If the database fails by a fault of its own, the question is asked again. Its stack ends with it.
         """

@@ -1,4 +1,4 @@
-"""Tables that a statement is given: rows that are not in the store, for as long as it is asked.
+"""Temporary tables with rows from outside the store, for the duration of one statement.
 
 They come a block at a time, and the database moves what does not fit into memory to temporary files.
 """
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class GivenTable:
-    """A table of rows that are not in the store.
+    """Temporary table with rows from outside the store.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ Given = GivenTable | tuple[str, Mapping[str, object]]
 
 
 def give(connection: DuckDBPyConnection, given: Iterable[Given]) -> None:
-    """Make tables that nobody but this connection sees, until it is closed."""
+    """Create temporary tables that only this connection sees."""
     for table in given:
         if isinstance(table, tuple):
             show_recorded(connection, table[0])
@@ -63,7 +63,7 @@ _BLOCK: Final = ":block"
 def _insert(
     connection: DuckDBPyConnection, name: str, block: Sequence[list[Any]], kinds: Sequence[str]
 ) -> None:
-    """Insert the rows of a block, as arrays where these hold all of its values."""
+    """Insert the rows of a block, as arrays if their types allow it."""
     arrays = _arrays_of(block, kinds)
     if arrays is None:
         values = ", ".join(f"unnest(CAST(? AS {kind}[]))" for kind in kinds)
@@ -85,7 +85,7 @@ _NUMBERS: Final[Mapping[str, tuple[str, object]]] = {
 
 
 def _arrays_of(block: Sequence[list[Any]], kinds: Sequence[str]) -> dict[str, Any] | None:
-    """Columns of values as arrays, which the database reads in a tenth of the time; ``None``: some cannot be.
+    """Return columns as arrays, which DuckDB reads ten times faster. ``None`` means unsuitable values.
 
     NaN is one of these: it would become NULL.
     """

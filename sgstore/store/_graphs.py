@@ -1,4 +1,4 @@
-"""Graphs read from the store, many frames at a time: columns for abstractions, scene graphs for all else."""
+"""Readers of stored graphs for many frames: as columns for abstractions, else as scene graphs."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ _EDGES_TOGETHER: Final = 2_000_000
 
 
 class Graphs:
-    """Graphs of the traces of a store, some frames at a time: as columns, or one scene graph after another.
+    """Reader of the graphs of a store in groups of frames: as columns, or one scene graph at a time.
 
     The maps that were used last are remembered.
     """
@@ -143,7 +143,7 @@ class Graphs:
     def of_trace(
         self, connection: DuckDBPyConnection, trace_id: int
     ) -> Iterator[tuple[NDArray[np.int64], GraphColumns]]:
-        """All frames of a trace: their numbers and graphs, window by window."""
+        """Yield frame numbers and graphs of a whole trace, window by window."""
         row = connection.execute(
             "SELECT min(bucket), max(bucket) FROM bucket WHERE trace_id = ?", [trace_id]
         ).fetchone()
@@ -156,7 +156,7 @@ class Graphs:
     def of_frames(
         self, connection: DuckDBPyConnection, first: int, last: int
     ) -> tuple[NDArray[np.int64], GraphColumns]:
-        """Frames of one trace from one id to another: their numbers, and their graphs."""
+        """Return frame numbers and graphs of a range of frame ids in one trace."""
         rows = connection.execute(_FRAMES, {"first": first, "last": last}).fetchnumpy()
         ids = rows["frame_id"].astype(np.int64)
         trace_id = first >> SEQ_BITS
@@ -167,7 +167,7 @@ class Graphs:
     def of_ids(
         self, connection: DuckDBPyConnection, frame_id: NDArray[np.int64]
     ) -> Iterator[tuple[NDArray[np.int64], GraphColumns]]:
-        """Some frames of any traces, whose ids ascend: their rows in what was asked, and their graphs.
+        """Yield graphs for ascending frame ids of any traces, with their indices in the input.
 
         As many are read at once as have about two million edges; those on one map are one
         :class:`GraphColumns`.
@@ -187,7 +187,7 @@ class Graphs:
         ids: NDArray[np.int64],
         trace_id: int | None = None,
     ) -> tuple[list[tuple[NDArray[np.int64], GraphColumns]], int]:
-        """Frames, by their maps; and how many edges they have. Those of no map are together, too.
+        """Return graphs grouped by map, and the number of edges. Frames without a map form one group.
 
         Of no frame there is a graph without frames, if it is said of which trace.
         """
@@ -232,7 +232,7 @@ class Graphs:
     def scenes(
         self, connection: DuckDBPyConnection, frame_id: NDArray[np.int64], *, known: bool = False
     ) -> Iterator[SceneGraph]:
-        """Scene graphs of some frames of one trace, whose ids ascend: all that the views show of them.
+        """Yield scene graphs of one trace for ascending frame ids, with all data of the public views.
 
         Their columns are in memory together, and the records of one graph. ``known``: with all that is known
         beyond them.
@@ -290,7 +290,6 @@ class Graphs:
 
 
 def _of_known(sql: str) -> str:
-    """A statement on tables of graphs, asked of those with what is known beyond them, too."""
     sql = sql.replace("SELECT n.* FROM nodes n", "SELECT n.* EXCLUDE (in_graph) FROM world_nodes n")
     return _OF_GRAPHS.sub(r"FROM known_\1", sql)
 
@@ -299,7 +298,7 @@ _OF_GRAPHS: Final = re.compile(r"\bFROM (node|edge|lane_state|lane_gap)\b")
 
 
 def _remembered(maps: OrderedDict[str, T], digest: str, read: Callable[[], T]) -> T:
-    """A map by its digest, which is read if it is not remembered; those that were used last stay."""
+    """Return a map by its digest from a cache of the most recently used maps."""
     if digest not in maps:
         maps[digest] = read()
         while len(maps) > _MAPS:
@@ -311,7 +310,7 @@ def _remembered(maps: OrderedDict[str, T], digest: str, read: Callable[[], T]) -
 def _asked(
     frame_id: NDArray[np.int64], otherwise: int = 0
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Values of statements that ask for frames, and of those that ask for masks of buckets.
+    """Return the SQL parameters for frame ids, and those for bucket masks.
 
     ``otherwise``: the bounds where there is no frame.
     """
@@ -331,7 +330,7 @@ def _asked(
 def _records(
     connection: DuckDBPyConnection, sql: str, values: dict[str, Any]
 ) -> Iterator[tuple[tuple[int, ...], dict[str, Any]]]:
-    """Rows of a statement: ids of the frame and of nodes, and what is known of their attributes."""
+    """Yield rows of a statement as frame and node ids, and their non-null attributes."""
     found = run(connection, sql, values)
     ids = sum(name in {"frame_id", "node_id", "src", "dst"} for name in found.columns)
     names = found.columns[ids:]
@@ -346,7 +345,7 @@ def _own_attributes(
     frame_id: NDArray[np.int64],
     of_edges: dict[tuple[int, int, int, int], dict[str, Any]],
 ) -> dict[int, list[tuple[int, str, Any]]]:
-    """Attributes of a client's own: those of nodes, by frame; those of edges are added to ``of_edges``."""
+    """Return user-defined node attributes by frame. Edge attributes are added to ``of_edges``."""
     of_nodes: dict[int, list[tuple[int, str, Any]]] = {}
     for frame, node, relation, dst, name, text in run(connection, _OWN, by_frame).values:
         value = json.loads(text)
@@ -362,7 +361,6 @@ def _own_attributes(
 def _standing(
     connection: DuckDBPyConnection, trace_id: int, here: NDArray[np.int64]
 ) -> dict[int, dict[str, Any]]:
-    """Attributes of what stands."""
     nodes = np.unique(here[here >= 0]).tolist()
     asked = {"trace_id": trace_id, "nodes": nodes}
     return {node: about for (node,), about in _records(connection, _ENTITIES, asked)}
@@ -402,7 +400,7 @@ def _map_columns(connection: DuckDBPyConnection, map_id: int) -> MapColumns:
 
 @dataclass(frozen=True, slots=True)
 class _Traces:
-    """Origins and maps of the traces of a store; map -1: none."""
+    """Origins and maps of the traces of a store. Map -1 means no map."""
 
     trace_id: NDArray[np.int64]
     origin: dict[str, NDArray[np.float64]]
@@ -415,18 +413,17 @@ class _Traces:
         return cls(found["trace_id"].astype(np.int64), origin, found["map_id"].astype(np.int64))
 
     def rows(self, frame_id: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The trace of each frame."""
+        """Return the trace row of each frame."""
         return np.searchsorted(self.trace_id, trace_of(frame_id)).astype(np.int64)
 
 
 def _each_frame(of: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Rows with masks of buckets as rows of single frames."""
     frame_id, row = frames_of(of.pop("bucket").astype(np.int64), of.pop("mask").astype(np.int64))
     return {"frame_id": frame_id, **{name: column[row] for name, column in of.items()}}
 
 
 def _by_map(of: dict[str, NDArray[Any]], number: Numbers, maps: int) -> list[dict[str, Any]]:
-    """Divide rows by the maps of their frames, which are numbered anew for each map."""
+    """Split rows by the map of their frame. Each part numbers its frames from 0."""
     if maps == 1:
         return [of]
     frame = np.empty(len(number), np.int64)
@@ -440,7 +437,6 @@ def _by_map(of: dict[str, NDArray[Any]], number: Numbers, maps: int) -> list[dic
 
 
 def _places(number: Numbers, numbers: int) -> list[NDArray[np.int64]]:
-    """Positions of each of 0 … ``numbers`` - 1."""
     order = np.argsort(number, kind="stable").astype(np.int64)
     return np.split(order, np.cumsum(np.bincount(number, minlength=numbers))[:-1])
 
@@ -473,5 +469,5 @@ def _seen(
 
 
 def filled(values: NDArray[Any]) -> NDArray[np.float64]:
-    """Numbers, NaN where there is none."""
+    """Return float64 values with NaN in place of masked values."""
     return np.ma.filled(np.ma.asarray(values, dtype=np.float64), np.nan)

@@ -1,4 +1,4 @@
-"""Tables of users' own beside a store: labels, outcomes, splits, joined to its frames.
+"""User tables joined to the frames of a store: labels, outcomes, splits.
 
 A table comes as a file (Parquet, CSV, JSON) or as a data frame. It is read once, by a database of its own that
 sees nothing of the store, and kept as Parquet in a folder of this process. The store's readers may read files
@@ -85,7 +85,7 @@ _NANOSECONDS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class UserTable:
-    """A table of a user's own.
+    """Table provided by a user.
 
     Attributes
     ----------
@@ -109,7 +109,7 @@ class UserTable:
 
     @property
     def view(self) -> str:
-        """The statement whose rows are those of the table, with their ``frame_id``."""
+        """SQL of the rows of the table, with their ``frame_id``."""
         rows = f"read_parquet({literal(str(self.place))})"
         match self.key:
             case "frame_id":
@@ -126,7 +126,7 @@ class UserTable:
 
 @dataclass(frozen=True, slots=True)
 class JoinedTable:
-    """Join of a table with the frames of a store.
+    """Row counts of the join of a user table with the frames of a store.
 
     Attributes
     ----------
@@ -143,7 +143,7 @@ class JoinedTable:
 
 
 class UserTables:
-    """Tables beside a store.
+    """User tables next to a store.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ class UserTables:
             connection.execute(f'CREATE TEMP VIEW "{table.name}" AS {table.view}')
 
     def known(self, connection: DuckDBPyConnection, catalog: Catalog) -> Catalog:
-        """A catalog in which patterns can speak of the tables whose rows belong to frames, one row a frame."""
+        """Return the catalog with facts about user tables. Patterns can use tables with one row per frame."""
         single = {
             name: None
             if one.frames == one.matched
@@ -219,14 +219,13 @@ class UserTables:
         return replace(catalog, tables=found)
 
     def _traces(self, connection: DuckDBPyConnection, table: UserTable) -> frozenset[int] | None:
-        """Ids of the traces of a table whose rows are of traces."""
         if table.key != "trace":
             return None
         sql = f'SELECT DISTINCT frame_id >> 24 FROM "{table.name}" WHERE frame_id IS NOT NULL'
         return frozenset(row[0] for row in connection.execute(sql).fetchall())
 
     def joined(self, connection: DuckDBPyConnection) -> dict[str, JoinedTable]:
-        """Joins of all tables whose rows can belong to frames."""
+        """Return the joins of all tables that have a frame key."""
         found: dict[str, JoinedTable] = {}
         for table in self.tables:
             if table.key:
@@ -239,7 +238,7 @@ class UserTables:
 
 
 def type_of(declared: str) -> Type:
-    """The type in patterns of a column, given its type in the database: number, truth value, else text."""
+    """Return the query type for a database column type: number, boolean, else text."""
     if declared == "BOOLEAN":
         return Type.boolean
     numeric = declared.removeprefix("U").startswith(("TINYINT", "SMALLINT", "INT", "BIGINT"))
@@ -248,12 +247,12 @@ def type_of(declared: str) -> Type:
 
 
 def tables_folder() -> Path:
-    """The folder of this process for tables, which the readers of stores may read; it need not be there."""
+    """Return this process's folder for user tables. Store connections may read it. It may not exist yet."""
     return temporary_folder() / "tables"
 
 
 def _kept(name: str, given: object, folder: Path) -> UserTable:
-    """A table as it is kept: read and written as Parquet, unless it is there already."""
+    """Read a user table, and write it as Parquet."""
     source = str(given) if isinstance(given, str | Path) else type(given).__name__
     place = folder / f"{name}.parquet"
     with _told(name, source), duckdb.connect(":memory:", config=_config(folder)) as connection:
@@ -267,7 +266,7 @@ def _kept(name: str, given: object, folder: Path) -> UserTable:
 
 
 def _reading(connection: DuckDBPyConnection, name: str, given: object) -> str:
-    """The statement that reads a table."""
+    """Return the SQL that reads a user table."""
     if not isinstance(given, str | Path):
         connection.register("given", given)
         return "SELECT * FROM given"
@@ -311,7 +310,7 @@ def _key_of(columns: Mapping[str, Any]) -> str:
 
 @contextmanager
 def _told(name: str, source: str) -> Generator[None]:
-    """Errors of the database and of the disk as errors of a table."""
+    """Convert database and disk errors to store errors that name the table."""
     try:
         yield
     except (duckdb.Error, OSError) as error:

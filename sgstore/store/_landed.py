@@ -1,4 +1,4 @@
-"""Sealed segments that wait in a collection, each without its road map, which waits once."""
+"""Sealed segments in the inbox of a collection. Each road map is stored once, apart from the segments."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MAP_TABLES: Final = frozenset(SHARED["map"])
 
 
 def split_segment(sealed: Path, to: Path, of_map: Path) -> str:
-    """Write a sealed segment again, its road map apart; the digest of the map, empty without one.
+    """Copy a sealed segment with its road map apart, and return the map digest, or an empty string.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def split_segment(sealed: Path, to: Path, of_map: Path) -> str:
 
 
 def whole_segment(segment: Path, of_map: Path | None, to: Path) -> Sealed:
-    """A sealed segment in a folder of its own, made of one without its map, and of the map.
+    """Return a sealed segment in a new folder, combined from a segment without a map and a map.
 
     Raises
     ------

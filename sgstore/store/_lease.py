@@ -1,4 +1,4 @@
-"""Files of stores that stay open between questions, and are given back when a writer waits.
+"""Store files that stay open between queries and close when a writer waits.
 
 To open a file takes a hundred times as long as to ask a small question. So the instance of the database that
 reads a file is kept for a while after a question. It is closed
@@ -48,7 +48,7 @@ LOOK_S: Final = 0.05
 
 
 def stamp_of(path: Path) -> Stamp:
-    """Identity, size and time of a store's file and of its log: they change whenever the store does."""
+    """Return identity, size and times of a store file and its log. They change with every write."""
     found: list[tuple[int, ...]] = []
     for file in (path, _beside(path, ".wal")):
         with suppress(OSError):
@@ -58,7 +58,7 @@ def stamp_of(path: Path) -> Stamp:
 
 
 def gate_of(path: Path) -> Path:
-    """The file that a writer holds while it waits for the readers of a store, or writes."""
+    """Return the lock file that a writer process holds while it waits for readers, or writes."""
     return _beside(path, ".gate")
 
 
@@ -68,7 +68,7 @@ def _beside(path: Path, ending: str) -> Path:
 
 
 def _wanted(path: Path) -> bool:
-    """Return whether a writer has closed the gate of a store."""
+    """True if a writer process has closed the gate of a store."""
     if fcntl is None:
         return True
     try:
@@ -85,7 +85,7 @@ def _wanted(path: Path) -> bool:
 
 
 class AttachedFile:
-    """A file that is attached, to be read, to the instance of the database for its folder.
+    """Read-only store file, attached to the database instance of its folder.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ class AttachedFile:
         self._instance.cursor().execute(told)
 
     def cursor(self, schema: str = "") -> DuckDBPyConnection:
-        """A connection that reads the file, and looks for names in a schema of it, if one is named."""
+        """Return a connection to the file that resolves names in the given schema."""
         connection = self._instance.cursor()
         if schema:
             connection.execute(f"USE {quoted(self.name)}.{schema}")
@@ -134,7 +134,7 @@ _instances_lock = threading.Lock()
 def shared_instance(
     key: tuple[object, ...], make: Callable[[], DuckDBPyConnection]
 ) -> DuckDBPyConnection:
-    """The instance of the database for a purpose, made when it is first asked for; ask its cursors."""
+    """Return the shared database instance of a key, created at the first call. Use its cursors only."""
     with _instances_lock:
         if key not in _instances:
             _instances[key] = make()
@@ -143,7 +143,7 @@ def shared_instance(
 
 @dataclass(slots=True, eq=False)
 class OpenFile:
-    """The state of one file in this process. Whoever changes it holds ``changed``.
+    """State of one store file in this process. Changes require the lock ``changed``.
 
     Attributes
     ----------
@@ -193,7 +193,7 @@ class OpenFile:
 
     @property
     def mine(self) -> int:
-        """Number of readings that this thread has open."""
+        """Number of open readings of the current thread."""
         return getattr(self.held, "count", 0)
 
     @mine.setter
@@ -201,14 +201,14 @@ class OpenFile:
         self.held.count = max(count, 0)  # a reading may end in another thread than it began in
 
     def close(self) -> None:
-        """Close the instance, unless somebody reads."""
+        """Close the database instance if it has no readers."""
         if not self.readers and self.instance is not None:
             instance, self.instance = self.instance, None  # gone even if closing it is interrupted
             self.spoiled = False
             instance.close()
 
     def rest(self) -> None:
-        """Keep the instance after a reading, or close it if there is a reason to."""
+        """Keep the database instance open after a reading, unless another process needs the file."""
         if self.readers:
             return
         self.changed.notify_all()
@@ -220,7 +220,7 @@ class OpenFile:
             self.close()
 
     def refresh(self, settings: tuple[object, ...], folder: Path | None) -> None:
-        """Close an instance of a file of before, or one that was opened otherwise, unless somebody reads."""
+        """Close an unused instance if the file or its settings have changed."""
         if self.instance is None or self.readers:
             return
         other = self.settings != settings or folder not in {None, self.folder}
@@ -228,7 +228,7 @@ class OpenFile:
             self.close()
 
     def let_go(self, token: object) -> None:
-        """Note that one of the objects that use the file is gone, and close it after the last one."""
+        """Unregister a user object of the file. Close the file after the last object."""
         self.holders.discard(token)
         # An object may go at any time and in any thread: nobody is waited for. The watcher looks, too.
         if not self.holders and self.changed.acquire(blocking=False):
@@ -242,19 +242,19 @@ class OpenFile:
 
 
 class _Watch:
-    """Files that may be open with nobody reading, and the thread that looks after them while there are any."""
+    """Idle open files, and the thread that closes them."""
 
     def __init__(self) -> None:
         self.begin()
 
     def begin(self) -> None:
-        """Begin with no file and no thread."""
+        """Reset to no files and no thread."""
         self.kept: set[OpenFile] = set()
         self.running = False
         self._lock = threading.Lock()
 
     def over(self, file: OpenFile) -> bool:
-        """Look after a file, too; ``False``: there can be no thread for it."""
+        """Watch a file. False if the watcher thread cannot start."""
         if file in self.kept:
             return True
         with self._lock:
@@ -278,7 +278,7 @@ class _Watch:
                 self.running = bool(self.kept)
 
     def _look(self, file: OpenFile) -> None:
-        """Close a file that nobody reads if somebody waits for it, or if nobody has asked for long."""
+        """Close an idle connection if a writer waits or the timeout passed."""
         if not file.changed.acquire(blocking=False):
             return  # somebody comes or goes
         try:
@@ -299,7 +299,7 @@ files: Final[dict[Path, OpenFile]] = {}
 
 
 def give_back(patience_s: float = 0.0) -> None:
-    """Close all files that nobody reads."""
+    """Close all files without readers."""
     for file in tuple(_watch.kept):
         if file.changed.acquire(timeout=patience_s):
             try:
@@ -321,7 +321,7 @@ _of_parents: Final[list[object]] = []
 
 
 def _begin_anew() -> None:
-    """Forget, in a process that was forked off, what threads of its parent did."""
+    """Reset the state inherited from the parent process after a fork."""
     _watch.begin()
     _of_parents.extend(_instances.values())
     _instances.clear()

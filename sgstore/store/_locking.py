@@ -53,7 +53,7 @@ _NO_NAME: Final = frozenset("?\\")
 
 
 def refuse_name(path: Path) -> None:
-    """Refuse a path that DuckDB reads in its own way.
+    """Reject a path with characters that DuckDB misinterprets.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def refuse_name(path: Path) -> None:
 
 
 def refuse_special(path: Path) -> None:
-    """Refuse what is no file: to open a pipe would wait for somebody to write into it.
+    """Reject pipes and devices, which would block on open.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def refuse_special(path: Path) -> None:
 
 
 def shut_in(connection: DuckDBPyConnection, path: Path, folders: tuple[Path, ...]) -> None:
-    """Let a connection see no files but a store and what is in some folders, for good."""
+    """Limit a connection to the store file and the given folders, permanently."""
     if not connection.execute("SELECT current_setting('enable_external_access')").fetchall()[0][0]:
         return
     whole = str(path.absolute())
@@ -120,7 +120,7 @@ _NAME: Final = ".segment-"
 
 
 class Folder(HeldFolder):
-    """A folder beside a store that is locked for as long as its process lives.
+    """Folder next to a store, locked while its process lives.
 
     Parameters
     ----------
@@ -145,12 +145,12 @@ class Folder(HeldFolder):
 
 
 def remove_left_behind(store: Path) -> None:
-    """Remove what killed processes left on its way into a store."""
+    """Remove the folders that killed writer processes left next to a store."""
     sweep(store.parent, f"{store.name}{_NAME}")
 
 
 def refuse_odd_name(store: Path) -> None:
-    """Refuse a name that the database cannot be told.
+    """Reject a path that is not valid UTF-8 or contains a null character.
 
     Raises
     ------
@@ -172,7 +172,7 @@ def refuse_odd_name(store: Path) -> None:
 
 
 def engine_fault(error: duckdb.Error) -> str | None:
-    """Return one line about an error that is a fault of the database itself; ``None`` for others."""
+    """Return one line about an internal DuckDB error. ``None`` means another error."""
     if not isinstance(error, duckdb.InternalException | duckdb.FatalException):
         return None
     reason = str(error).strip().partition("\n")[0].removeprefix("INTERNAL Error: ")
@@ -180,7 +180,7 @@ def engine_fault(error: duckdb.Error) -> str | None:
 
 
 def spill_fault(message: str) -> str | None:
-    """Return the message for a question that exceeds its memory and disk; ``None``: another error."""
+    """Return the message for a query that exceeds its memory and disk limits. ``None`` means another error."""
     if not message.startswith("Out of Memory Error"):
         return None
     return (
@@ -238,7 +238,7 @@ _PAUSE: Final = 0.005, 0.1
 
 
 def without_faults(connection: DuckDBPyConnection) -> None:
-    """Turn off what some versions of DuckDB do wrong.
+    """Disable features that are faulty in some DuckDB versions.
 
     * From 1.5.1 on its optimizer *common_subplan* takes two branches of a union for one though they read
       different columns of the same joins: rows are wrong, and nothing is said (duckdb/duckdb#25819; 2.0, too).
@@ -265,14 +265,13 @@ _CAREFUL: Final = (
 
 
 def _be_careful(connection: DuckDBPyConnection) -> None:
-    """Turn off whatever may be at fault and is not needed: for a question that has met a fault of DuckDB."""
     known = {row[0] for row in connection.execute("FROM duckdb_optimizers()").fetchall()}
     off = ",".join(name for name in _CAREFUL if name in known)
     connection.execute(f"SET disabled_optimizers = {literal(off)}")
 
 
 def default_memory() -> int:
-    """A quarter of the machine's memory, 1 GiB at most; bytes."""
+    """Return a quarter of the machine's memory, between 256 MiB and 1 GiB; bytes."""
     try:
         machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):
@@ -285,7 +284,7 @@ SPILL: Final = 10 * 10**9
 
 
 def memory_setting(memory: int) -> str:
-    """An amount of memory as DuckDB reads it."""
+    """Format an amount of memory for DuckDB."""
     return f"{memory // 1024}KiB"
 
 
@@ -293,7 +292,7 @@ _files_lock = threading.Lock()
 
 
 def _file_at(path: Path) -> OpenFile:
-    """The state of a file; what killed processes left beside it is removed when it is first asked for."""
+    """Return the state of a file. At first access, remove the leftovers of killed processes."""
     place = path.resolve()
     with _files_lock:
         known = files.get(place)
@@ -304,7 +303,7 @@ def _file_at(path: Path) -> OpenFile:
 
 
 def trust(path: Path, made: os.stat_result) -> None:
-    """Remember that a file is a store as ours are, if it is the one that this process has just made."""
+    """Mark a file as checked if this process has just created it."""
     stamp = stamp_of(path)
     if len(stamp) != 1:
         return  # there is somebody's log beside it
@@ -313,7 +312,7 @@ def trust(path: Path, made: os.stat_result) -> None:
 
 
 class Access:
-    """A DuckDB file that is open while it is used, and for a short while after it was read.
+    """Access to a DuckDB file, which stays open for a short time after each reading.
 
     Parameters
     ----------
@@ -371,7 +370,7 @@ class Access:
 
     @contextmanager
     def reading(self, *, public: bool = False, idle: bool = False) -> Generator[DuckDBPyConnection]:
-        """A read-only connection. Readings may be nested; all that overlap see the same state.
+        """Yield a read-only connection. Nested and overlapping readings see the same state.
 
         Parameters
         ----------
@@ -411,12 +410,12 @@ class Access:
                 self._leave(connection, failed=failed)
 
     def close(self) -> None:
-        """Give the file back, unless somebody reads it now; it is opened again with the next question."""
+        """Close the file if it has no readers. The next query opens it again."""
         with self._file.changed:
             self._file.close()
 
     def _damage(self, connection: DuckDBPyConnection, error: Exception) -> str:
-        """The fault of the store by which our own code failed; empty if it failed for another reason."""
+        """Return the damage of the store behind an internal error. Empty means another cause."""
         if self._diagnose is None:
             return ""
         trace = error.__traceback__
@@ -432,7 +431,7 @@ class Access:
         return self._diagnose(connection, self.path)
 
     def restart(self) -> bool:
-        """Close the file after a fault of DuckDB; it is opened anew without what may be at fault.
+        """Close the file after a DuckDB fault. It reopens with suspect optimizers disabled.
 
         Returns
         -------
@@ -492,7 +491,6 @@ class Access:
             return connection
 
     def _is_fit(self, file: OpenFile) -> bool:
-        """Whether nobody reads the file in an instance that sees other files than this one may."""
         return not file.readers or self.together == isinstance(file.instance, AttachedFile)
 
     def _leave(self, connection: DuckDBPyConnection, *, failed: bool) -> None:
@@ -506,7 +504,7 @@ class Access:
                 file.rest()
 
     def _check(self, connection: DuckDBPyConnection, database: str, stamp: Stamp) -> None:
-        """Refuse what is no store as ours are; one that was looked at before is not looked at again."""
+        """Reject a file that is not a valid store. Files checked before are skipped."""
         if stamp and stamp == self._file.good:
             return
         with translated(self.path):
@@ -551,7 +549,7 @@ class Access:
     def _shut_in(
         self, config: dict[str, Any], place: str, *folders: Path, read_only: bool = True
     ) -> DuckDBPyConnection:
-        """Open a database that sees no files but its own, users' tables, and what is in some folders."""
+        """Open a database that can read only its own file, user tables and the given folders."""
         connection = duckdb.connect(place, read_only=read_only, config=config)
         # Among the settings above DuckDB might take these before the folder, and refuse that.
         seen = [str(folder) for folder in (self._file.folder, *folders)]
@@ -565,7 +563,7 @@ class Access:
 
     @contextmanager
     def writing(self, connection: DuckDBPyConnection, *folders: Path) -> Generator[None]:
-        """One transaction on the file, as :meth:`attached` has it. It is undone if the block raises.
+        """Run one transaction on the file; see :meth:`attached`. An exception rolls it back.
 
         Raises
         ------
@@ -577,7 +575,7 @@ class Access:
 
     @contextmanager
     def attached(self, connection: DuckDBPyConnection, *folders: Path) -> Generator[None]:
-        """The file attached as ``store`` to a connection of the caller's; nobody else has it meanwhile.
+        """Attach the file as ``store`` to the caller's connection, with exclusive access.
 
         From then on the connection sees no files but the store and what is in the folders that are named, and
         its settings are locked.
@@ -602,7 +600,7 @@ class Access:
 
     @contextmanager
     def _alone(self) -> Generator[_Deadline]:
-        """No other thread of this process has the file."""
+        """Exclude all other threads of this process from the file."""
         file, deadline = self._file, _Deadline(self._wait_s)
         if file.mine:
             raise StoreError(f"{self.path}: cannot be written while the same thread reads it")
@@ -641,7 +639,7 @@ class Access:
 
 @contextmanager
 def transaction(connection: DuckDBPyConnection) -> Generator[None]:
-    """A transaction on the attached store; it is undone if the block raises."""
+    """Run one transaction on the attached store. An exception rolls it back."""
     connection.execute("BEGIN TRANSACTION")
     try:
         yield
@@ -656,20 +654,20 @@ def transaction(connection: DuckDBPyConnection) -> Generator[None]:
 
 
 class BusyError(StoreError):
-    """Others have the file."""
+    """Another process or connection uses the file."""
 
 
 class EngineError(StoreError):
-    """The database has failed by a fault of its own."""
+    """DuckDB failed with an internal error."""
 
 
 class HeldHereError(BusyError):
-    """The process has it already, by a connection that sgstore did not make."""
+    """Another connection of this process, not made by sgstore, uses the file."""
 
 
 @contextmanager
 def translated(path: Path) -> Generator[None]:
-    """Errors of DuckDB as errors of the store at ``path``, and an interruption as what it is.
+    """Convert DuckDB errors to errors of the store at ``path``, and interruptions to ``KeyboardInterrupt``.
 
     DuckDB turns Ctrl-C into errors of its own: into a RuntimeError while a statement runs, and into one that
     quotes the KeyboardInterrupt while it looks at our arrays.
@@ -715,7 +713,7 @@ def _reason(message: str) -> str:
 
 
 class _Deadline:
-    """A bounded wait with growing pauses."""
+    """Retry timer with growing pauses and an overall limit."""
 
     def __init__(self, wait_s: float) -> None:
         self._start = time.monotonic()
@@ -726,7 +724,7 @@ class _Deadline:
         return max(self._end - time.monotonic(), 0)
 
     def pause(self, error: StoreError) -> None:
-        """Sleep a little, or raise the error if there is no time left."""
+        """Sleep briefly, or raise the error after the time limit."""
         if isinstance(error, HeldHereError):
             if time.monotonic() - self._start > _HELD_HERE_S:
                 raise error
@@ -738,7 +736,7 @@ class _Deadline:
 
 
 def _pass_gate(path: Path, deadline: _Deadline) -> None:
-    """Wait while a writer waits for readers to go. A courtesy: DuckDB's lock decides."""
+    """Wait while a writer process holds the gate. This is a courtesy: the DuckDB lock decides."""
     if fcntl is None:
         return
     try:
@@ -768,7 +766,7 @@ def _closed_gate(path: Path, deadline: _Deadline) -> Generator[None]:
 
 
 class _Gate:
-    """The gate of a store, closed by this process."""
+    """Gate of a store, closed by this process."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -776,7 +774,7 @@ class _Gate:
         self._begun = False
 
     def close(self, deadline: _Deadline) -> None:
-        """Wait until nobody else has closed it, and close it."""
+        """Wait until the gate is free, and close it."""
         self._begun = True
         while True:
             try:
@@ -798,7 +796,7 @@ class _Gate:
             return False
 
     def remove(self) -> None:
-        """Open it, unless another process has it now."""
+        """Open the gate, unless another process holds it now."""
         if fcntl is None or not self._begun:
             return
         with suppress(OSError):
@@ -831,5 +829,5 @@ def _lock(gate: int, how: int, path: Path, deadline: _Deadline) -> None:
 
 
 def spill_folder() -> Path:
-    """A folder that does not exist yet; DuckDB makes it when memory runs out, and removes it."""
+    """Return an unused folder path. DuckDB creates it when memory is full, and removes it."""
     return new_place("spill")

@@ -1,4 +1,4 @@
-"""Answers of parts of a collection, which wait in Parquet files or are a few rows, as tables of one statement.
+"""Partial results of a collection, from Parquet files or memory, as tables of one statement.
 
 The statement is ours (:mod:`sgstore.lang._parts`): it puts rows in order, or groups what the parts have
 grouped. What does not fit into memory spills to disk.
@@ -59,7 +59,7 @@ _PLAIN: Final = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class PartFile:
-    """Rows of one part of an answer.
+    """Rows of one partial result.
 
     Attributes
     ----------
@@ -80,22 +80,22 @@ class PartFile:
 
     @property
     def written(self) -> bool:
-        """Whether its rows are in the file."""
+        """True if the rows are in the file."""
         return bool(self.rows) and not self.few
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as plain values."""
+        """Return the partial result as plain values."""
         about = {"columns": list(self.columns), "types": list(self.types), "rows": self.rows}
         return {"path": str(self.path) if self.written else "", "few": self.few} | about
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> PartFile:
-        """The part that plain values describe."""
+        """Restore a partial result from plain values."""
         columns, types = tuple(values["columns"]), tuple(values["types"])
         return cls(Path(values["path"]), columns, types, values["rows"], values["few"])
 
     def moved(self, folder: Path) -> PartFile:
-        """Move it into another folder, where it stays until others have come, too."""
+        """Move the file into another folder, until all parts are complete."""
         if not self.written:
             return self
         return replace(self, path=self.path.replace(folder / self.path.name))
@@ -111,7 +111,7 @@ def write_part(
     given: Iterable[Given],
     to: Path,
 ) -> PartFile:
-    """Write the rows of a statement of ours on a store to a Parquet file; the database itself writes it.
+    """Run a trusted SQL statement on a store, and let DuckDB write the rows to a Parquet file.
 
     Parameters
     ----------
@@ -134,14 +134,13 @@ def write_part(
 
 
 def _making(sql: str, columns: int) -> str:
-    """The statement that makes the table of a part."""
     # Names of columns may differ in case alone, which neither a table nor Parquet tells apart.
     names = ", ".join(f"c{number}" for number in range(columns))
     return f"CREATE OR REPLACE TEMP TABLE {_PART} AS SELECT * FROM (\n{sql}\n) AS t({names})"
 
 
 def _written(connection: DuckDBPyConnection) -> Written:
-    """Write the table of a part to a file in the one folder that the database sees, unless it has few rows."""
+    """Write the table of a part to a file in the allowed folder. A small table stays in memory."""
     described = connection.execute(f"DESCRIBE {_PART}").fetchall()
     kinds = {str(row[0]): str(row[1]) for row in described}
     # A column of which nothing is known is of no type, and a table has none such.
@@ -172,7 +171,7 @@ def _is_plain(kind: str) -> bool:
 def write_classes(
     file: StoreFile, abstraction: str, traces: Sequence[int], table: str, to: Path
 ) -> PartFile:
-    """Write the classes that frames have in an abstraction: of some traces, or of a user's own table.
+    """Write the frame classes of an abstraction for some traces, or for a user table.
 
     Parameters
     ----------
@@ -196,13 +195,13 @@ def write_classes(
 
 
 def write_rows(columns: Mapping[str, str], rows: Iterable[Sequence[Any]], to: Path) -> PartFile:
-    """Write rows that no statement gives, as :func:`write_part` does; ``columns``: with their types."""
+    """Write rows from Python in the format of :func:`write_part`. ``columns`` maps names to types."""
     names, types = [f"c{number}" for number in range(len(columns))], (*columns.values(),)
     return PartFile(to, tuple(columns), types, write_parquet(names, rows, to, types))
 
 
 def write_coded(file: StoreFile, abstraction: str, to: Path) -> PartFile:
-    """Write the class of each frame in an abstraction, as :func:`merged_classes` reads it."""
+    """Write the class of each frame in an abstraction, for :func:`merged_classes`."""
     columns = {"class": "VARCHAR", "bucket": "BIGINT", "mask": "BIGINT"}
     return write_rows(columns, file.abstracted.masks(abstraction), to)
 
@@ -215,7 +214,7 @@ Parts = dict[str, list[PartFile]]
 def merged_parts(
     parts: Parts, words: Mapping[str, Sequence[str]], sql: str, values: Sequence[Any]
 ) -> Generator[Batches]:
-    """The rows of a statement over the answers of parts.
+    """Stream the rows of a statement over partial results.
 
     Parameters
     ----------
@@ -238,7 +237,7 @@ def merged_file(
     columns: Sequence[str],
     to: Path,
 ) -> PartFile:
-    """Write the rows of a statement over the answers of parts, as a part of a further answer.
+    """Write the rows of a statement over partial results as a new partial result.
 
     Parameters
     ----------
@@ -267,13 +266,13 @@ def merged_file(
 def merged_arrays(
     parts: Parts, words: Mapping[str, Sequence[str]], sql: str, values: Sequence[Any]
 ) -> dict[str, NDArray[np.generic]]:
-    """All columns of such a statement, as :func:`merged_parts` takes it; masked where something is NULL."""
+    """Return the columns of a statement over partial results as arrays. NULL values are masked."""
     with _tables(parts, words) as connection:
         return arrays(connection, sql, _numbered(values))
 
 
 def merged_classes(parts: Sequence[PartFile]) -> CodedClasses:
-    """The classes of frames that parts tell, as rows of ``class``, ``bucket``, ``mask``."""
+    """Return the frame classes of partial results with columns ``class``, ``bucket``, ``mask``."""
     from sgstore.store._classes import classes_coded
 
     with _tables({"parts": [*parts]}, {}) as connection:
@@ -286,7 +285,7 @@ def _numbered(values: Sequence[Any]) -> dict[str, Any]:
 
 @contextmanager
 def _tables(parts: Parts, words: Mapping[str, Sequence[str]]) -> Generator[DuckDBPyConnection]:
-    """A database of our own in which the answers of parts are tables."""
+    """Yield a database connection with partial results as tables."""
     kinds = {
         enum: tuple(dict.fromkeys([*shape.own_labels(enum), *words.get(enum, ())]))
         for enum in NAMES
@@ -303,7 +302,7 @@ def _tables(parts: Parts, words: Mapping[str, Sequence[str]]) -> Generator[DuckD
 def _told(
     connection: DuckDBPyConnection, table: str, files: Sequence[PartFile]
 ) -> dict[tuple[str, ...], str]:
-    """Types → the table with the rows of those parts that tell them as values."""
+    """Create tables for the parts held in memory. Return column types → table name."""
     alike: dict[tuple[str, ...], list[Sequence[Any]]] = {}
     for one in files:
         if one.few:
@@ -321,7 +320,6 @@ def _told(
 
 
 def _merging(kinds: Mapping[str, Sequence[str]]) -> DuckDBPyConnection:
-    """A database with the enumerations that all bundles have together: to make one takes 15 ms."""
     connection = scratch(spill_folder(), memory=default_memory(), threads=os.cpu_count() or 1)
     for enum, labels in kinds.items():
         connection.execute(f"CREATE TYPE {enum} AS ENUM ({', '.join(map(literal, labels))})")
@@ -329,7 +327,7 @@ def _merging(kinds: Mapping[str, Sequence[str]]) -> DuckDBPyConnection:
 
 
 def _rows_of(files: Sequence[PartFile], told: Mapping[tuple[str, ...], str]) -> str:
-    """The statement whose rows are those of some files and tables, with the types that they had."""
+    """Return SQL for the rows of some files and tables, with their original types."""
     if not files:
         raise StoreError("nothing was answered")
     first = files[0]
@@ -363,7 +361,7 @@ _WIDTHS: Final = (
 
 
 def _common(kinds: set[str]) -> str:
-    """The type that holds the values of some types of one column: a part may know no value of it."""
+    """Return the common type for several types of one column. A part may have no value of it."""
     enums = {_enum_of(kind) for kind in kinds if kind.startswith("ENUM")}
     if enums:
         return enums.pop() if len(enums) == 1 and len(kinds - {_NOTHING}) >= 1 else "VARCHAR"
@@ -376,7 +374,7 @@ def _common(kinds: set[str]) -> str:
 
 
 def _enum_of(kind: str) -> str:
-    """The enumeration of ours that a type is, by its first values: stores may have added some."""
+    """Return the schema enumeration that a database type extends, matched by its first values."""
     for enum in NAMES:
         head = ", ".join(map(literal, shape.own_labels(enum)))
         if kind.startswith(f"ENUM({head}"):

@@ -1,4 +1,4 @@
-"""Graphs of a block as columns of the store's tables: codes and masks.
+"""Conversion of graph blocks to columns of store tables: codes and masks.
 
 A mask holds the 60 frames of a bucket. An edge that holds in many of them is one row, and so is a static
 node that is present in many.
@@ -52,19 +52,19 @@ LONGEST_STEP: Final = f"{GAP} * period_ns + {TOLERANCE}"
 
 @dataclass(slots=True)
 class NodeKinds:
-    """Kinds of the nodes of a trace by node id: entities, which become more, and parts of its map."""
+    """Kinds of the nodes of a trace by node id: entities (growing) and map elements."""
 
     entities: Codes
     map: Codes
 
     def learn(self, entities: Entities) -> None:
-        """Take note of entities that appear for the first time, in order of node id."""
+        """Append the kinds of new entities, ordered by node id."""
         if len(entities) and entities.first != len(self.entities):
             raise ValueError(f"new entities begin at {entities.first}, not {len(self.entities)}")
         self.entities = np.concatenate([self.entities, entities.kind])
 
     def of(self, nodes: Whole) -> Codes:
-        """Kinds of nodes."""
+        """Return the kind codes of nodes."""
         kinds = np.empty(len(nodes), np.int8)
         kinds[nodes >= 0] = self.entities[nodes[nodes >= 0]]
         kinds[nodes < 0] = self.map[-1 - nodes[nodes < 0]]
@@ -72,17 +72,17 @@ class NodeKinds:
 
 
 def trace_bucket(trace_id: int, seq: Ints) -> Ints:
-    """Buckets of frames of a trace."""
+    """Return the bucket of each frame number of a trace."""
     return (trace_id << BUCKET_BITS) + seq // BUCKET_FRAMES
 
 
 def frame_ids(trace_id: int, seq: Ints) -> Ints:
-    """Ids of frames of a trace."""
+    """Return the frame id of each frame number of a trace."""
     return (trace_bucket(trace_id, seq) << FRAME_BITS) + seq % BUCKET_FRAMES
 
 
 def frames_of(bucket: Ints, mask: Ints) -> tuple[Ints, Ints]:
-    """The frames of masks: their ids, and the row of each."""
+    """Return the frame ids in bucket masks, and the row of each frame."""
     ids: list[Ints] = []
     rows: list[Ints] = []
     for bit in range(BUCKET_FRAMES):
@@ -93,18 +93,18 @@ def frames_of(bucket: Ints, mask: Ints) -> tuple[Ints, Ints]:
 
 
 def trace_of(frame_id: Ints) -> Ints:
-    """Ids of the traces of frames."""
+    """Return the trace id of each frame id."""
     return frame_id >> SEQ_BITS
 
 
 def seq_of(frame_id: Ints) -> Ints:
-    """Numbers of frames in their traces."""
+    """Return the number in its trace of each frame id."""
     bucket = (frame_id >> FRAME_BITS) & ((1 << BUCKET_BITS) - 1)
     return bucket * BUCKET_FRAMES + (frame_id & ((1 << FRAME_BITS) - 1))
 
 
 def begins(frame_id: Ints) -> Bools:
-    """(N,): which frames do not come next after the one before them, in its trace."""
+    """Return a mask (N,) of the frames that do not directly follow the previous row's frame."""
     trace, seq = trace_of(frame_id), seq_of(frame_id)
     found = np.ones(len(frame_id), np.bool_)
     found[1:] = (trace[1:] != trace[:-1]) | (seq[1:] != seq[:-1] + 1)
@@ -112,7 +112,7 @@ def begins(frame_id: Ints) -> Bools:
 
 
 def masks_of(keys: Sequence[Whole], bits: Whole) -> tuple[NDArray[np.intp], Ints]:
-    """Rows with equal keys become one, with the bits of all of them.
+    """Merge rows with equal keys, and combine their bits into masks.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def masks_of(keys: Sequence[Whole], bits: Whole) -> tuple[NDArray[np.intp], Ints
 
 
 def packed(keys: Sequence[NDArray[Any]]) -> Ints | None:
-    """The columns of a key as one number that sorts as they do.
+    """Combine key columns into one integer with the same sort order. ``None`` means that they do not fit.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def packed(keys: Sequence[NDArray[Any]]) -> Ints | None:
 
 
 def frame_columns(graph: GraphBlock, trace_id: int) -> Columns:
-    """Table ``frame``."""
+    """Return table ``frame``."""
     frames = graph.frames
     return {
         "frame_id": frame_ids(trace_id, frames.seq),
@@ -183,7 +183,7 @@ def frame_columns(graph: GraphBlock, trace_id: int) -> Columns:
 def state_columns(
     graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds, origin: Origin
 ) -> Columns:
-    """States in each frame, but for the constants of entities; kinds and states of lights as codes."""
+    """Return the variable states of each frame. Kinds and light states are codes."""
     frames, states = graph.frames, graph.frames.states
     row = frames.frame_of
     plain = {name: getattr(states, name) for name in KEPT}
@@ -208,7 +208,7 @@ def state_columns(
 
 
 def node_columns(graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds) -> Columns:
-    """Table ``node``; kinds as codes."""
+    """Return table ``node``. Kinds are codes."""
     seq = graph.frames.seq[graph.presence.frame]
     kind, bucket, node = (
         kinds.of(graph.presence.node),
@@ -222,7 +222,7 @@ def node_columns(graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds
 def edge_columns(
     graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds
 ) -> Iterator[Columns]:
-    """Table ``edge``, in pieces of about :data:`EDGE_ROWS`; relations and kinds as codes."""
+    """Yield table ``edge`` in pieces of about :data:`EDGE_ROWS` rows. Relations and kinds are codes."""
     edges = graph.edges
     count = -(-len(edges) // EDGE_ROWS)
     if count <= 1:
@@ -261,7 +261,7 @@ def _edge_columns(
 
 
 def lane_columns(graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds) -> Columns:
-    """Places in lanes in each frame; kinds as codes."""
+    """Return the lane positions of entities in each frame. Kinds are codes."""
     lanes = graph.lanes
     seq = graph.frames.seq[lanes.frame]
     return {
@@ -281,7 +281,7 @@ def lane_columns(graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds
 
 
 def gap_columns(graph: GraphBlock | WorldBlock, trace_id: int) -> Columns:
-    """Gaps along the lanes in each frame."""
+    """Return the gaps along the lanes in each frame."""
     gaps = graph.gaps
     seq = graph.frames.seq[gaps.frame]
     return {
@@ -294,7 +294,7 @@ def gap_columns(graph: GraphBlock | WorldBlock, trace_id: int) -> Columns:
 
 
 def entity_columns(graph: GraphBlock, origin: Origin) -> Columns:
-    """Table ``entity``; kinds as codes."""
+    """Return table ``entity``. Kinds are codes."""
     entities, scenery = graph.frames.entities, graph.frames.scenery
     rows = scenery.node - entities.first
     if len(rows) and not 0 <= rows.min() <= rows.max() < len(entities):
@@ -323,27 +323,27 @@ def entity_columns(graph: GraphBlock, origin: Origin) -> Columns:
 
 
 def message_columns(messages: MessageRefs, channel_ids: Ints) -> Columns:
-    """Places of messages, with the channels' ids in the file."""
+    """Return message positions with the channel ids of the file."""
     columns = {f.name: getattr(messages, f.name) for f in fields(messages)}
     return columns | {"channel": channel_ids[messages.channel]}
 
 
 def unless(values: Whole, missing: Bools) -> Ints:
-    """Values, and :data:`MISSING` where they are missing."""
+    """Replace missing values by :data:`MISSING`."""
     return np.where(missing, np.int64(MISSING), values)
 
 
 def texts(values: Iterable[str]) -> NDArray[Any]:
-    """Texts as the database takes them; empty where there is none."""
+    """Return texts as a column with valid Unicode for the database."""
     told = list(values)
     return np.array(told if "".join(told).isascii() else [plain(value) for value in told], object)
 
 
 def plain(text: str) -> str:
-    """A text with ``?`` for what is not Unicode: parts of files that are not what they say."""
+    """Replace characters that are not valid Unicode, such as lone surrogates, by ``?``."""
     return text if text.isascii() else text.encode("utf-8", "replace").decode()
 
 
 def as_json(values: dict[str, Any]) -> str:
-    """Plain values as JSON that the database takes; the same values give the same text."""
+    """Return values as canonical JSON: equal values give equal texts."""
     return plain(json.dumps(values, sort_keys=True, ensure_ascii=False))

@@ -33,7 +33,7 @@ _SAMPLE: Final = 8192
 
 @dataclass(slots=True)
 class Periods:
-    """Periods of channels, estimated from their first messages.
+    """Median periods of channels, estimated from their first messages.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class Periods:
     counts: dict[int, int] = field(default_factory=dict[int, int])
 
     def see(self, channel: int, log_time_ns: Ints) -> None:
-        """Take note of messages."""
+        """Add messages to the estimate."""
         count = self.counts.get(channel, 0)
         if count <= _SAMPLE and len(log_time_ns):
             piece = log_time_ns[: _SAMPLE + 1 - count]
@@ -55,7 +55,7 @@ class Periods:
             self.counts[channel] = count + len(piece)
 
     def of(self, channel: int) -> float:
-        """Median difference of log times; ns. 0 if there are fewer than two messages."""
+        """Return the median difference of log times; ns. Fewer than two messages give 0."""
         times = np.sort(np.concatenate(self.times.get(channel, [np.zeros(0, np.int64)])))
         return float(np.median(np.diff(times))) if len(times) > 1 else 0.0
 
@@ -77,7 +77,7 @@ def joined(
     periods: Periods,
     settings: Payloads,
 ) -> Iterator[Columns]:
-    """Table ``payload`` of a trace, but for whose it is: the rows of one channel after another, in order.
+    """Yield table ``payload`` of a trace without the trace id, channel by channel, in order.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def joined(
 
 
 class FrameTimes:
-    """Log times of the frames of a trace, and the order in which they ascend.
+    """Log times of the frames of a trace, and their ascending order.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ class FrameTimes:
 def _messages_of(
     messages: Callable[[], Iterable[Columns]], numbers: list[int]
 ) -> Iterator[Columns]:
-    """Messages of some channels, so many together as memory is for."""
+    """Yield the messages of some channels in groups that fit into memory."""
     waiting: list[Columns] = []
     for some in messages():
         rows = np.flatnonzero(np.isin(some["channel"], numbers))
@@ -138,7 +138,7 @@ def _messages_of(
 def _own(
     frames: FrameTimes, messages: Callable[[], Iterable[Columns]], leading: list[int]
 ) -> Columns:
-    """The messages that frames are: of frames of one time the first is the first message, and so on."""
+    """Return the messages from which the frames were read. Frames of equal time keep the message order."""
     parts = list(_messages_of(messages, leading))
     if not parts:
         return {name: np.zeros(0, np.int64) for name in ("frame", "channel", *_PLACE)}
@@ -158,7 +158,7 @@ def _own(
 def _chosen(
     frames: FrameTimes, messages: Iterable[Columns], allowed: int, *, nearest: bool
 ) -> Columns:
-    """For each frame the nearest message in log time, of two as near the earlier; or the latest.
+    """Return for each frame the nearest message in log time (the earlier of two), or the latest message.
 
     Of messages of one time the last one in the file counts.
     """
@@ -184,12 +184,11 @@ def _chosen(
 
 
 def _none(count: int) -> Ints:
-    """Columns of messages that are none: their length is below zero."""
     return np.full((len(_PLACE), count), -1, np.int64)
 
 
 def _better(one: Ints, other: Ints, *, later: bool) -> Ints:
-    """Of two messages for each frame the later, or the earlier; of one time the one further on in the file."""
+    """Return the later or the earlier message for each frame. At equal times, the later file position wins."""
     further = np.zeros(one.shape[1], np.bool_)
     same = np.ones(one.shape[1], np.bool_)
     for mine, theirs in zip(one[1:], other[1:], strict=True):
@@ -201,7 +200,7 @@ def _better(one: Ints, other: Ints, *, later: bool) -> Ints:
 
 
 def tolerance_ns(periods: Periods, channel: int, settings: Payloads) -> int:
-    """Greatest difference of log times between a frame and its message; ns."""
+    """Return the largest log time difference between a frame and its message; ns."""
     if settings.tolerance:
         return round(settings.tolerance * 1e9)
     period = max(periods.of(channel), periods.of(FRAMES))
@@ -211,7 +210,7 @@ def tolerance_ns(periods: Periods, channel: int, settings: Payloads) -> int:
 def payload_place(
     connection: DuckDBPyConnection, frame: FrameRef, channel: str
 ) -> tuple[int, int, int, int]:
-    """Channel's id, chunk offset, offset and length of the message of a channel that belongs to a frame.
+    """Return channel id, chunk offset, offset and length of a channel's message at a frame.
 
     Raises
     ------
@@ -252,7 +251,7 @@ MOST_WAITING: Final = 100_000
 
 
 class Happenings:
-    """The events of one trace, block after block.
+    """Events of one trace, added block by block.
 
     Parameters
     ----------
@@ -271,7 +270,7 @@ class Happenings:
         )  # the last frame so far: simulation time, log time, id
 
     def of(self, frames: FrameBlock) -> Columns:
-        """Table ``event``, as far as it can be told when these frames are known."""
+        """Return the rows of table ``event`` that these frames complete. Later frames may complete others."""
         ids = frame_ids(self._trace_id, frames.seq)
         known = np.hstack([self._last, np.stack([frames.time_ns, frames.log_time_ns, ids])])
         self._last = known[:, -1:]
@@ -285,7 +284,7 @@ class Happenings:
         return _columns(told, known[2][frame[~waits]])
 
     def rest(self) -> Columns:
-        """The same of events for which no other frame came."""
+        """Return the remaining rows of table ``event`` after the last frame."""
         events, self._waiting = self._waiting, []
         return _columns(events, self._last[2][np.zeros(len(events), np.intp)])
 

@@ -1,4 +1,4 @@
-"""Publishing and removing traces, and adding to published ones, in one transaction.
+"""Publication and removal of traces, and additions to published traces, each in one transaction.
 
 From a sealed segment into the store, and out of it: what one transaction does.
 """
@@ -56,7 +56,7 @@ SHARED: Final = {
 
 
 class PresentError(StoreError):
-    """The store has the trace already, read in the same way.
+    """The store already has the trace, read with the same settings.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class PresentError(StoreError):
 def publish_each(
     access: Access, sealed: Sequence[Sealed], *, replace: bool = False
 ) -> list[str | SgstoreError]:
-    """Bring traces into a store that is opened once; see :meth:`StoreFile.publish_each`."""
+    """Add sealed traces to a store that is opened once; see :meth:`StoreFile.publish_each`."""
     found: list[str | SgstoreError] = []
     while len(found) < len(sealed):
         try:
@@ -91,7 +91,7 @@ def publish_each(
 
 
 def _publish(connection: DuckDBPyConnection, path: Path, sealed: Sealed, *, replace: bool) -> str:
-    """Bring a trace into the attached store at a path; the name of the trace there."""
+    """Add a sealed trace to the attached store, and return its stored name."""
     tables = TableFile(sealed.folder / FILE, path)
     try:
         return _put(connection, path, sealed, tables, replace=replace)
@@ -133,7 +133,7 @@ def _put(
 
 
 def widen(connection: DuckDBPyConnection, words: Mapping[str, Iterable[str]]) -> None:
-    """Let the attached store hold values of enumerations that it may not have."""
+    """Add missing enumeration values to the attached store."""
     # Every store has those of ``schema.sql``; to look which others it has takes a while.
     new = {
         enum: [name for name in names if name not in shape.own_labels(enum)]
@@ -150,7 +150,7 @@ def _publish_shared(
     owner: str,
     digest: str,
 ) -> None:
-    """Insert a recording, settings or a map, if the store does not have it; of a recording, its place now.
+    """Insert a recording, settings or a map if missing. Update the path of a stored recording.
 
     Raises
     ------
@@ -192,7 +192,7 @@ def insert(
     table: str,
     given: Mapping[str, object] | None = None,
 ) -> None:
-    """Insert the staged rows of a table, with the values that only the store can give."""
+    """Insert the staged rows of a table, with values that only the store can assign."""
     given = given or {}
     # The same arrays for all rows: until it ends, the transaction keeps whatever it has been given.
     staged = _buffers(tables, table)
@@ -213,7 +213,7 @@ def insert(
 
 
 def _buffers(tables: TableFile, table: str) -> Columns:
-    """Columns for so many rows of a table as are inserted together."""
+    """Return empty columns for the largest number of rows inserted at once."""
     pieces, types = tables.pieces(table), types_of(table)
     size = min(sum(piece.rows for piece in pieces), PIECE_ROWS)
     return {
@@ -223,7 +223,7 @@ def _buffers(tables: TableFile, table: str) -> Columns:
 
 
 def _filled(tables: TableFile, table: str, staged: Columns) -> Iterator[int]:
-    """Fill the columns with rows of a table until there are no more; how many there are each time."""
+    """Fill the columns with the next rows of a table until the end. Yield the number of rows each time."""
     size, count = len(next(iter(staged.values()))), 0
     for piece in tables.pieces(table):
         first = 0
@@ -240,7 +240,7 @@ def _filled(tables: TableFile, table: str, staged: Columns) -> Iterator[int]:
 
 
 def _value(table: str, name: str, values: NDArray[Any]) -> str:
-    """SQL of a staged column: enumerations by their codes, NULL for what is missing; NaN is NULL anyway."""
+    """Return SQL of a staged column: enumeration values from codes, and NULL for missing values."""
     if values.dtype.kind == "O":
         return f"nullif(\"{name}\", '')" if values.any() else "NULL"
     enum = shape.enums_of(table).get(name)
@@ -259,7 +259,7 @@ def _value(table: str, name: str, values: NDArray[Any]) -> str:
 def _note(
     connection: DuckDBPyConnection, owner: str, number: int, checksums: Mapping[str, Checksum]
 ) -> None:
-    """Take down the checksums of what was inserted."""
+    """Store the checksums of inserted rows."""
     values = [
         (owner, number, table, checksum.rows, checksum.value)
         for table, checksum in checksums.items()
@@ -293,7 +293,7 @@ ORPHANS: Final = "".join(
 
 
 def owned(connection: DuckDBPyConnection, database: str) -> Iterator[tuple[str, str]]:
-    """The tables of a store that hold rows of traces, each with the condition on the rows of ``$trace_id``."""
+    """Yield the tables with trace rows, each with the SQL condition for the rows of ``$trace_id``."""
     rows = connection.execute(
         """
         SELECT table_name, list(column_name) FROM duckdb_columns()
@@ -309,7 +309,7 @@ def owned(connection: DuckDBPyConnection, database: str) -> Iterator[tuple[str, 
 
 
 def remove(connection: DuckDBPyConnection, trace_id: int) -> None:
-    """Delete a trace from the attached store, with the settings and the map that no other trace has."""
+    """Delete a trace from the attached store, with the settings and map that no other trace uses."""
     _delete(connection, trace_id)
     connection.execute(ORPHANS)
 
@@ -329,7 +329,7 @@ _SCATTERED: Final = (*STATES, *REPEATED, *REPEATED.values(), "frame", *MASKS, "d
 
 
 def copy_sorted(connection: DuckDBPyConnection) -> None:
-    """Fill the empty store that is attached as ``fresh`` from the one attached as ``store``."""
+    """Copy the store attached as ``store`` into the empty store attached as ``fresh``, sorted."""
     tables = connection.execute(
         "SELECT table_name FROM duckdb_tables() WHERE database_name = 'fresh'"
     ).fetchall()
@@ -351,13 +351,13 @@ STEP: Final = 64
 
 @contextmanager
 def writing(access: Access) -> Generator[DuckDBPyConnection]:
-    """One transaction on a store, attached as ``store``."""
+    """Run one transaction on a store, attached as ``store``."""
     with scratch(spill_folder()) as connection, access.writing(connection):
         yield connection
 
 
 def add(connection: DuckDBPyConnection, path: Path, staging: Staging) -> None:
-    """Insert all that a staging sealed into the attached store at a path."""
+    """Insert all sealed tables of a staging into the attached store."""
     tables = TableFile(staging.folder / FILE, path)
     try:
         for table in staging.checksums:
@@ -367,7 +367,7 @@ def add(connection: DuckDBPyConnection, path: Path, staging: Staging) -> None:
 
 
 def note(connection: DuckDBPyConnection, trace_id: int, tables: Iterable[str]) -> None:
-    """Take down what a trace has now in tables that change after it was published."""
+    """Update the stored checksums of a trace for tables that changed after its publication."""
     sql = "SELECT frames FROM store.inside.trace WHERE trace_id = ?"
     frames = sum(n for (n,) in connection.execute(sql, [trace_id]).fetchall())
     for table in tables:
@@ -382,7 +382,7 @@ def note(connection: DuckDBPyConnection, trace_id: int, tables: Iterable[str]) -
 def checksum_of(
     connection: DuckDBPyConnection, database: str, table: str, trace_id: int, frames: int
 ) -> Checksum:
-    """Checksum of the rows of a trace in a table, of which few are in memory at once."""
+    """Return the checksum of a trace's rows in a table. The rows are read in small ranges."""
     checksum = Checksum()
     select = expressions(connection, table, database)
     for condition, values in _ranges(connection, database, table, trace_id, frames):
@@ -396,7 +396,7 @@ def checksum_of(
 def _ranges(
     connection: DuckDBPyConnection, database: str, table: str, trace_id: int, frames: int
 ) -> Iterator[tuple[str, list[int]]]:
-    """Conditions on the rows of a trace, each of so many as fit into memory."""
+    """Yield SQL conditions that split the rows of a trace into ranges that fit into memory."""
     names = {name for name, _ in columns_of(connection, table, database)}
     bits = {"bucket": 0, "frame_id": FRAME_BITS}
     column = next((name for name in bits if name in names), None)

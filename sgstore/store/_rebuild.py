@@ -1,4 +1,4 @@
-"""Rebuilding: what is known of an old store, and a new file in its place.
+"""Rebuild of a store: reads the content of an old store, and replaces its file.
 
 What is known of a store's traces, however old or altered it is: enough to make it anew.
 
@@ -52,7 +52,7 @@ _NEW: Final = f"STORAGE_VERSION '{STORAGE_VERSION}', BLOCK_SIZE {BLOCK_SIZE}"
 
 @dataclass(frozen=True, slots=True)
 class OldTrace:
-    """A trace as a store has it; see :class:`sgstore.store._traces.StoredTrace`.
+    """Trace of an old store; see :class:`sgstore.store._traces.StoredTrace`.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class OldTrace:
 
 @dataclass(frozen=True, slots=True)
 class OldMap:
-    """A road map as a store has it; without a text if it is of named parts."""
+    """Road map of an old store. A map of named parts has no text."""
 
     name: str
     digest: str
@@ -87,7 +87,7 @@ class OldMap:
 
 @dataclass(frozen=True, slots=True)
 class OldSet:
-    """A derived set of relations of some traces."""
+    """Derived set of relations of some traces in an old store."""
 
     name: str
     settings: dict[str, Any]
@@ -96,7 +96,7 @@ class OldSet:
 
 @dataclass(frozen=True, slots=True)
 class Remains:
-    """Contents of a store that are needed to make it anew.
+    """Content of an old store that a rebuild needs.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ class Remains:
 
 
 def remains_of(path: Path) -> Remains:
-    """Contents of a store that are needed to make it anew.
+    """Return the content of an old store that a rebuild needs.
 
     Raises
     ------
@@ -132,7 +132,7 @@ def remains_of(path: Path) -> Remains:
 
 
 def remains_in(connection: DuckDBPyConnection, database: str, path: Path) -> Remains:
-    """The same of a store that a connection has open under a name."""
+    """Return the content that a rebuild needs from a store that is already open."""
     objects = shape.objects_of(connection, database)
     if shape.about_store(connection, database, objects) is None:
         raise StoreError(f"{path}: a DuckDB database, but not a store")
@@ -162,7 +162,7 @@ def remains_in(connection: DuckDBPyConnection, database: str, path: Path) -> Rem
 
 
 class _TableReader:
-    """Rows of tables, if they are tables: nothing that the store may have made takes part."""
+    """Reader of plain tables. Views and macros of the store are ignored."""
 
     def __init__(
         self, connection: DuckDBPyConnection, database: str, path: Path, objects: Objects
@@ -174,15 +174,15 @@ class _TableReader:
         self._tables = {one[2] for one in objects if one[:2] == ("table", self._schema)}
 
     def has(self, table: str) -> bool:
-        """Tell whether there is such a table."""
+        """True if the table exists."""
         return table in self._tables
 
     def rows(self, table: str, columns: str, *, needed: bool = False) -> list[dict[str, Any]]:
-        """All rows of a table; none if there is no such table and it is not needed."""
+        """Return all rows of a table. A missing optional table has no rows."""
         return self._asked(table, columns, "SELECT", needed=needed)
 
     def distinct(self, table: str, columns: str) -> list[dict[str, Any]]:
-        """Its rows, equal ones once."""
+        """Return the distinct rows of a table."""
         return self._asked(table, columns, "SELECT DISTINCT", needed=False)
 
     def _asked(self, table: str, columns: str, how: str, *, needed: bool) -> list[dict[str, Any]]:
@@ -289,7 +289,7 @@ def _object(text: object) -> dict[str, Any]:
 
 
 def create(path: Path) -> None:
-    """Make an empty store, whole or not at all; nothing that exists is overwritten.
+    """Create an empty store atomically. An existing file is not overwritten.
 
     Raises
     ------
@@ -308,7 +308,7 @@ def create(path: Path) -> None:
 
 
 def _name(place: Path, path: Path) -> None:
-    """Give a file its name, unless that is taken: of two that make the same store the first one stays."""
+    """Move a new file to its final name. If another process created the store first, keep that file."""
     try:
         os.link(place, path)
     except FileExistsError:
@@ -322,14 +322,14 @@ def _name(place: Path, path: Path) -> None:
 
 
 def attach_empty(connection: DuckDBPyConnection, place: Path) -> None:
-    """Make an empty store and attach it as ``fresh``."""
+    """Create an empty store, and attach it as ``fresh``."""
     write_empty(place)
     file = literal(str(place.absolute()))
     connection.execute(f"ATTACH {file} AS fresh ({_NEW})")
 
 
 def write_empty(place: Path) -> None:
-    """Make an empty store where nothing is.
+    """Create an empty store at an unused path.
 
     Raises
     ------
@@ -377,7 +377,7 @@ def _make_empty(place: Path) -> None:
 
 
 def compact(path: Path, access: Access, memory: int) -> None:
-    """Write a store anew, sorted; see :meth:`StoreFile.compact`."""
+    """Rewrite a store with sorted tables; see :meth:`StoreFile.compact`."""
     refuse_others(path, access)
     database = scratch(spill_folder(), memory=memory, threads=os.cpu_count() or 1)
     with (
@@ -393,7 +393,7 @@ def compact(path: Path, access: Access, memory: int) -> None:
 
 
 def settle(path: Path, access: Access, memory: int) -> None:
-    """Work in what a killed writer left beside a store; see :meth:`StoreFile.settle`."""
+    """Merge the log of a killed writer into a store; see :meth:`StoreFile.settle`."""
     left = [path.with_name(f"{path.name}{ending}") for ending in (".wal", ".gate")]
     if any(one.exists() for one in left):
         database = scratch(spill_folder(), memory=memory)
@@ -402,7 +402,7 @@ def settle(path: Path, access: Access, memory: int) -> None:
 
 
 def refuse_others(path: Path, access: Access) -> None:
-    """Refuse to write a store anew that holds tables or views of somebody else's.
+    """Raise an error if a store has user tables or views, which a rewrite would lose.
 
     Raises
     ------
@@ -418,7 +418,7 @@ def refuse_others(path: Path, access: Access) -> None:
 
 
 def named_as(path: Path, old: Remains) -> None:
-    """Give traces and maps of a store the names that they have in another."""
+    """Rename traces and maps of a store to their names in an old store."""
     access = Access(path)
     with scratch(spill_folder()) as connection, access.writing(connection):
         for trace in old.traces:
@@ -441,7 +441,7 @@ def named_as(path: Path, old: Remains) -> None:
 
 
 def take_place(fresh: Path, path: Path, old: Remains) -> None:
-    """Put a store in the place of an old one, which nobody else has meanwhile.
+    """Replace an old store by a new one, with exclusive access to the old store.
 
     Raises
     ------
@@ -458,7 +458,7 @@ def take_place(fresh: Path, path: Path, old: Remains) -> None:
 
 
 def _replace(path: Path, fresh: Path) -> None:
-    """Put a file in the place of a store whose log was worked in.
+    """Replace a store file whose log is already merged.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Answers as relations of DuckDB, to go on from."""
+"""Query results as DuckDB relations for further SQL."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def relation_of(write: Callable[[Path], object]) -> duckdb.DuckDBPyRelation:
-    """Make the table ``answer`` of what a function writes as Parquet, in a database of its own."""
+    """Load the output of a Parquet writer function as the table ``answer`` of a new database."""
     with working_folder("relation") as folder:
         file = folder / "answer.parquet"
         write(file)

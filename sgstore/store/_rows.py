@@ -57,21 +57,19 @@ _READS: Final = {"SELECT", "EXPLAIN"}
 
 
 class Tabular:
-    """Source of rows, as tables of other packages and as files."""
+    """Source of rows that converts to tables of other packages and to files."""
 
     def __iter__(self) -> Iterator[tuple[Any, ...]]:
         raise NotImplementedError
 
     def _described(self) -> tuple[tuple[str, ...], tuple[str, ...] | None]:
-        """Names of the columns, and their types in the database; ``None``: the values tell them."""
         raise NotImplementedError
 
     def _table(self) -> Any:
-        """The rows as Arrow, made by the database; ``None`` where Arrow has them otherwise than Python."""
         return None
 
     def arrow(self) -> Any:
-        """All rows as a ``pyarrow.Table``.
+        """Return all rows as a ``pyarrow.Table``.
 
         Raises
         ------
@@ -89,7 +87,7 @@ class Tabular:
         return arrow.table(list(arrays), names=list(names))
 
     def df(self) -> Any:
-        """All rows as a ``pandas.DataFrame``.
+        """Return all rows as a ``pandas.DataFrame``.
 
         Raises
         ------
@@ -103,7 +101,7 @@ class Tabular:
         return pandas.DataFrame.from_records(list(self), columns=list(names))
 
     def polars(self) -> Any:
-        """All rows as a ``polars.DataFrame``.
+        """Return all rows as a ``polars.DataFrame``.
 
         Raises
         ------
@@ -118,7 +116,7 @@ class Tabular:
         return polars.DataFrame([polars.Series(name, of, strict=False) for name, of in columns])
 
     def _by_values(self) -> Any:
-        """The table with the types that values of Python tell; ``None`` without pyarrow, too."""
+        """Return an Arrow table with types inferred from Python values, or ``None`` if unavailable."""
         with suppress(MissingExtraError):
             _package("pyarrow")
             table = self._table()
@@ -126,7 +124,7 @@ class Tabular:
         return None
 
     def parquet(self, path: str | Path) -> int:
-        """Write all rows to a Parquet file, as they come; how many there are.
+        """Stream all rows to a Parquet file, and return their number.
 
         Raises
         ------
@@ -137,7 +135,7 @@ class Tabular:
         return write_parquet(names, self, Path(path), types)
 
     def csv(self, path: str | Path) -> int:
-        """Write all rows to a CSV file, as they come; how many there are.
+        """Stream all rows to a CSV file, and return their number.
 
         Raises
         ------
@@ -147,7 +145,7 @@ class Tabular:
         return write_csv(self._described()[0], self, Path(path))
 
     def relation(self) -> duckdb.DuckDBPyRelation:
-        """All rows as a relation of DuckDB, to go on from: filter, join, aggregate, plot.
+        """Return all rows as a DuckDB relation, for filters, joins, aggregates and plots.
 
         ::
 
@@ -168,7 +166,7 @@ class Tabular:
 
 
 class Rows(Tabular):
-    """The result of a statement.
+    """Result of a statement.
 
     Attributes
     ----------
@@ -196,7 +194,7 @@ class Rows(Tabular):
 
     @property
     def values(self) -> list[tuple[Any, ...]]:
-        """The rows; enumerations as ``str``, NULL as ``None``."""
+        """Rows as tuples. Enumeration values are ``str``; NULL is ``None``."""
         return self._values
 
     def __repr__(self) -> str:
@@ -204,7 +202,7 @@ class Rows(Tabular):
         return f"<{len(self):,} rows{more} of {', '.join(self.columns)}>"
 
     def _repr_html_(self) -> str:
-        """The first rows as a table, for notebooks."""
+        """Return the first rows as an HTML table, for notebooks."""
         from sgstore.display import html_table
 
         some = self._values[:IN_NOTEBOOK]
@@ -221,12 +219,12 @@ class Rows(Tabular):
         return self.columns, self.types
 
     def dicts(self) -> list[dict[str, Any]]:
-        """The rows, each as a dict from column to value."""
+        """Return each row as a dict: column → value."""
         return [dict(zip(self.columns, row, strict=True)) for row in self.values]
 
 
 class LaterRows(Rows):
-    """Many rows, of which the first are known; all are asked for when they are wanted.
+    """Large result with its first rows loaded. The rest is loaded on demand.
 
     Parameters
     ----------
@@ -258,7 +256,7 @@ class LaterRows(Rows):
 
     @property
     def values(self) -> list[tuple[Any, ...]]:
-        """The rows; enumerations as ``str``, NULL as ``None``."""
+        """Rows as tuples. Enumeration values are ``str``; NULL is ``None``."""
         if not self._whole:
             self._values, self._whole = self._ask().values, True
         return self._values
@@ -267,7 +265,7 @@ class LaterRows(Rows):
         return None if self._whole else self._ask_table()
 
     def parquet(self, path: str | Path) -> int:
-        """Write all rows to a Parquet file, as they come; how many there are.
+        """Stream all rows to a Parquet file, and return their number.
 
         Raises
         ------
@@ -278,7 +276,7 @@ class LaterRows(Rows):
 
 
 class Batches:
-    """The result of a statement as a stream; each batch is :class:`Rows`.
+    """Result of a statement as a stream of batches; each batch is :class:`Rows`.
 
     Attributes
     ----------
@@ -309,7 +307,7 @@ class Batches:
         self._single = [i for i, kind in enumerate(self.types) if kind == "FLOAT" and shortened]
 
     def _told(self, values: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
-        """Rows whose numbers of 32 bits have their shortest text."""
+        """Round float32 values in the rows to the float64 with the shortest text."""
         if not self._single:
             return values
         columns = list(zip(*values, strict=True))
@@ -327,7 +325,7 @@ class Batches:
 
 
 def table_of(connection: DuckDBPyConnection, sql: str, parameters: Parameters | None = None) -> Any:
-    """All rows of a statement as a ``pyarrow.Table``, enumerations as texts.
+    """Return all rows of a statement as a ``pyarrow.Table``. Enumeration values are texts.
 
     ``None``, and nothing is searched, if a column holds anything but numbers, truth values and texts: of others
     Arrow and Python have different notions.
@@ -356,7 +354,7 @@ def _is_plain(relation: Any) -> bool:
 def as_told(
     tables: Sequence[Any], columns: Sequence[str] | None = None, most: int | None = None
 ) -> Any:
-    """Tables of Arrow as one, with the types that values of Python would tell.
+    """Concatenate Arrow tables, with the types that Python values would have.
 
     Parameters
     ----------
@@ -384,7 +382,7 @@ def as_told(
 
 
 def run(connection: DuckDBPyConnection, sql: str, parameters: Parameters | None = None) -> Rows:
-    """All rows of a statement of ours."""
+    """Run a trusted SQL statement, and return all rows."""
     values = interruptible(
         connection, lambda: connection.execute(sql, parameters or None).fetchall()
     )
@@ -392,7 +390,6 @@ def run(connection: DuckDBPyConnection, sql: str, parameters: Parameters | None 
 
 
 def _described(result: DuckDBPyConnection) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names and types of the columns of a result."""
     description = result.description or []
     return tuple(str(one[0]) for one in description), tuple(str(one[1]) for one in description)
 
@@ -400,7 +397,7 @@ def _described(result: DuckDBPyConnection) -> tuple[tuple[str, ...], tuple[str, 
 def arrays(
     connection: DuckDBPyConnection, sql: str, parameters: Parameters | None, *, plain: bool = False
 ) -> dict[str, NDArray[np.generic]]:
-    """All columns of a statement, masked where something is NULL; enumerations, unless plain, as texts."""
+    """Return all columns as arrays with NULL masked. Enumerations become texts unless ``plain`` is true."""
     given = parameters or None
     described = [] if plain else connection.execute(f"DESCRIBE {sql}", given).fetchall()
     listed = [quoted(str(row[0])) for row in described if "ENUM" in str(row[1])]
@@ -418,7 +415,7 @@ def arrays(
 def user_statement(
     connection: DuckDBPyConnection, sql: str, timeout_s: float | None, ask: Callable[[], T]
 ) -> Generator[T]:
-    """Run a statement of a user's on a connection that can read the store and nothing else, by its views.
+    """Run a user's SQL statement on a connection that can read only the store and its views.
 
     ``ask`` begins it; what is read of it is read before this is left.
 
@@ -449,7 +446,7 @@ def _check(connection: DuckDBPyConnection, sql: str) -> None:
 
 @contextmanager
 def _refused(sql: str, timeout_s: float | None) -> Generator[None]:
-    """Errors of DuckDB as errors of the user's statement."""
+    """Convert DuckDB errors to errors of the user's statement."""
     try:
         yield
     except duckdb.InterruptException as error:
@@ -475,7 +472,7 @@ def _shown(sql: str) -> str:
 
 @contextmanager
 def _interrupted_after(connection: DuckDBPyConnection, timeout_s: float | None) -> Generator[None]:
-    """Stop whatever the connection does when the time is up; again and again, until the block is left."""
+    """Interrupt the connection after a timeout, repeatedly, until the block ends."""
     if timeout_s is None:
         yield
         return
@@ -527,7 +524,7 @@ def _package(name: str) -> Any:
 
 
 def write_csv(columns: Sequence[str], rows: Iterable[Sequence[Any]], to: Path) -> int:
-    """Write rows to a CSV file; what is missing is empty, lists and dicts are JSON.
+    """Write rows to a CSV file. Missing values are empty; lists and dicts are JSON.
 
     Returns
     -------
@@ -550,7 +547,7 @@ def write_csv(columns: Sequence[str], rows: Iterable[Sequence[Any]], to: Path) -
 
 
 def arrow_file(source: Path, to: Path) -> None:
-    """A Parquet file as a file of Arrow (IPC, Feather 2), batch by batch.
+    """Convert a Parquet file to an Arrow file (IPC, Feather 2), batch by batch.
 
     Raises
     ------
@@ -572,7 +569,7 @@ def arrow_file(source: Path, to: Path) -> None:
 
 
 def _columns(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[list[Any]]:
-    """Rows as columns. Some rows at a time: what was made together lies together in memory."""
+    """Transpose rows to columns in batches, which keeps related values close in memory."""
     found: list[list[Any]] = [[] for _ in columns]
     rows = iter(rows)
     while batch := list(islice(rows, BATCH)):
@@ -582,7 +579,6 @@ def _columns(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[list
 
 
 def _cell(value: Any) -> Any:
-    """A value as CSV has it: lists and dicts as JSON, control characters as escapes."""
     if isinstance(value, list | tuple | dict):
         value = json.dumps(value, ensure_ascii=False, default=str)
     return "" if value is None else without_controls(value) if isinstance(value, str) else value
@@ -600,7 +596,7 @@ _TYPES: Final = ((bool, "BOOLEAN"), (int, "BIGINT"), ((int, float), "DOUBLE"))
 
 
 class ParquetTable:
-    """A Parquet file that is written a block of rows at a time; to be used in a ``with``.
+    """Parquet file, written in blocks of rows. Use it as a context manager.
 
     What the blocks add up to waits in a file of its own, not in memory. The same blocks are the same bytes.
 
@@ -664,7 +660,7 @@ class ParquetTable:
                 )
 
     def add(self, columns: Mapping[str, NDArray[Any] | Sequence[Any]]) -> None:
-        """Add rows.
+        """Append rows given as columns.
 
         Parameters
         ----------
@@ -679,13 +675,13 @@ class ParquetTable:
         self._add([columns[name] for name in self._columns])
 
     def add_rows(self, rows: Iterable[Sequence[Any]]) -> None:
-        """Add rows of plain Python values, ``None`` where one is missing; see :meth:`add`."""
+        """Append rows of Python values; ``None`` means missing. See :meth:`add`."""
         rows = iter(rows)
         while batch := list(islice(rows, _TOGETHER)):
             self._add([[row[i] for row in batch] for i in range(len(self._columns))])
 
     def add_arrow(self, block: Any) -> None:
-        """Add the rows of a ``pyarrow.Table``, whose columns have distinct names; see :meth:`add`."""
+        """Append the rows of a ``pyarrow.Table`` with distinct column names; see :meth:`add`."""
         self._insert(block, len(block))
 
     def _add(self, columns: Sequence[NDArray[Any] | Sequence[Any]]) -> None:
@@ -721,7 +717,7 @@ def write_parquet(
     to: Path,
     types: Sequence[str] | None = None,
 ) -> int:
-    """Write rows to a Parquet file; one that is there is replaced.
+    """Write rows to a Parquet file. An existing file is replaced.
 
     Parameters
     ----------
@@ -760,7 +756,7 @@ def write_parquet(
 def record_batches(
     connection: DuckDBPyConnection, sql: str, parameters: Parameters | None = None
 ) -> ArrowStream | None:
-    """Columns of a statement, and its rows as batches of Arrow, one in memory at a time.
+    """Return the columns of a statement, and a stream of Arrow batches, one in memory at a time.
 
     ``None``, and nothing is searched: pyarrow is not installed, or a column is not plain (:func:`table_of`).
     """
@@ -788,7 +784,7 @@ def record_batches(
 
 
 def as_told_batches(columns: Sequence[str], stream: ArrowStream) -> ArrowStream:
-    """A stream whose columns have other names, and the types that :func:`write_parquet` tells by values."""
+    """Return an Arrow stream with new column names and with the types that Python values would have."""
     (named, batches), first, rows = stream, list[Any](), 0
     for batch in batches:
         first.append(batch)
@@ -805,7 +801,7 @@ def as_told_batches(columns: Sequence[str], stream: ArrowStream) -> ArrowStream:
 
 
 def write_batches(stream: ArrowStream, to: Path) -> int:
-    """Write batches of Arrow to a Parquet file, as :func:`write_parquet` writes rows; how many rows there are.
+    """Write Arrow batches to a Parquet file like :func:`write_parquet`, and return the number of rows.
 
     Raises
     ------
@@ -823,7 +819,6 @@ def write_batches(stream: ArrowStream, to: Path) -> int:
 
 
 def _without_nan(column: Any) -> Any:
-    """A column of Arrow in which numbers that are none are missing, as in what Python values become."""
     compute = import_module("pyarrow.compute")
     if not import_module("pyarrow").types.is_floating(column.type):
         return column
@@ -841,7 +836,7 @@ def _type_of(values: list[Any]) -> str:
 
 
 def count_parquet(file: Path) -> tuple[int, tuple[str, ...]]:
-    """Count the rows of a Parquet file, and name its columns; it is read again as a whole.
+    """Read a whole Parquet file, and return its number of rows and its column names.
 
     Raises
     ------
@@ -868,7 +863,7 @@ def give_to_user(
     sql: str,
     timeout_s: float | None,
 ) -> None:
-    """Make tables for a statement of a user's, by statements of ours.
+    """Create temporary tables for a user's SQL statement, by trusted statements.
 
     Raises
     ------

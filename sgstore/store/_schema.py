@@ -1,4 +1,4 @@
-"""Comparison of the tables and views of a store, from whomever, with those that ``schema.sql`` makes.
+"""Check of a store's tables and views against ``schema.sql``. The store may be from an untrusted source.
 
 A file that a stranger sends may hold a view in the place of a table, a macro that is called like a function,
 a trigger. So before anything is read of a store, its catalogue is compared with the one that ``schema.sql``
@@ -55,7 +55,7 @@ _SYSTEM: Final = frozenset({"information_schema", "pg_catalog", "system", "temp"
 
 @cache
 def schema_sql() -> str:
-    """The text of ``schema.sql``: types, tables and views."""
+    """Return the text of ``schema.sql``: types, tables and views."""
     text = resources.files("sgstore").joinpath("schema.sql").read_text(encoding="utf-8")
     for view in ("pairs", "criticality"):
         made, numbers = pairs_view(view)
@@ -96,12 +96,11 @@ _VIEWS_BEYOND: Final[Mapping[str, Mapping[str, str]]] = {
 
 
 def _between(text: str, before: str, behind: str) -> str:
-    """The part of a text between two others."""
     return text.partition(f"CREATE {before}")[2].partition(behind)[0].strip()
 
 
 def schema_version() -> str:
-    """The version that the head of ``schema.sql`` says."""
+    """Return the version in the header of ``schema.sql``."""
     found = _HEAD.match(schema_sql())
     if found is None:
         raise ValueError("the head of schema.sql says no version")
@@ -117,25 +116,25 @@ TEXT: Final = (
 
 @cache
 def schema_digest() -> str:
-    """SHA-256 of the statements of ``schema.sql``: it stays the same if comments change."""
+    """Return the SHA-256 of the statements of ``schema.sql``. Comments do not change it."""
     text, known = TEXT
     return known if text_digest() == text else statements_digest()
 
 
 def text_digest() -> str:
-    """SHA-256 of the text of ``schema.sql``."""
+    """Return the SHA-256 of the text of ``schema.sql``."""
     return hashlib.sha256(schema_sql().encode()).hexdigest()
 
 
 def statements_digest() -> str:
-    """SHA-256 of the statements of ``schema.sql``, worked out."""
+    """Compute the SHA-256 of the statements of ``schema.sql``, without comments."""
     made = ["\0".join(words) for words in _statements() if words[0] != "COMMENT"]
     return hashlib.sha256("\n".join(made).encode()).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """Tables, views and types of ``schema.sql``, by name.
+    """Tables, views and types of ``schema.sql`` by name.
 
     Attributes
     ----------
@@ -153,7 +152,7 @@ class Shape:
 
 @cache
 def expected(*wider: tuple[str, Tokens]) -> Shape:
-    """Return the shape that ``schema.sql`` makes, with other values of enumerations if they are given."""
+    """Return the shape that ``schema.sql`` creates, optionally with extended enumerations."""
     tables: dict[str, Tokens] = {}
     types: dict[str, Tokens] = {}
     views: dict[str, dict[str, str]] = {"main": {}, INSIDE: {}}
@@ -173,7 +172,7 @@ _written: dict[str, Tokens] = {}
 
 
 def _expected_views(connection: DuckDBPyConnection) -> dict[str, Tokens]:
-    """The views of ``schema.sql`` as this version of the database writes them down."""
+    """Return the views of ``schema.sql`` in the text form of this DuckDB version."""
     if not _written:
         views = expected().views | expected().inner
         rows = connection.execute(
@@ -187,7 +186,7 @@ def _expected_views(connection: DuckDBPyConnection) -> dict[str, Tokens]:
 
 
 def check(connection: DuckDBPyConnection, database: str, path: Path) -> None:
-    """Refuse a database that is no store, one of another version, and one that somebody has altered.
+    """Reject a database that is not a store, has another version, or was altered.
 
     Parameters
     ----------
@@ -217,7 +216,7 @@ _REMEDY: Final = "'sgstore rebuild' makes it anew from its recordings"
 
 
 def looked_at(connection: DuckDBPyConnection, path: Path) -> tuple[list[str], tuple[str, ...]]:
-    """List all that :func:`check` would refuse, and the tables and views that are none of ours.
+    """Return all faults that :func:`check` rejects, and the names of user tables and views.
 
     Raises
     ------
@@ -232,7 +231,7 @@ def looked_at(connection: DuckDBPyConnection, path: Path) -> tuple[list[str], tu
 
 
 def database_of(connection: DuckDBPyConnection) -> str:
-    """The name under which a connection that opened a file has it."""
+    """Return the database name of the file that a connection has open."""
     sql = "SELECT database_name FROM system.main.duckdb_databases() WHERE internal = false"
     ((name,),) = connection.execute(sql).fetchall()
     return name
@@ -252,7 +251,7 @@ def _about(
 def about_store(
     connection: DuckDBPyConnection, database: str, objects: Objects
 ) -> dict[str, str] | None:
-    """Read version and digest of a store's schema from it; ``None`` if it is no store."""
+    """Return version and digest of a store's schema. ``None`` means that the file is not a store."""
     schema = schema_of(objects)
     told = _info_of(objects).get(schema)
     if told is None:
@@ -267,12 +266,12 @@ def about_store(
 
 
 def schema_of(objects: Objects) -> str:
-    """Return the schema in which a store has its tables: stores of before have them among the views."""
+    """Return the schema with a store's tables. Old stores have tables and views in one schema."""
     return INSIDE if INSIDE in _info_of(objects) else "main"
 
 
 def _info_of(objects: Objects) -> dict[str, str]:
-    """The statement of the table that says what a store is, by the schema where it stands."""
+    """Return the CREATE statement of table ``store_info`` for each schema that contains it."""
     return {
         schema: str(told)
         for what, schema, name, told in objects
@@ -281,7 +280,7 @@ def _info_of(objects: Objects) -> dict[str, str]:
 
 
 def other_version(about: dict[str, str]) -> str:
-    """Return the message for a store whose schema is not this one; empty if it is."""
+    """Return the message for a store with another schema version, or an empty string."""
     held, maker = (
         about.get("schema_version", "unknown"),
         about.get("created_by", "an unknown version"),
@@ -298,7 +297,7 @@ def other_version(about: dict[str, str]) -> str:
 
 
 def altered(connection: DuckDBPyConnection, database: str) -> list[str]:
-    """List our tables, views and types that differ from ``schema.sql``, and others' that shadow them.
+    """Return faults: tables, views and types that differ from ``schema.sql``, and objects that shadow them.
 
     Kinds, relations and states of lights may have come to those of ``schema.sql``; they are made known here.
     """
@@ -329,18 +328,17 @@ What another version tells otherwise is compared word by word.
 
 
 def digest_of(objects: Objects) -> str:
-    """Return the SHA-256 of the text of ``schema.sql`` and of all that was read of a store's objects."""
+    """Return the SHA-256 of ``schema.sql`` and of a store's objects together."""
     return hashlib.sha256(repr((schema_sql(), sorted(objects))).encode()).hexdigest()
 
 
 @lru_cache(maxsize=_MOST_COMPARED)
 def _is_known(objects: Objects) -> bool:
-    """Tell whether the objects of a store are those that this package makes, to the letter."""
     return digest_of(objects) == KNOWN
 
 
 def _changed(objects: Objects, views: dict[str, Tokens]) -> Iterator[str]:
-    """Objects that are not as ``schema.sql`` makes them, or stand where others of it are looked for."""
+    """Yield faults: objects that differ from ``schema.sql``, or are in the wrong place."""
     made = _made(objects)
     types = made["type", "main"]
     shape = expected(
@@ -366,17 +364,16 @@ def _changed(objects: Objects, views: dict[str, Tokens]) -> Iterator[str]:
 
 @cache
 def own_labels(enum: str) -> tuple[str, ...]:
-    """Return the values of an enumeration of ``schema.sql``."""
+    """Return the values of an enumeration in ``schema.sql``."""
     return _labels(expected().types[enum])
 
 
 def _labels(words: Tokens) -> tuple[str, ...]:
-    """The values of an enumeration, given its words."""
     return tuple(word[1:-1].replace("''", "'") for word in words if word.startswith("'"))
 
 
 def labels_of(connection: DuckDBPyConnection, database: str, enum: str) -> tuple[str, ...]:
-    """Return the values of an enumeration of a store, by their codes there; none if there is no such type."""
+    """Return the values of a store's enumeration in code order. A missing type has no values."""
     rows = connection.execute(
         "SELECT labels FROM system.main.duckdb_types() WHERE database_name = ?"
         " AND schema_name = ? AND type_name = ? AND internal = false",
@@ -386,13 +383,13 @@ def labels_of(connection: DuckDBPyConnection, database: str, enum: str) -> tuple
 
 
 def others_of(connection: DuckDBPyConnection, enum: str) -> tuple[str, ...]:
-    """Return the values of an enumeration of an open store beside those of ``schema.sql``."""
+    """Return the values of an open store's enumeration that ``schema.sql`` lacks."""
     ((labels,),) = connection.execute(f"SELECT enum_range(NULL::{enum})").fetchall()
     return tuple(labels[len(own_labels(enum)) :])
 
 
 def codes_of(connection: DuckDBPyConnection, enum: str) -> NDArray[np.int8]:
-    """Return the codes in this process of the values of an enumeration of a store, by their codes there."""
+    """Return a lookup table: enumeration code in the store → code in this process."""
     ((labels,),) = connection.execute(f"SELECT enum_range(NULL::{enum})").fetchall()
     return np.array([learn(enum, label) for label in labels], np.int8)
 
@@ -400,7 +397,7 @@ def codes_of(connection: DuckDBPyConnection, enum: str) -> NDArray[np.int8]:
 def widen(
     connection: DuckDBPyConnection, database: str, names: Mapping[str, Iterable[str]]
 ) -> None:
-    """Let the enumerations of a database that is attached hold these values, too."""
+    """Add values to the enumerations of an attached database."""
     inside = f"{quoted(database)}.{INSIDE}"
     for enum, wanted in names.items():
         labels = labels_of(connection, database, enum)
@@ -417,7 +414,7 @@ def widen(
 
 @cache
 def enums_of(table: str) -> Mapping[str, str]:
-    """Return the columns of a table of ``schema.sql`` that are of an enumeration, and which."""
+    """Return the enumeration columns of a table in ``schema.sql``: column → enumeration."""
     words = next((words for words in _statements() if words[1:3] == ("TABLE", table)), ())
     return {
         column: what
@@ -427,7 +424,7 @@ def enums_of(table: str) -> Mapping[str, str]:
 
 
 def code_sql(column: str, enum: str) -> str:
-    """Return SQL of a number for a value of an enumeration that is the same in every store."""
+    """Return SQL that maps an enumeration value to the same number in every store."""
     code, words = f"enum_code({column}::{enum})", tuple(_words(enum))
     own = next(own for own in expected().types.values() if words[: len(own) - 1] == own[:-1])
     if words == own:
@@ -438,7 +435,7 @@ def code_sql(column: str, enum: str) -> str:
 
 
 def _strange(objects: Objects) -> Iterator[str]:
-    """The values of enumerations that this process cannot take."""
+    """Yield faults: enumeration values that this process cannot register."""
     labels = {
         name: told for what, schema, name, told in objects if (what, schema) == ("type", "main")
     }
@@ -451,7 +448,7 @@ def _strange(objects: Objects) -> Iterator[str]:
 
 
 def others(objects: Objects) -> list[str]:
-    """Tables and views in a store that are none of ours, sorted."""
+    """Return the sorted names of user tables and views in a store."""
     inside = schema_of(objects)
     ours = {(inside, name) for name in (*expected().tables, *expected().inner)}
     ours |= {("main", name) for name in expected().views}
@@ -467,7 +464,7 @@ def others(objects: Objects) -> list[str]:
 
 @cache
 def _statements() -> tuple[Tokens, ...]:
-    """The statements of ``schema.sql``, as words."""
+    """Return the statements of ``schema.sql`` as tokens."""
     found: list[list[str]] = [[]]
     for word in _words(schema_sql()):
         if word == ";":
@@ -478,7 +475,7 @@ def _statements() -> tuple[Tokens, ...]:
 
 
 def _words(sql: str) -> list[str]:
-    """A statement as words: without comments, marks around plain names, and casts of constants."""
+    """Split a statement into tokens, without comments, quotes of plain names, and casts of constants."""
     found: list[str] = []
     for match in _TOKEN.finditer(sql):
         word = match[0]
@@ -500,13 +497,12 @@ def _words(sql: str) -> list[str]:
 
 @lru_cache(maxsize=256)
 def _statement(sql: str) -> Tokens:
-    """A statement as words, without the schema; those of one store are mostly those of the next."""
     words = _words(sql)
     return tuple(words[:2] + words[4:] if words[3:4] == ["."] else words)
 
 
 def _with_types(words: Tokens, types: dict[str, Tokens]) -> Iterator[str]:
-    """The words of a table, its types as the database writes them down: enumerations with all their values."""
+    """Yield the tokens of a table, with each enumeration expanded to all its values, as DuckDB prints it."""
     before = ""
     for number, word in enumerate(words):
         # A type stands behind the name of a column, which may be called like it.
@@ -519,7 +515,7 @@ def _with_types(words: Tokens, types: dict[str, Tokens]) -> Iterator[str]:
 
 
 def objects_of(connection: DuckDBPyConnection, database: str) -> Objects:
-    """Read the tables, views and types of a database: kind, schema, name, and statement or values of each."""
+    """Return tables, views and types of a database: (kind, schema, name, statement or values)."""
     found: list[tuple[str, str, str, str | Tokens]] = []
     for what, told in (("table", "sql"), ("view", "sql"), ("type", "labels")):
         rows = connection.execute(
@@ -534,7 +530,7 @@ def objects_of(connection: DuckDBPyConnection, database: str) -> Objects:
 
 
 def _made(objects: Objects) -> Mapping[tuple[str, str], dict[str, Tokens]]:
-    """The tables, views and types of our schemas, by what they are and the schema: statements by name."""
+    """Return the store's objects by (kind, schema): name → tokens of the statement."""
     found: dict[tuple[str, str], dict[str, Tokens]] = defaultdict(dict)
     for what, schema, name, told in objects:
         if schema not in {"main", INSIDE}:
@@ -553,7 +549,7 @@ def _enum(labels: Iterable[str]) -> str:
 def _differing(
     what: str, wanted: dict[str, Tokens], there: dict[str, Tokens], instead: dict[str, Tokens]
 ) -> Iterator[str]:
-    """Objects that are missing, something else, or others than they should be."""
+    """Yield faults: objects that are missing, of the wrong kind, or different."""
     for name, words in wanted.items():
         found = there.get(name)
         if found is None:
@@ -564,7 +560,7 @@ def _differing(
 
 
 def _misplaced(objects: Objects, shape: Shape) -> Iterator[str]:
-    """Tables and views of somebody else's that are called like ours and would be found in their place."""
+    """Yield faults: user tables and views whose names hide objects of the schema."""
     for schema, name in sorted(
         (schema, name) for what, schema, name, _ in objects if what != "type"
     ):
@@ -575,7 +571,7 @@ def _misplaced(objects: Objects, shape: Shape) -> Iterator[str]:
 
 
 def _shadowing(connection: DuckDBPyConnection, database: str) -> Iterator[str]:
-    """Macros and schemas that are called like what the database has itself."""
+    """Yield faults: macros and schemas with the names of built-in database objects."""
     macros = connection.execute(
         "SELECT function_name FROM system.main.duckdb_functions() WHERE database_name = ?",
         [database],
@@ -598,7 +594,7 @@ def _shadowing(connection: DuckDBPyConnection, database: str) -> Iterator[str]:
 
 
 def _attached(connection: DuckDBPyConnection, database: str) -> Iterator[str]:
-    """Triggers and indexes on tables of ours."""
+    """Yield faults: triggers and indexes on tables of the schema."""
     for what in ("trigger", "index"):
         plural = {"trigger": "triggers", "index": "indexes"}[what]
         try:

@@ -1,4 +1,4 @@
-"""Frames like one that is given: those whose graphs are the same in an abstraction, and then the most like."""
+"""Search for frames like an example: first frames with equal graphs, then the most similar frames."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class SimilarFrames:
-    """Consecutive frames of a trace that are as like an example as each other, for the same reasons.
+    """Consecutive frames of a trace with the same similarity to an example, for the same reasons.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class SimilarFrames:
 
 @dataclass(slots=True)
 class _FrameRun:
-    """Frames that follow one another with the same features, and the same class if they have all."""
+    """Consecutive frames with equal features. If they match all features, their class is equal too."""
 
     key: tuple[Any, ...]
     similarity: float
@@ -89,7 +89,7 @@ class _FrameRun:
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """What frames are compared with: plain values, which a store elsewhere understands.
+    """Example frame for a similarity search, as plain values that work in any store.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ BESIDE_S: Final = 5.0
 
 
 def example_of(file: StoreFile, ref: int | str, name: str, ignored: Sequence[str]) -> Example:
-    """A frame as an example.
+    """Return a frame as a search example.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def example_of(file: StoreFile, ref: int | str, name: str, ignored: Sequence[str
 def frames_like(
     file: StoreFile, example: Example, limit: int, *, each_trace: bool = False
 ) -> list[SimilarFrames]:
-    """Runs of frames, the most like an example first, then by name of the trace and time.
+    """Return runs of similar frames, most similar first, then by trace name and time.
 
     Memory does not grow with the store: graphs are read window by window.
 
@@ -181,7 +181,7 @@ def frames_like(
 
 
 def most_like(found: Iterable[SimilarFrames], limit: int) -> list[SimilarFrames]:
-    """The first of what several stores found, in the order in which one with all their traces has them."""
+    """Return the best results of several stores, in the order of a single combined store."""
 
     def place(one: SimilarFrames) -> tuple[Any, ...]:
         likeness = one.similarity + (one.same is True)
@@ -198,14 +198,14 @@ def _blocks(
 
 
 def _beside(connection: DuckDBPyConnection, frame: FrameRef) -> tuple[int, int]:
-    """Numbers of the frames around one, itself among them."""
+    """Return the first and last number of the frames near a frame in time."""
     sql = "SELECT min(seq), max(seq) FROM frames WHERE trace_id = ? AND abs(t - ?) < ?"
     found = connection.execute(sql, [frame.trace_id, frame.t, BESIDE_S]).fetchone()
     return found or (0, -1)
 
 
 class _RunSearch:
-    """The best runs so far, of all or of each trace, in a heap whose first is the worst of them."""
+    """Search for the best runs, overall or per trace, with a heap whose first item is the worst."""
 
     def __init__(self, example: Example, limit: int, *, each_trace: bool) -> None:
         self.example = Counter(example.features)
@@ -219,7 +219,7 @@ class _RunSearch:
     def look(
         self, trace: int, seq: NDArray[np.int64], graphs: Labelled, left_out: range = range(0)
     ) -> None:
-        """Take up the next frames of a trace, but for some."""
+        """Add the next frames of a trace, except some frame numbers."""
         features = GraphFeatures.of(graphs)
         likeness, digest = features.likeness(self.example), features.digests()
         same: list[bool | None] = [False] * graphs.frames
@@ -257,7 +257,7 @@ class _RunSearch:
             )
 
     def close(self) -> None:
-        """The last run is over."""
+        """Close the last run, and keep it if it is good enough."""
         run, self._last = self._last, None
         if run is None or not self._wanted(run.trace, run.similarity):
             return
@@ -280,7 +280,7 @@ class _RunSearch:
         return bool(self._limit) and similarity + (similarity == 1) > self._heap[0][0]
 
     def best(self) -> list[_FrameRun]:
-        """The best runs, the best one first."""
+        """Return the best runs in descending order."""
         every = self._heap if self._each is None else self._each.values()
         ordered = sorted(every, key=lambda e: e[:-1], reverse=True)
         return [entry[-1] for entry in ordered[: self._limit]]
@@ -309,7 +309,7 @@ def _sorted(counts: Counter[str]) -> dict[str, int]:
 
 
 def _check(ignored: Sequence[str], graphs: Labelled) -> None:
-    """Refuse what nothing is called: neither in the vocabulary nor in the example."""
+    """Reject a name to ignore that occurs neither in the vocabulary nor in the example."""
     known = {*RELATIONS, *RELATION_ALIASES, *graphs.labels, *labels()}
     folds = {name.replace("_", "").lower() for name in known}
     for name in ignored:

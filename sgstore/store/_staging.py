@@ -1,4 +1,4 @@
-"""Staged tables of a trace: arrays that wait in a file beside the store until they are published.
+"""Staged tables of a trace: arrays in a file next to the store, until publication.
 
 The tables that grow with a trace are cut into parts of some ten thousand rows, each sorted as the store is and
 written behind the others, so that memory does not grow. In the end all tables are in one file, with a checksum
@@ -59,7 +59,7 @@ _PLAIN: Final = frozenset({"|b1", "|i1", "<i2", "<i4", "<i8", "<f4", "<f8"})
 
 
 class Piece(NamedTuple):
-    """Some rows of a table in a file.
+    """Group of rows of a table in a staging file.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ class Piece(NamedTuple):
 
 
 class TableFile:
-    """Rows of tables in a file that only this package writes and reads; nothing in it is trusted to be code.
+    """Private file of table rows. Its content is never run as code.
 
     Parameters
     ----------
@@ -106,13 +106,13 @@ class TableFile:
         return StoreError(f"{self._store}: what waits beside it {what}{reason}")
 
     def close(self) -> None:
-        """Close the file. What is in it stays."""
+        """Close the file. Its content stays."""
         self._file.close()
 
     def append(
         self, table: str, columns: Columns, texts: Mapping[str, list[str]] | None = None
     ) -> Piece:
-        """Write rows behind the others; ``texts`` are those that indices stand for, by column."""
+        """Append rows. ``texts`` maps each text column to the texts behind its indices."""
         rows = len(next(iter(columns.values())))
         about: dict[str, dict[str, Any]] = {}
         body: list[NDArray[Any]] = []
@@ -151,28 +151,28 @@ class TableFile:
 
     @property
     def size(self) -> int:
-        """Bytes in the file."""
+        """Size of the file in bytes."""
         return self._size
 
     def behind(self, at: int) -> bytes:
-        """All that stands in the file from a place on."""
+        """Return the bytes of the file from an offset to the end."""
         return self._bytes(at, self._size - at)
 
     def adopt(self, pieces: bytes) -> None:
-        """Write pieces of another file behind the others; only who reads the file again finds them."""
+        """Append raw pieces of another file. This object does not list them; a new reader does."""
         self._write(pieces)
         self._size += len(pieces)
 
     def pieces(self, table: str) -> list[Piece]:
-        """The pieces of a table, in the order in which they were written."""
+        """Return the pieces of a table in writing order."""
         return [piece for piece in self._pieces if piece.table == table]
 
     def all(self) -> list[Piece]:
-        """All pieces, in the order in which they were written."""
+        """Return all pieces in writing order."""
         return list(self._pieces)
 
     def read(self, piece: Piece, first: int = 0, end: int | None = None) -> Columns:
-        """Columns of some rows of a piece.
+        """Return the columns of a range of rows in a piece.
 
         Raises
         ------
@@ -184,7 +184,7 @@ class TableFile:
     def column(
         self, piece: Piece, name: str, first: int = 0, end: int | None = None
     ) -> NDArray[Any]:
-        """One of these columns."""
+        """Return one column of a range of rows in a piece."""
         about, end = piece.columns[name], piece.rows if end is None else end
         if about["type"] not in _PLAIN:
             raise self._wrong("is none of ours")
@@ -200,7 +200,7 @@ class TableFile:
         return values.astype(np.int64) + about["base"] if "base" in about else values
 
     def values(self, piece: Piece, name: str, first: int, end: int) -> NDArray[Any]:
-        """One of them with its texts, whether the piece has it or not."""
+        """Return one column with texts in place of indices. A column that the piece lacks is all missing."""
         if name not in piece.columns:
             texts = types_of(piece.table)[name] in TEXTS
             count = end - first
@@ -211,7 +211,7 @@ class TableFile:
         return np.array([*self._texts(piece, name), ""], object)[values]
 
     def texts(self, piece: Piece) -> dict[str, list[str]]:
-        """The texts that indices of a piece stand for, by column."""
+        """Return the texts behind the indices of a piece, by column."""
         return {
             name: self._texts(piece, name)
             for name in piece.columns
@@ -235,7 +235,7 @@ class TableFile:
         return data
 
     def _look(self) -> None:
-        """Read the lines of a file that is there."""
+        """Read the headers of an existing file."""
         at = 0
         while at < self._size:
             length = int.from_bytes(self._bytes(at, _HEAD), "little")
@@ -250,7 +250,7 @@ class TableFile:
 
 
 def _narrowed(values: NDArray[Any]) -> tuple[dict[str, Any], NDArray[Any] | None]:
-    """Values with as few bytes as are easily had: what is said of them, and what is written."""
+    """Encode values in few bytes. Return the description and the array to write."""
     kind = values.dtype.newbyteorder("<").str
     values = np.ascontiguousarray(values)
     if values.dtype.kind == "f":
@@ -300,7 +300,7 @@ _RUNS: Final = {
 
 
 class StagedRows(NamedTuple):
-    """Rows of whole tables, as a :class:`Staging` has written them.
+    """Rows of whole tables, written by a :class:`Staging`.
 
     ``words``: enumeration → values in them that ``schema.sql`` has not.
     """
@@ -311,7 +311,7 @@ class StagedRows(NamedTuple):
 
 
 class Staging:
-    """The tables of one trace.
+    """Staged tables of one trace.
 
     Parameters
     ----------
@@ -348,14 +348,14 @@ class Staging:
             raise
 
     def close(self) -> None:
-        """Forget the tables in memory, and the file if the folder is its own."""
+        """Discard the tables in memory. Remove the folder if this object created it."""
         self._waiting.clear()
         self._file.close()
         if self._own is not None:
             self._own.remove()
 
     def insert(self, table: str, columns: Columns) -> None:
-        """Append rows to a table. What is missing is not finite, :data:`MISSING`, or empty."""
+        """Append rows to a table. Missing values are non-finite, :data:`MISSING`, or empty."""
         rows = len(next(iter(columns.values())))
         if not rows:
             return
@@ -379,7 +379,7 @@ class Staging:
         return np.array(found, np.int32)
 
     def _learn(self, enum: str, codes: NDArray[Any]) -> None:
-        """Take note of values of an enumeration that ``schema.sql`` has not."""
+        """Collect enumeration values that ``schema.sql`` lacks."""
         own = len(own_labels(enum))
         if codes.max() < own:
             return
@@ -388,24 +388,24 @@ class Staging:
         noted += [name for name in found if name not in noted]
 
     def words(self, answers: Iterable[str]) -> dict[str, list[str]]:
-        """Enumeration → values that a store must be able to hold: relations that are answered, what is new."""
+        """Return the enumeration values that the store must support: enumeration → values."""
         relations = sorted({*answers, *self._new.get("relation", ())})
         return {**self._new, "relation": relations}
 
     def shared(self) -> StagedRows:
-        """Write all tables so far, and return their rows for other stagings. No rows come to these any more."""
+        """Write all tables, and return their rows for other stagings. These tables must not grow afterwards."""
         for table in [*self._waiting]:
             self.write(table)
         return StagedRows(self._file.behind(0), dict(self.checksums), dict(self._new))
 
     def adopt(self, rows: StagedRows) -> None:
-        """Take tables that another staging settled, before any other rows."""
+        """Take the shared tables of another staging, before any other rows."""
         self._file.adopt(rows.pieces)
         self.checksums.update(rows.checksums)
         self._new.update({enum: [*names] for enum, names in rows.words.items()})
 
     def mark(self, table: str, name: str, values: NDArray[Any]) -> None:
-        """Add a column to the rows of a table that does not grow."""
+        """Add a column to the rows of a complete table."""
         first = 0
         for staged in self._waiting[table]:
             rows = len(next(iter(staged.values())))
@@ -413,7 +413,7 @@ class Staging:
             first += rows
 
     def settle(self, *, whole: bool) -> None:
-        """Make room if the tables have grown; called between blocks.
+        """Write large tables to the file to free memory. Called between blocks.
 
         Parameters
         ----------
@@ -428,7 +428,7 @@ class Staging:
             self._texts[True] = {"": -1}
 
     def _merge(self, table: str) -> None:
-        """Make one row of the pieces of a mask; if these are many still, they wait in the file."""
+        """Merge rows that differ only in their masks. Write them to the file if many remain."""
         merged = self._gathered(table)
         rows = len(merged["mask"])
         self._waiting[table], self._rows[table] = [merged], rows
@@ -438,14 +438,13 @@ class Staging:
             self._rows[table] = 0
 
     def _gathered(self, table: str) -> Columns:
-        """The rows of a table that are in memory, sorted."""
         return in_order(table, chained(table, self._waiting.pop(table)), self._texts_of(table))
 
     def _texts_of(self, table: str) -> list[str]:
         return list(self._texts[table in _CUT])[1:]
 
     def write(self, table: str) -> None:
-        """Write the rows of a table that wait, and forget them."""
+        """Write the waiting rows of a table to the file, and free their memory."""
         texts = self._texts_of(table)
         if self._runs[table]:
             if self._waiting[table]:
@@ -481,7 +480,7 @@ class Staging:
             self._file.append(table, some, said)
 
     def _merged_runs(self, table: str, runs: list[Piece]) -> Iterator[Columns]:
-        """The rows of sorted runs, sorted: those with one value in the first column at a time."""
+        """Merge sorted runs. Yield the rows of one value of the first column at a time."""
         name, texts = _RUNS[table], self._texts_of(table)
         firsts = [self._file.column(run, name) for run in runs]
         for value in np.unique(np.concatenate([np.unique(first) for first in firsts])).tolist():
@@ -495,13 +494,13 @@ class Staging:
             yield in_order(table, chained(table, found), texts)
 
     def messages(self) -> Iterator[Columns]:
-        """All messages, some at a time."""
+        """Yield all messages in groups."""
         for piece in self._file.pieces("message"):
             yield self._file.read(piece)
         yield from self._waiting["message"]
 
     def seal(self) -> None:
-        """Write everything into the file; nothing can be added then."""
+        """Write all tables to the file, and close it for additions."""
         for table in [*self._waiting, *self._runs]:
             self.write(table)
         self._file.close()
@@ -516,7 +515,7 @@ MEMORY: Final = 48 << 20
 
 
 def scratch(spill: Path, *, memory: int = 0, threads: int = 1) -> DuckDBPyConnection:
-    """A database in memory that may attach files; what does not fit goes into a folder that need not exist.
+    """Open an in-memory database that can attach files. It spills to a folder, which it creates if needed.
 
     Parameters
     ----------
@@ -546,7 +545,7 @@ _SAID: Final = "sealed.json"
 
 @dataclass(frozen=True, slots=True)
 class Sealed:
-    """A segment that is complete. It needs nothing of the process that built it.
+    """Complete segment. It does not depend on the process that built it.
 
     Attributes
     ----------
@@ -571,7 +570,7 @@ class Sealed:
     words: dict[str, list[str]]
 
     def write(self) -> None:
-        """Write into the folder what :meth:`read` needs.
+        """Write the metadata for :meth:`read` into the folder.
 
         Raises
         ------
@@ -586,7 +585,7 @@ class Sealed:
 
     @classmethod
     def read(cls, folder: Path) -> Self:
-        """Read what a process of ours sealed in a folder.
+        """Read a sealed segment from its folder.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""States of frames as plain columns, as a viewer draws them: where everything is, frame by frame.
+"""Entity states of frames as plain columns, for drawing in a viewer.
 
 Positions are those of the tables, about the origin of the trace, so that they fit into 32 bits; what is not
 known is NaN. Kinds and states of lights are numbers; :func:`kinds_of` gives their names.
@@ -44,7 +44,7 @@ _OF_STATE: Final = ", ".join(f'{sql or name} AS "{name}"' for name, sql in _STAT
 
 
 def frame_times(connection: DuckDBPyConnection, trace_id: int, first: int, last: int) -> Columns:
-    """Number, time since the trace began (s) and ego (-1: none) of frames, both ends included."""
+    """Return number, time since the trace start (s) and ego (-1: none) of a range of frames, ends included."""
     low, high = _ids(trace_id, first, last)
     found = connection.execute(
         "SELECT f.seq AS seq, round((f.time_ns - t.start_ns) / 1e3) / 1e6 AS t, coalesce(f.ego, -1) AS ego"
@@ -56,7 +56,7 @@ def frame_times(connection: DuckDBPyConnection, trace_id: int, first: int, last:
 
 
 def states_between(connection: DuckDBPyConnection, trace_id: int, first: int, last: int) -> Columns:
-    """States of all that moves or changes in some frames, in their order, with the number of each frame.
+    """Return the states of all non-static entities in a range of frames, with the frame numbers.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def states_between(connection: DuckDBPyConnection, trace_id: int, first: int, la
 
 
 def states_at(connection: DuckDBPyConnection, frames: Sequence[tuple[int, int]]) -> Columns:
-    """States in frames, told by trace and number; ``at`` says which of these a row is of."""
+    """Return states in frames given as (trace id, number). Column ``at`` is the index of the frame."""
     if len(frames) > MOST_FRAMES:
         raise StoreError(f"{len(frames)} frames are asked for; {MOST_FRAMES} are given at once")
     ids = [int(frame_ids(trace, np.array([seq]))[0]) for trace, seq in frames]
@@ -91,7 +91,7 @@ def states_at(connection: DuckDBPyConnection, frames: Sequence[tuple[int, int]])
 
 
 def scenery(connection: DuckDBPyConnection, trace_id: int) -> Columns:
-    """Scenery of a trace, which never moves, beside its road map."""
+    """Return the static entities of a trace, without its road map."""
     found = connection.execute(
         'SELECT node_id AS node, enum_code(kind) AS kind, x, y, heading, "length", width FROM entity'
         " WHERE trace_id = ? AND is_static ORDER BY node_id",
@@ -101,7 +101,7 @@ def scenery(connection: DuckDBPyConnection, trace_id: int) -> Columns:
 
 
 def names_of_nodes(connection: DuckDBPyConnection, trace_id: int) -> dict[int, tuple[str, ...]]:
-    """Kind, the simulator's id and type name of each entity of a trace; empty where not known."""
+    """Return kind, simulator id and type name of each entity of a trace. Unknown texts are empty."""
     rows = connection.execute(
         "SELECT node_id, kind::VARCHAR, coalesce(ident, ''), coalesce(type_name, '') FROM entity"
         " WHERE trace_id = ? ORDER BY node_id",
@@ -111,7 +111,7 @@ def names_of_nodes(connection: DuckDBPyConnection, trace_id: int) -> dict[int, t
 
 
 def places(connection: DuckDBPyConnection) -> dict[str, tuple[float, float, str, list[str]]]:
-    """By trace: the place that its positions are about (m, in the axes of its map), the map's digest, cameras.
+    """Return for each trace its origin (m, in map axes), the digest of its map, and its camera topics.
 
     Of all traces at once, because there may be thousands. Cameras are topics of pictures, by name.
     """
@@ -125,7 +125,7 @@ def places(connection: DuckDBPyConnection) -> dict[str, tuple[float, float, str,
 
 
 def kinds_of(connection: DuckDBPyConnection) -> dict[str, list[str]]:
-    """Names of kinds and of states of lights, by the numbers in columns."""
+    """Return the names of kinds and light states in code order."""
     row = connection.execute(
         "SELECT enum_range(NULL::kind)::VARCHAR[], enum_range(NULL::light_state)::VARCHAR[]"
     ).fetchone()
@@ -136,7 +136,7 @@ def kinds_of(connection: DuckDBPyConnection) -> dict[str, list[str]]:
 def series(
     connection: DuckDBPyConnection, trace_id: int, attribute: str, node: int, other: int | None
 ) -> Columns:
-    """An attribute of a node, or a number of two, over a trace.
+    """Return an attribute of a node, or of a pair of nodes, over a trace.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ def _ids(trace_id: int, first: int, last: int) -> tuple[int, int]:
 
 
 def _typed(found: Mapping[str, NDArray[Any]], types: Mapping[str, Any]) -> Columns:
-    """Columns of their types; NaN, or 0, where something is NULL."""
+    """Convert columns to their types. NULL becomes NaN or 0."""
     told: Columns = {}
     for name, values in found.items():
         type_ = np.dtype(types[name])

@@ -1,4 +1,4 @@
-"""Steps of the database that a signal ends at once.
+"""Database calls that a signal interrupts at once.
 
 Python runs the handler of a signal only between its own steps and in the main thread, and DuckDB lets it do so
 only between its tasks, one of which may take minutes. So the main thread does no such step itself: it waits for
@@ -28,7 +28,7 @@ _AGAIN_S: Final = 0.01
 
 
 def interruptible(connection: DuckDBPyConnection, step: Callable[[], T]) -> T:
-    """Do a step of the database; whatever a handler of signals raises meanwhile ends it.
+    """Run a database call. An exception from a signal handler interrupts it.
 
     Parameters
     ----------
@@ -69,13 +69,13 @@ interrupted: Final[set[int]] = set()
 
 
 def interrupt(connection: DuckDBPyConnection) -> None:
-    """End the statement of a connection."""
+    """Interrupt the statement of a connection."""
     interrupted.add(id(connection))
     connection.interrupt()
 
 
 class _Task(Generic[T]):
-    """A step that another thread does."""
+    """Database call that another thread runs."""
 
     def __init__(self, step: Callable[[], T]) -> None:
         self.ended = threading.Event()
@@ -86,7 +86,7 @@ class _Task(Generic[T]):
         self._error: BaseException | None = None
 
     def take(self) -> bool:
-        """Take the turn; ``False`` if it was taken."""
+        """Claim the task. False if it is already claimed."""
         try:
             self._turns.pop()
         except IndexError:
@@ -94,13 +94,13 @@ class _Task(Generic[T]):
         return True
 
     def is_over(self) -> bool:
-        """Return whether the step has ended, or will never begin."""
+        """True if the task has ended, or can no longer start."""
         if self.take():
             self.ended.set()
         return self.ended.is_set()
 
     def result(self) -> T:
-        """Return what the step returned, or raise what it raised."""
+        """Return the result of the call, or raise its exception."""
         try:
             if self._error is not None:
                 raise self._error
@@ -109,12 +109,12 @@ class _Task(Generic[T]):
             self.forget()
 
     def forget(self) -> None:
-        """Let go of the result: an error refers to what refers to it, and so would hold the connection."""
+        """Drop the result and the error, whose traceback would keep the connection alive."""
         self._error = None
         self._found.clear()
 
     def run(self) -> None:
-        """Do the step, unless it is not wanted any more."""
+        """Run the call, unless it was cancelled."""
         if not self.take():
             return
         try:
@@ -126,7 +126,7 @@ class _Task(Generic[T]):
 
 
 class _StepThread:
-    """The thread that does the steps of the main thread, one after another.
+    """Thread that runs the database calls of the main thread, one after another.
 
     It lasts, because to start one takes longer than a short question.
     """
@@ -136,7 +136,7 @@ class _StepThread:
         self._thread: threading.Thread | None = None
 
     def begin(self, task: _Task[Any]) -> bool:
-        """Hand over a task; ``False``: there can be no thread for it."""
+        """Queue a task. False if the thread cannot start."""
         # A process that was forked off has no thread, and its queue may be locked for ever.
         if self._thread is None or not self._thread.is_alive():
             self._tasks = SimpleQueue()

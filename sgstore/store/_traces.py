@@ -1,4 +1,4 @@
-"""Traces of a store: their identity, their attributes, and the names of them and of their frames."""
+"""Traces of a store: identity, attributes, and the names of traces and frames."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Identity:
         road_map: RoadMap | None,
         part: tuple[float | None, float | None] = (None, None),
     ) -> Identity:
-        """The identity of a recording, or of a part of it, that is read with a config and a map."""
+        """Return the identity of a recording, or a part of it, for a config and a map."""
         settings = as_json(replace(config, ego="", egos=()).as_dict())
         return cls(
             trace_id=trace_id_of(info.digest, info.ego),
@@ -91,18 +91,18 @@ class Identity:
 
     @property
     def shared(self) -> dict[str, str]:
-        """Digests of what other traces may have, too, by its table; without a map none of it."""
+        """Digests of the data that traces can share: table → digest. Without a map, ``map`` is absent."""
         found = {"recording": self.digest, "config": self.settings_digest}
         return found | ({"map": self.map_digest} if self.map_digest else {})
 
     @property
     def numbers(self) -> dict[str, int]:
-        """Columns by which a trace refers to that: ``recording_id``, ``config_id`` and ``map_id``."""
+        """Reference columns of a trace: ``recording_id``, ``config_id`` and ``map_id``."""
         return {f"{table}_id": id_of(digest) for table, digest in self.shared.items()}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Identity:
-        """The identity that plain values describe."""
+        """Restore an identity from plain values."""
         from sgstore.config import Payloads  # many settings: not for who only reads a store
 
         payloads: Any = Payloads(**values["payloads"])
@@ -110,19 +110,19 @@ class Identity:
 
 
 def id_of(digest: str) -> int:
-    """The first 60 bits of a digest in hexadecimal digits: the number of a recording, a map or settings."""
+    """Return the first 60 bits of a hexadecimal digest: the id of a recording, map or config."""
     return int(digest[:15], 16)
 
 
 def trace_id_of(digest: str, ego: str) -> int:
-    """39 bits of the SHA-256 of a recording's digest and its ego's id: the same in every store."""
+    """Return the trace id: 39 bits of a hash of recording digest and ego id. It is equal in every store."""
     both = f"{digest}\0{ego}".encode("utf-8", "surrogatepass")
     return int.from_bytes(hashlib.sha256(both).digest()[:8], "big") >> (64 - _TRACE_BITS)
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class StoredTrace:
-    """A trace in a store.
+    """Trace in a store.
 
     Attributes
     ----------
@@ -187,13 +187,13 @@ class StoredTrace:
         return f"<StoredTrace {self.name!r}: {about}>"
 
     def as_dict(self) -> dict[str, Any]:
-        """All that is known of it, as plain values."""
+        """Return all attributes of the trace as plain values."""
         return asdict(self) | {"path": place_named(self.path)}
 
 
 @dataclass(frozen=True, slots=True)
 class FrameRef:
-    """A frame in a store.
+    """Reference to a frame in a store.
 
     Attributes
     ----------
@@ -232,12 +232,12 @@ ROOT: Final = "SGSTORE_ROOT"
 
 
 def uri_of(path: Path) -> str:
-    """The place of a recording as a store keeps it: its URL, or where it lies on this machine."""
+    """Return the stored location of a recording: its URL or its absolute path."""
     return url_named(path) or plain(str(path.resolve()))
 
 
 def place_below(store: Path, path: Path) -> str:
-    """The place of a recording from the folder of a store; empty where it does not lie below it."""
+    """Return the path of a recording relative to the store's folder. It is empty for a path outside."""
     if url_named(path) is not None:
         return ""
     with suppress(ValueError):
@@ -248,7 +248,7 @@ def place_below(store: Path, path: Path) -> str:
 def located(
     uri: str, place: str | None, size: int, store: Path | None, root: str | Path | None = None
 ) -> Path:
-    """The place of a recording now: beneath the root, below the folder of the store, or where it was ingested.
+    """Find a recording: below the root, below the store's folder, or at its original path.
 
     Parameters
     ----------
@@ -284,7 +284,7 @@ def located(
 
 
 def scope_of(reports: Iterable[Mapping[str, Any]], *, world: bool | None) -> dict[str, Any]:
-    """What the settings of some traces left out of a question, counted; empty where that is nothing.
+    """Return counts of the data that the settings of some traces exclude from a query, or an empty dict.
 
     Parameters
     ----------
@@ -316,7 +316,7 @@ def scope_of(reports: Iterable[Mapping[str, Any]], *, world: bool | None) -> dic
 
 
 def scope_text(found: Mapping[str, Any]) -> str:
-    """What settings left out, as :func:`scope_of` has it, in one line."""
+    """Format the result of :func:`scope_of` as one line."""
     if not found:
         return ""
     scope, states = found.get("scope", ""), f"of {found['states']:,} states"
@@ -334,7 +334,7 @@ def scope_text(found: Mapping[str, Any]) -> str:
 def stored_traces(
     connection: DuckDBPyConnection, store: Path | None = None, root: str | Path | None = None
 ) -> tuple[StoredTrace, ...]:
-    """All traces of a store, by name in natural order; recordings are looked for as :func:`located` does."""
+    """Return all traces of a store by name in natural order. :func:`located` finds the recordings."""
     found = run(connection, _TRACES).dicts()
     texts = connection.execute("SELECT config_id, settings FROM config").fetchall()
     try:
@@ -359,7 +359,7 @@ def _object(text: str) -> dict[str, Any]:
 def stored_name(
     connection: DuckDBPyConnection, identity: Identity, *, catalog: str = ""
 ) -> str | None:
-    """The name under which a store has a trace, however it was read; ``None`` if it has it not.
+    """Return the stored name of a trace, read with any settings. ``None`` means not stored.
 
     Raises
     ------
@@ -385,7 +385,7 @@ def stored_name(
 def already_stored(
     connection: DuckDBPyConnection, identity: Identity, *, catalog: str = ""
 ) -> str | None:
-    """The name under which a store has a trace; ``None`` if it has it not.
+    """Return the stored name of a trace with exactly this identity. ``None`` means not stored.
 
     Raises
     ------
@@ -419,7 +419,7 @@ def already_stored(
 
 
 def free_name(stem: str, taken: set[str]) -> str:
-    """A name that is not taken: the stem, or the stem with ``~2``, ``~3``, … behind it."""
+    """Return an unused name: the stem, or the stem with a suffix ``~2``, ``~3`` and so on."""
     name, count = stem, 1
     while name in taken:
         count += 1
@@ -432,7 +432,7 @@ _SECONDS: Final = re.compile(r"\s*(-?\d+(?:\.\d+)?)\s*s?\s*")
 
 
 def trace_named(connection: DuckDBPyConnection, ref: str) -> tuple[int, str]:
-    """Id and name of a trace by its name, its id, or a unique beginning of its name.
+    """Return id and name of a trace from its name, its id, or a unique prefix of its name.
 
     Raises
     ------
@@ -444,7 +444,7 @@ def trace_named(connection: DuckDBPyConnection, ref: str) -> tuple[int, str]:
 
 
 def trace_among(known: Mapping[str, int], ref: str) -> tuple[int, str]:
-    """As :func:`trace_named` among traces whose names and ids are known, in the order of the names."""
+    """Find a trace like :func:`trace_named`, among known names and ids, sorted by name."""
     if ref in known:
         return known[ref], ref
     found = [name for name, trace_id in known.items() if str(trace_id) == ref]
@@ -459,7 +459,7 @@ def trace_among(known: Mapping[str, int], ref: str) -> tuple[int, str]:
 
 
 def frame_named(connection: DuckDBPyConnection, ref: int | str) -> FrameRef:
-    """A frame by its id, ``TRACE#SEQ``, or ``TRACE@12.3s`` (the last frame at or before that time).
+    """Return a frame by id, ``TRACE#SEQ``, or ``TRACE@12.3s`` (the last frame at or before that time).
 
     Raises
     ------
@@ -529,7 +529,7 @@ def _frame(
 
 
 def _extent(connection: DuckDBPyConnection, trace_id: int) -> tuple[int, int, int, int]:
-    """First and last seq, start and latest time of a trace."""
+    """Return first number, last number, start time and latest time of a trace."""
     row = connection.execute(
         """
         SELECT min(f.seq), max(f.seq), any_value(t.start_ns), max(f.time_ns)

@@ -1,4 +1,4 @@
-"""Verification of a store: rows against their checksums, masks, and references between rows.
+"""Verification of a store: rows against checksums, masks, and references between rows.
 
 Reading a table also makes the database verify the checksums of its blocks.
 """
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Something in a store that is not as it should be.
+    """Fault in a store.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Fault:
 
 @dataclass(slots=True)
 class Verification:
-    """Result of verifying a store.
+    """Result of the verification of a store.
 
     Attributes
     ----------
@@ -265,7 +265,7 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
 
 
 def verify_file(path: str | Path, *, recordings: bool = False) -> Verification:
-    """Look through a store that may have been altered so that it cannot be opened.
+    """Verify a store file, even one that is too altered to open.
 
     If its tables and views are not those that sgstore makes, that is all that is said: nothing is read of them.
 
@@ -292,7 +292,7 @@ def verify_file(path: str | Path, *, recordings: bool = False) -> Verification:
 
 
 def verify_store(access: Access, *, recordings: bool = False) -> Verification:
-    """Look through a store; see :meth:`StoreFile.verify`."""
+    """Verify a store; see :meth:`StoreFile.verify`."""
     from sgstore.mcap import digest_of
 
     with access.reading() as connection:
@@ -305,7 +305,7 @@ def verify_store(access: Access, *, recordings: bool = False) -> Verification:
 
 
 def verify(connection: DuckDBPyConnection, path: Path) -> Verification:
-    """Look through a store.
+    """Verify an open store.
 
     What the database cannot read becomes a fault.
 
@@ -337,7 +337,7 @@ def verify(connection: DuckDBPyConnection, path: Path) -> Verification:
 
 
 def damage(connection: DuckDBPyConnection, path: Path) -> str:
-    """Return the first fault of a store; empty if there is none."""
+    """Return the first fault of a store, or an empty string."""
     try:
         found = verify(connection, path)
     except SgstoreError as error:
@@ -346,7 +346,7 @@ def damage(connection: DuckDBPyConnection, path: Path) -> str:
 
 
 def _odd(connection: DuckDBPyConnection) -> Iterator[Fault]:
-    """Rows that belong to no trace and to no map: settings, names, bits."""
+    """Yield faults: rows without a trace or map, such as unused settings, names and mask bits."""
     for number, text in connection.execute("SELECT config_id, settings FROM config").fetchall():
         try:
             from_dict(json.loads(text))
@@ -371,7 +371,7 @@ def verify_recordings(
     store: Path | None = None,
     root: str | Path | None = None,
 ) -> Verification:
-    """Hash the recordings of all traces again."""
+    """Compare the recordings of all traces with their stored hashes."""
     found = Verification()
     known: dict[Path, str | SgstoreError] = {}
     traces = stored_traces(connection, store, root)
@@ -395,7 +395,7 @@ _Published = dict[tuple[str, int], dict[str, Checksum]]
 
 
 def _published(connection: DuckDBPyConnection) -> _Published:
-    """The manifest: whose ("trace", "map", …) and its number → table → checksum."""
+    """Return the manifest: (owner kind such as "trace" or "map", id) → table → checksum."""
     sql = 'SELECT owner, id, "table", rows, checksum FROM manifest'
     published: _Published = {}
     for owner, number, table, rows, value in connection.execute(sql).fetchall():
@@ -406,7 +406,7 @@ def _published(connection: DuckDBPyConnection) -> _Published:
 def _rows(
     connection: DuckDBPyConnection, trace: StoredTrace, published: _Published, found: Verification
 ) -> Iterator[Fault]:
-    """Tables of a trace whose rows are not those that were published."""
+    """Yield faults: tables of a trace whose rows differ from the published rows."""
     manifest = published.get(("trace", trace.trace_id), {})
     if not manifest:
         yield Fault(trace.name, "rows", "nothing is noted of what was published of it")
@@ -433,7 +433,7 @@ _NAMED: Final = {"recording": "uri", "config": "config_id", "map": "name"}
 def _shared(
     connection: DuckDBPyConnection, published: _Published, found: Verification
 ) -> Iterator[Fault]:
-    """Recordings, settings and road maps that are not those that were published."""
+    """Yield faults: recordings, settings and road maps that differ from the published ones."""
     database = _database(connection)
     for owner, tables in SHARED.items():
         sql = f"SELECT {owner}_id, {_NAMED[owner]} FROM {owner}"

@@ -1,4 +1,4 @@
-"""A trace on its way into a store: built aside, block by block, and published in one short transaction.
+"""Writer of a trace: builds it outside the store, block by block, and publishes it in a short transaction.
 
 The store itself is touched only to publish: then a trace is in it, with everything that belongs to it, or not
 at all.
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 class OnMap:
-    """Work that the segments on one road map share: classes of their frames, and the rows of the map.
+    """Data shared by the segments on one road map: frame classes, and the rows of the map.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class OnMap:
         self.classes = IngestedClasses(road_map)
 
     def insert_into(self, staging: Staging, map_id: int) -> None:
-        """Insert the tables of the map, as the first rows of a staging."""
+        """Insert the map tables as the first rows of a staging."""
         if self.road_map is None:
             return
         if (rows := _ROWS.get(self.road_map)) is not None:
@@ -69,7 +69,7 @@ _ROWS: Final[WeakKeyDictionary[RoadMap, StagedRows]] = WeakKeyDictionary()
 
 
 class Segment:
-    """The graphs of one trace, until they are published.
+    """Graphs of one trace before publication.
 
     Parameters
     ----------
@@ -134,11 +134,11 @@ class Segment:
         self.close()
 
     def close(self) -> None:
-        """Forget the segment. What was published stays."""
+        """Discard the segment. Published data stay in the store."""
         self._staging.close()
 
     def as_kept(self, frames: FrameBlock) -> FrameBlock:
-        """The next frames with the numbers that the store will give back of them.
+        """Return the next frames with values rounded as in the store.
 
         Positions are kept as float32 about an origin, all else as float32. Graphs that are made of these
         numbers can be made again from the store, to the last edge; so this comes before the generator.
@@ -178,7 +178,7 @@ class Segment:
         self._insert_graph(graph, self._identity.trace_id, self._origin or Origin(0.0, 0.0, 0.0))
 
     def name_frames(self, seq: Ints, graphs: list[str], places: Ints, images: Ints) -> None:
-        """Take down what the file of an import calls the graphs that became frames: table ``imported``.
+        """Store the graph names of an imported file for its frames: table ``imported``.
 
         Parameters
         ----------
@@ -199,7 +199,7 @@ class Segment:
     def keep_attributes(
         self, seq: Ints, own: Sequence[tuple[int, int, int, int, str, str]]
     ) -> None:
-        """Add attributes of a client's own: table ``attribute``.
+        """Add user-defined attributes: table ``attribute``.
 
         Parameters
         ----------
@@ -226,7 +226,7 @@ class Segment:
         more: Mapping[str, Any] | None = None,
         parked: Sequence[Codes] = (),
     ) -> Sealed:
-        """Complete the files of the trace, so that any process can publish them; nothing can be added then.
+        """Complete the files of the trace. Any process can then publish them, but not extend them.
 
         Parameters
         ----------
@@ -287,7 +287,7 @@ class Segment:
 
     @property
     def scope(self) -> dict[str, Any]:
-        """What settings left out so far, as the report has it; nothing of an import."""
+        """Return the data that the settings have excluded so far, for the report. An import excludes none."""
         counts, settings = self._left_out, json.loads(self._identity.settings)
         if not counts.states:
             return {}
@@ -316,7 +316,7 @@ class Segment:
         self._staging.write("payload")
 
     def _bucket_columns(self, time_ns: Ints, period_ns: int) -> Columns:
-        """Table ``bucket``: the frames of each, and which of them follow on the one before."""
+        """Return table ``bucket``: masks of each bucket's frames, and of the frames without a gap before."""
         seq = np.arange(len(time_ns))
         one = np.left_shift(1, seq % BUCKET_FRAMES)
         step = np.diff(time_ns, prepend=time_ns[0])
@@ -331,7 +331,7 @@ class Segment:
         return columns if number is None else columns | {"map_id": np.full(len(starts), number)}
 
     def _insert_about(self) -> None:
-        """Insert all that is known before the first frame: recording, settings, channels, context and map."""
+        """Insert the data known before the first frame: recording, settings, channels, context and map."""
         insert, info, identity = self._staging.insert, self._info, self._identity
         self._on_map.insert_into(self._staging, identity.numbers.get("map_id", 0))
         recording = {
@@ -394,7 +394,6 @@ class Segment:
             self._periods.see(number, messages["log_time_ns"][channel == number])
 
     def _learned(self, entities: Columns) -> Columns:
-        """Constants of all entities so far, which states repeat, where any of them has one."""
         for name, known in self._constants.items():
             known[:] = [np.concatenate([*known, entities[name]])]
         return {name: known[0] for name, known in self._constants.items() if any(known[0])}
@@ -404,19 +403,18 @@ class Segment:
         return {name: values[node] for name, values in known.items()}
 
     def _owned(self, columns: Columns) -> Columns:
-        """The columns, and whose they are."""
         count = len(next(iter(columns.values())))
         return columns | {"trace_id": np.full(count, self._identity.trace_id)}
 
 
 def _period_ns(time_ns: Ints) -> int:
-    """Median difference of consecutive frames, of two in the middle the lower; 0 for one frame."""
+    """Return the lower median time between frames; ns. A single frame gives 0."""
     steps = np.sort(np.diff(time_ns))
     return int(steps[(len(steps) - 1) // 2]) if len(steps) else 0
 
 
 def _map_tables(road_map: RoadMap) -> dict[str, Columns]:
-    """Tables of a map; they are the same for all traces on it."""
+    """Return the tables of a road map, which are equal for all its traces."""
     nodes = road_map.nodes
     count = len(nodes)
     is_lane = np.array([bool(kind) for kind in nodes.lane_type], np.bool_)
