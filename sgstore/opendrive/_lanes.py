@@ -661,7 +661,7 @@ def _stations(
 def _lateral_jumps(
     intervals: _LaneIntervals, borders: _LaneBorders
 ) -> tuple[Floats, Floats, Floats]:
-    """Greatest reach of borders from the reference line at the end of each interval, their jumps and turns."""
+    """Return reach, jumps and turns of the borders at the end of each interval."""
     n = len(intervals.section)
     length = (intervals.end - intervals.start)[borders.interval]
     reach, step, corner = np.zeros(n), np.zeros(n), np.zeros(n)

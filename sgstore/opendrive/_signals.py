@@ -272,7 +272,7 @@ class Signals:
         return ("controlsTrafficOf", signal, FIRST_LANE + lane)
 
     def places(self, first: int) -> tuple[Ints, Ints, Floats]:
-        """Rows of signals among the nodes, lanes that they apply to, and the places ``s`` on their roads."""
+        """Return rows of signals among the nodes, their lanes, and the places ``s`` on the roads."""
         rows = [(row, *one) for row, lanes in enumerate(self.lanes) for one in sorted(lanes)]
         row, lane = np.array([one[:2] for one in rows], np.int64).reshape(-1, 2).T
         return first + row, lane, np.array([s for *_, s in rows], np.float64)

@@ -1,16 +1,16 @@
-"""Numbers of a pair of entities (a, b): each declared once, for views, the language and arrays.
+"""Numbers of a pair of entities (a, b): each is declared once, for views, the language and arrays.
 
-A number is an expression of SQL over others of the same pair, down to the columns of both entities (``a_x``: x
-of a; conventions of axes and units in :mod:`sgstore.geometry`). The view and the compiler write it into
-statements, layer by layer, because DuckDB shares named columns and not repeated expressions;
-:class:`PairNumbers` computes the same expression with arrays, where NaN is NULL. What a number needs of an
-entity follows from its columns.
+A number is an expression of SQL over other numbers of the same pair, and finally over the columns
+of both entities (``a_x``: x of a; conventions of axes and units in :mod:`sgstore.geometry`). The
+view and the compiler write it into statements, layer by layer, because DuckDB shares named columns
+but not repeated expressions. :class:`PairNumbers` computes the same expression with arrays, where
+NaN is NULL. The needed columns of an entity follow from the expression.
 
-One more number is one more entry of ``NUMBERS`` in the file of its family: ``_boxes`` has those of the view
-``pairs``; measures of criticality are in ``_encounter``, ``_following``, ``_crossing``, ``_rss`` and
-``_evading``. These look ahead from one moment: at constant velocity, at constant acceleration or at the worst
-that bounded accelerations can do. Expressions that numbers share stand in ``PARTS``, under the usual symbols
-of that literature (``v1``, ``a2``) where it has some.
+A new number is a new entry of ``NUMBERS`` in the file of its family. ``_boxes`` has the numbers of
+the view ``pairs``; measures of criticality are in ``_encounter``, ``_following``, ``_crossing``,
+``_rss`` and ``_evading``. They predict from one moment: at constant velocity, at constant
+acceleration, or in the worst case of bounded accelerations. Shared expressions are in ``PARTS``,
+with the usual symbols of the literature (``v1``, ``a2``).
 """
 
 import lazy_loader

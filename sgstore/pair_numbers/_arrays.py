@@ -1,4 +1,4 @@
-"""Numbers of pairs as arrays: the expressions of their SQL, computed by numpy."""
+"""Numbers of pairs as arrays: numpy evaluates their SQL expressions."""
 
 from __future__ import annotations
 
@@ -20,19 +20,20 @@ Floats: TypeAlias = "NDArray[np.float64]"
 Formula = Callable[[Mapping[str, Any]], Any]
 
 COLUMNS: Final = ("x", "y", "z", "heading", "length", "width", "vx", "vy", "ax", "ay")
-"""Columns of an entity that numbers of pairs are made of."""
+"""Columns of an entity that numbers of pairs use."""
 
 
 class PairNumbers(dict[str, "Floats"]):
-    """Numbers of many ordered pairs by name, each computed when it is first asked for; (K,) float64.
+    """Numbers of many ordered pairs by name, each computed on first use; (K,) float64.
 
     Parameters
     ----------
     a, b : (K, 15) float64
-        ``x, y, z, heading, length, width, vx, vy, ax, ay`` of the two entities of pair k; m, m, m, rad, m, m,
-        m/s, m/s, m/s², m/s²; and heights of the lower and the upper side (:func:`low_and_high`), node id,
-        that of the carrier, and pitch (rad). NaN where one is missing. The last ones may be left out:
-        without heights (K, 10) all pairs are on one level, without accelerations (K, 8) they are unknown.
+        ``x, y, z, heading, length, width, vx, vy, ax, ay`` of the two entities of pair k; m, m, m,
+        rad, m, m, m/s, m/s, m/s², m/s²; then heights of the lower and the upper side
+        (:func:`low_and_high`), node id, node id of the carrier, and pitch (rad). NaN for a missing
+        value. The last columns are optional: without heights (K, 10) all pairs are on one level,
+        without accelerations (K, 8) accelerations are unknown.
     """
 
     def __init__(self, a: Floats, b: Floats) -> None:
@@ -51,7 +52,7 @@ class PairNumbers(dict[str, "Floats"]):
 
 
 def gap(a: Floats, b: Floats) -> Floats:
-    """Shortest distance between the boxes of each pair; 0 where they touch or overlap.
+    """Return the shortest distance between the boxes of each pair; 0 if they touch or overlap.
 
     Parameters
     ----------
@@ -62,7 +63,7 @@ def gap(a: Floats, b: Floats) -> Floats:
     Returns
     -------
     (K,) float64
-        Metres; NaN where a number is missing.
+        Metres; NaN if a number is missing.
     """
     found = np.empty(len(a))
     for start in range(0, len(a), _TOGETHER):
@@ -75,11 +76,11 @@ def gap(a: Floats, b: Floats) -> Floats:
 
 
 _TOGETHER: Final = 1 << 14
-"""Pairs whose parts are in memory at once: few enough for the caches of a processor."""
+"""Pairs that are processed at once: few enough for the caches of a processor."""
 
 _FOOTPRINT: Final = [COLUMNS.index(name) for name in ("x", "y", "heading", "length", "width")]
 
-# An expression is parsed as one of Python, which it is but for these words.
+# An expression is parsed as Python, after replacing these words.
 _AS_PYTHON: Final = tuple(
     (re.compile(pattern), text)
     for pattern, text in (
@@ -97,7 +98,7 @@ _AS_PYTHON: Final = tuple(
 
 
 def _case(*parts: Any) -> Any:
-    """The first value whose condition is true, else the last, or NaN."""
+    """Return the first value whose condition is true, else the last value, or NaN."""
     pairs, found = len(parts) // 2, parts[-1] if len(parts) % 2 else np.nan
     for i in reversed(range(pairs)):
         found = np.where(parts[2 * i], parts[2 * i + 1], found)
@@ -122,7 +123,7 @@ def _is_known(value: Any, _: Any) -> Any:
 
 @cache
 def _functions() -> Mapping[str, Callable[..., Any]]:
-    """Functions of expressions by their names."""
+    """Return the functions of expressions by name."""
     return {
         "case": _case,
         **{
@@ -131,7 +132,7 @@ def _functions() -> Mapping[str, Callable[..., Any]]:
         },
         "acos": np.arccos,
         "atan2": np.arctan2,
-        # They pass over what is missing.
+        # They ignore missing values.
         "greatest": lambda *values: reduce(np.fmax, values),
         "least": lambda *values: reduce(np.fmin, values),
         "coalesce": _coalesced,
@@ -161,9 +162,9 @@ def _operators() -> Mapping[type[ast.AST], Callable[..., Any]]:
 
 @cache
 def _compiled(name: str) -> Formula:
-    """The function of the values of a number of pairs, given those of what it is made of.
+    """Compile the formula of a number of pairs.
 
-    What is unknown in a condition is false, which is as good: no condition is negated.
+    An unknown condition counts as false; this is equivalent, because conditions are never negated.
     """
     text = EXPRESSIONS[name]
     for pattern, python in _AS_PYTHON:

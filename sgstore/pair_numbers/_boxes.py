@@ -1,4 +1,4 @@
-"""Places, velocities and footprints of two entities: gaps, angles, and when two boxes meet."""
+"""Positions, velocities and footprints of two entities: gaps, angles, and contact times of two boxes."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from sgstore.pair_numbers._ways import LANE_DIST
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-# Not within a branch of a CASE, for which DuckDB works out all parts anew.
+# Not within a branch of a CASE, because DuckDB would compute all parts again.
 GAP: Final = "coalesce(sqrt(least(square1, square2, square3, square4)), 0) + 0 * (out1 + out2)"
-"""The distance of b's centre from the octagon; NULL where a place or size is not known."""
+"""The distance of b's centre from the octagon; NULL if a position or size is unknown."""
 
 BEYOND: Final = {
     "out1": "abs(lon) - reach1",
@@ -30,7 +30,8 @@ BEYOND: Final = {
         for i in (1, 2, 3, 4)
     },
 }
-"""Distances of b's centre beyond edges of the octagon, and past their ends; squares of those from the edges."""
+"""Distances of b's centre beyond edges of the octagon, and beyond their ends; squared distances
+from the edges."""
 
 
 _MEETS: Final = "meets1, meets2, meets3, meets4"
@@ -38,7 +39,7 @@ _PARTS: Final = "parts1, parts2, parts3, parts4"
 
 
 def _turned(angle: str) -> str:
-    """An angle in degrees, brought into (-180, 180]."""
+    """Return the SQL of an angle in degrees, wrapped to (-180, 180]."""
     return f"{angle} - 360 * ceil(({angle} - 180) / 360)"
 
 
@@ -58,9 +59,10 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
         note="in the plane where a height is not known",
         column="distance",
     ),
-    # The distance of b's centre from the Minkowski sum of both boxes, an octagon around a's centre whose edges
-    # are those of both. Boxes are symmetric about their centres: of two opposite edges only the one on the side
-    # of b's centre can be the nearest, so four remain, two in a's axes and two in b's.
+    # The distance of b's centre from the Minkowski sum of both boxes: an octagon around a's centre
+    # with the edges of both. Boxes are symmetric about their centres. Of two opposite edges only
+    # the one on the side of b's centre can be the nearest; therefore four remain, two in a's axes
+    # and two in b's.
     "gap": PairFunction(
         "shortest distance between the footprints",
         "m",
@@ -85,9 +87,9 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
         "-(dx * dvx + dy * dvy) / nullif(planar, 0)",
         worse="high",
     ),
-    # Two boxes meet where their shadows meet on each axis of both (separating axes: Gottschalk, Lin and
-    # Manocha, OBBTree, SIGGRAPH 1996). On one axis the shadows of boxes that move meet in one interval of time;
-    # what all four intervals have in common is when the boxes do.
+    # Two boxes meet if their shadows meet on each axis of both (separating axes: Gottschalk, Lin
+    # and Manocha, OBBTree, SIGGRAPH 1996). On one axis the shadows of moving boxes meet in one
+    # interval of time. The boxes meet in the intersection of all four intervals.
     "ttc": PairFunction(
         "time until the footprints first touch if both keep their velocity and do not turn",
         "s",
@@ -110,7 +112,7 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
     "rel_speed": PairFunction(
         "length of the difference of the velocities", "m/s", "sqrt(dvx * dvx + dvy * dvy)"
     ),
-    # Not by greatest(), which passes over NULL.
+    # Not with greatest(), which ignores NULL.
     "lon_gap": PairFunction(
         "how far the footprints are apart along a's axis",
         "m",
@@ -146,14 +148,14 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
 }
 
 PARTS: Final[Mapping[str, str]] = {
-    # Two on different storeys, and what pulls or carries the other, are no pair: NULL, else 0.
+    # NULL for pairs on different storeys and for an entity with its carrier, else 0.
     "apart": "CASE WHEN a_high > a_low AND b_high > b_low"
     f" AND greatest(b_low - a_high, a_low - b_high) <= {TOUCH:.0e} THEN 0"
     f" WHEN a_high > a_low AND b_high > b_low OR abs(b_low - a_low) > {STOREY}e0"
     f" THEN abs(b_low - a_low) - {_CLIMB} ELSE 0 * (b_low - a_low) END",
     "level": "CASE WHEN apart > 0 OR a_carrier = b_node_id OR b_carrier = a_node_id OR a_carrier = b_carrier"
     " THEN NULL ELSE 0 END",
-    # What is flat is no body: NULL, else 0.
+    # NULL for flat entities, else 0.
     "solid": "CASE WHEN a_high <= a_low OR b_high <= b_low THEN NULL ELSE 0 END",
     **{f"d{axis}": f"b_{axis} - a_{axis} + level" for axis in ("x", "y", "vx", "vy")},
     "dz": "coalesce(b_z - a_z, 0)",
@@ -164,29 +166,31 @@ PARTS: Final[Mapping[str, str]] = {
     **{f"s{one}": f"sin({one}_heading)" for one in "ab"},
     "planar": "sqrt(dx * dx + dy * dy)",
     "pace": "sqrt(a_vx * a_vx + a_vy * a_vy)",
-    # The difference of two angles is exact for the headings that people write (0, π/2, π), where the angle of
+    # The difference of two angles is exact for typical headings (0, π/2, π), but the angle of
     # turned components is not: the cosine of the double nearest to π/2 is 6e-17.
     "course": "CASE WHEN dx = 0 AND dy = 0 THEN 0 * a_heading ELSE degrees(atan2(dy, dx) - a_heading) END",
     "turned": "degrees(b_heading - a_heading) + level",
     "sighted": "degrees(b_heading - atan2(dy, dx))",
-    # a's centre in b's axes, with the other sign
+    # a's centre in b's axes, with the opposite sign
     "back": "dx * cb + dy * sb",
     "side": "dy * cb - dx * sb",
-    # Between the headings; of parallel boxes two corners reach equally far, and each box takes the other one.
+    # Angle between the headings; for parallel boxes two corners reach equally far, and each box
+    # uses the corner of the other.
     "cosine": "ca * cb + sa * sb",
     "sine": "ca * sb - sa * cb",
     "co": "abs(cosine)",
     "si": "abs(sine)",
     "hand": "CASE WHEN cosine * sine < 0 THEN -1 ELSE 1 END",
-    # Edges of the octagon, along and across a's axis and b's: their distance from a's centre, how far b's
-    # centre lies beyond, and how far past their ends
+    # Edges of the octagon, along and across a's axis and b's: their distance from a's centre, the
+    # distance of b's centre beyond them, and beyond their ends
     "reach1": "la + lb * co + wb * si",
     "reach2": "wa + lb * si + wb * co",
     "reach3": "lb + la * co + wa * si",
     "reach4": "wb + la * si + wa * co",
     **BEYOND,
-    # On each of the four axes, turned so that b moves along it: b's place and speed, and from when to when the
-    # boxes overlap. No speed is 0: two that stand on an axis meet there in ages, or have met for ages.
+    # On each of the four axes, turned so that b moves along it: b's position and speed, and start
+    # and end of the overlap. A speed of 0 is replaced: two boxes at rest on an axis meet in the far
+    # future, or have met for ages.
     "drift1": "dvx * ca + dvy * sa",
     "drift2": "dvy * ca - dvx * sa",
     "drift3": "dvx * cb + dvy * sb",
@@ -198,8 +202,8 @@ PARTS: Final[Mapping[str, str]] = {
     **{f"rate{i}": f"abs(drift{i}) + 1e-200" for i in (1, 2, 3, 4)},
     **{f"meets{i}": f"(-reach{i} - place{i}) / rate{i}" for i in (1, 2, 3, 4)},
     **{f"parts{i}": f"(reach{i} - place{i}) / rate{i}" for i in (1, 2, 3, 4)},
-    # Bounds that are cheap: no two boxes are nearer than their circumscribed circles (a micrometre makes up for
-    # rounding), and of two that move straight on the distance shrinks by no more than this in a second.
+    # Cheap bounds: two boxes are never nearer than their circumscribed circles (a micrometre covers
+    # rounding), and the distance of two in straight motion shrinks by at most this in a second.
     "at_least": "planar - sqrt(la * la + wa * wa) - sqrt(lb * lb + wb * wb) - 1e-6",
     "approach": "greatest(coalesce(closing_speed, 0), 0)",
 }

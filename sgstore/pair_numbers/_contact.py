@@ -1,4 +1,4 @@
-"""How far two footprints are apart, or how deep they overlap."""
+"""Gap or overlap depth of two footprints."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 NUMBERS: Final[Mapping[str, PairFunction]] = {
-    # The nearest edge of the octagon of ``gap`` is the shortest way out of it. The octagon has at most eight
-    # edges, those of both boxes, so no other axis can separate them sooner.
+    # The nearest edge of the octagon of ``gap`` is the shortest way out of it. The octagon has at
+    # most eight edges, those of both boxes; therefore no other axis can separate them sooner.
     "clearance": PairFunction(
         "shortest distance between the footprints, or the negative depth of their overlap: the shortest way by"
         " which one must move until they only touch",

@@ -1,4 +1,4 @@
-"""Paths that cross: who comes when to where they do, and how hard they would meet."""
+"""Crossing paths: arrival times at the conflict area, and severity of an impact."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ _WESTHOFEN: Final = "Westhofen et al., Criticality Metrics for Automated Driving
 _ALLEN: Final = "Allen, Shin and Cooper, Analysis of Traffic Conflicts and Collisions, 1978"
 
 NUMBERS: Final[Mapping[str, PairFunction]] = {
-    # Of two straight paths that cross, the conflict area is where the strips that both footprints sweep meet.
+    # The conflict area of two straight crossing paths is the intersection of the strips that both
+    # footprints sweep.
     "pret": measure(
         "predicted post-encroachment time: from when one has left the area where their straight paths cross to"
         " when the other one enters it, if both keep their velocity",
@@ -74,8 +75,8 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
 }
 
 PARTS: Final[Mapping[str, str]] = {
-    # Where straight paths cross: when each centre is there, and for how long before and after its box is on the
-    # strip that the other one sweeps. Speeds of both along and across both axes.
+    # Straight crossing paths: the time when each centre is there, and the time before and after in
+    # which its box is on the strip of the other. Speeds of both along and across both axes.
     "slip_a": "a_vy * ca - a_vx * sa",
     "slip_b": "b_vy * ca - b_vx * sa",
     "along_a": "a_vx * cb + a_vy * sb",

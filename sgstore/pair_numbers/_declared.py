@@ -1,4 +1,4 @@
-"""Declarations of numbers of two entities."""
+"""Declaration of numbers of two entities."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ class PairFunction:
         Meaning, in terms of a and b.
     unit : str
     sql : str
-        Expression over columns of both entities, parts (:data:`_PARTS`) and other numbers; empty: it is looked
-        up elsewhere, and is no column of the view.
+        Expression over columns of both entities, parts (:data:`_PARTS`) and other numbers; empty
+        for a number that is looked up elsewhere and is not a column of the view.
     note : str
         Special values.
     source : str
-        Where the literature defines it.
+        Its definition in the literature.
     view : str
-        The first view that has it as a column: ``pairs``, or ``criticality``, which has all.
+        The first view with it as a column: ``pairs``, or ``criticality``, which has all.
     column : str
-        Name in the views, where it differs.
+        Name in the views, if it differs.
     alias : str
         Second name in the language.
     worse : str
-        Which values are the more critical ones: ``low`` or ``high``; empty: neither.
+        The more critical values: ``low`` or ``high``; empty for neither.
     dear : bool
-        Whether a condition on it is tested after those on the others, and a bound on the distance before.
+        True if its conditions are tested after other conditions, and after a bound on the distance.
     """
 
     doc: str
@@ -46,7 +46,7 @@ class PairFunction:
 
     @property
     def meaning(self) -> str:
-        """The documentation in one line."""
+        """Return the documentation in one line."""
         return f"{self.doc}; {self.unit}" + (f"; {self.note}" if self.note else "")
 
 

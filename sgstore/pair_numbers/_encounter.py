@@ -1,4 +1,4 @@
-"""Closest encounter and worst case: when boxes that move will be nearest, or could first meet."""
+"""Closest encounter and worst case: time of the least distance, or of the first possible contact."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
 _EGGERT: Final = "Eggert, Predictive Risk Estimation for Intelligent ADAS Functions, 2014"
 _MOVED: Final = re.compile(r"\b(lon|lat|back|side|(?:out|past|square)[1-4])\b")
 _HALVES: Final = ((1, "la", 1, 2), (2, "wa", 2, 1), (3, "lb", 3, 4), (4, "wb", 4, 3))
-"""Half extents of both boxes, each with the axis that it lies on and the one across."""
+"""Half extents of both boxes, each with its axis and the axis across."""
 
 
 def _after_3s(text: str) -> str:
-    """An expression of where b is, of where it will be after 3 s."""
+    """Replace b's position in an expression by its position after 3 s."""
     return _MOVED.sub(r"\1_3s", text)
 
 
 NUMBERS: Final[Mapping[str, PairFunction]] = {
-    # The distance of two boxes that move is a convex function of time. If they do not meet, the line that b
-    # draws past a is nearest to their Minkowski sum where a corner of that is abreast, or an edge.
+    # The distance of two moving boxes is a convex function of time. If they do not meet, b's line
+    # past a is nearest to their Minkowski sum at a corner, or at an edge.
     "dce": measure(
         "distance of closest encounter: the least that the gap will be if both keep their velocity and do not"
         " turn",
@@ -65,8 +65,8 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
 }
 
 PARTS: Final[Mapping[str, str]] = {
-    # b as a sees it move: how far its line clears the Minkowski sum of both boxes, and from when to when its
-    # centre is abreast of the corner of that which is nearest to the line, or of the edge, if one runs with it.
+    # b relative to a: the clearance between its line and the Minkowski sum of both boxes, and the
+    # time when its centre is level with the nearest corner, or with a parallel edge.
     "dotted": "dx * dvx + dy * dvy",
     "beyond": "dy * dvx - dx * dvy",
     "swath": "la * abs(drift2) + wa * abs(drift1) + lb * abs(drift4) + wb * abs(drift3)",
@@ -91,9 +91,10 @@ PARTS: Final[Mapping[str, str]] = {
     "nearest": "CASE WHEN beyond < 0 THEN -corners ELSE corners END - dotted",
     "abreast": "(nearest - edges) / nullif(rel_speed * rel_speed, 0)",
     "abreast_until": "(nearest + edges) / nullif(rel_speed * rel_speed, 0)",
-    # The first time at which discs that grow by 11.5 t²/2 each touch: the least positive root of
-    # t⁴ + pt² + qt + s, where s < 0, by Ferrari: a root z of the resolvent cubic makes two quadratics of it.
-    # Two steps of Newton's take the rounding away. What stands in abs() is not negative where it is used.
+    # The first time at which discs that grow by 11.5 t²/2 each touch: the least positive root of t⁴
+    # + pt² + qt + s, where s < 0, by Ferrari: a root z of the resolvent cubic splits it into two
+    # quadratics. Two Newton steps remove the rounding error. The values in abs() are not negative
+    # where they are used.
     "discs": "sqrt(la * la + wa * wa) + sqrt(lb * lb + wb * wb)",
     "worst_p": "(23e0 * discs - rel_speed * rel_speed) / 132.25e0",
     "worst_q": "-2 * dotted / 132.25e0",

@@ -1,4 +1,4 @@
-"""Room to get away: by accelerating, and to a stand."""
+"""Room for evasion: by acceleration, and until a stop."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
 }
 
 PARTS: Final[Mapping[str, str]] = {
-    # When b comes to the area where straight paths cross, and how far b is behind in the strip of a's way.
+    # Time when b reaches the area where straight paths cross, and b's distance behind in the strip
+    # of a's path.
     "enters_b": "cross_b - stay_b",
     "trail": "CASE WHEN lon < 0 AND out2 < 0 THEN lon_gap END",
 }

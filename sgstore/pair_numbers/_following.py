@@ -1,4 +1,4 @@
-"""One behind the other: times and accelerations along a's axis, and across it to get past."""
+"""Following: times and accelerations along a's axis, and sideways for overtaking."""
 
 from __future__ import annotations
 
@@ -124,8 +124,8 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
 }
 
 PARTS: Final[Mapping[str, str]] = {
-    # Along a's axis: speeds and accelerations of both, and how far b's rear is from a's front where b stands in
-    # the strip that a would sweep.
+    # Along a's axis: speeds and accelerations of both, and the distance from a's front to b's rear
+    # if b is in the strip that a would sweep.
     "v1": "a_vx * ca + a_vy * sa",
     "v2": "b_vx * ca + b_vy * sa",
     "a1": "a_ax * ca + a_ay * sa",
@@ -134,16 +134,17 @@ PARTS: Final[Mapping[str, str]] = {
     "closing": "v1 - v2",
     "slack": "closing * closing - 2 * lead * (a2 - a1)",
     "slack_root": "CASE WHEN slack >= 0 THEN sqrt(slack) END",
-    # b's acceleration where it makes b slower along a's axis, whichever way b moves
+    # b's acceleration if it slows b along a's axis, in both directions of movement
     "brakes": "CASE WHEN v2 * a2 < 0 THEN a2 END",
     "brakes_root": "sqrt(CASE WHEN closing * closing >= 2 * lead * brakes"
     " THEN closing * closing - 2 * lead * brakes END)",
     "braking": "CASE WHEN closing + brakes_root > 0 THEN 2 * lead / (closing + brakes_root) END",
     "reached": "CASE WHEN closing > 0 THEN lead / closing END",
     "short_by": "reach2 - abs(lat + drift2 * reached)",
-    # Two that are no farther apart than the rounding of places touch.
+    # Two entities closer than the rounding of positions touch.
     "room": f"CASE WHEN lead > {TOUCH:.0e} THEN lead END",
-    # b comes to a stand, whichever way it moves, before a that brakes as hard as it must is as slow as b.
+    # b comes to a stop, in both directions of movement, before a under the required braking is as
+    # slow as b.
     "required": "CASE WHEN room > 0 AND a2 IS NOT NULL THEN CASE WHEN closing <= 0 THEN 0"
     " WHEN v1 > 0 AND (v2 * a2 < 0 OR v2 = 0 AND a2 < 0) AND 2 * room * abs(a2) > abs(v2) * closing"
     " THEN -v1 * v1 / (2 * room - v2 * v2 / a2) ELSE a2 - closing * closing / (2 * room) END END",

@@ -1,11 +1,12 @@
-"""Heights between which a body is: what tells storeys, and flat things, from bodies.
+"""Heights of a body's lower and upper side, to distinguish storeys and flat objects from bodies.
 
-Signals hang over the road and belong to no storey: they have no such heights. What by its kind stands upright
-has no height of 0: there 0 means that it was not recorded, as in recordings that never give heights.
+Signals hang over the road and belong to no storey: they have no such heights. An upright kind never
+has height 0: there 0 means an unrecorded height, as in recordings without heights.
 
-Two bodies whose heights are apart may still be on one road, which climbs between them. They are on different
-storeys only if their lower sides differ by more than a road climbs over the distance of their centres: by a
-grade of :data:`GRADE`, up to a storey, or by the pitch of either, if it is recorded.
+Two bodies with separate heights can still be on one road that climbs between them. They are on
+different storeys only if their lower sides differ by more than a road climbs over the distance of
+their centres: by a grade of :data:`GRADE`, up to a storey, or by the pitch of one of them, if it is
+recorded.
 """
 
 from __future__ import annotations
@@ -23,46 +24,46 @@ if TYPE_CHECKING:
     Bools = NDArray[np.bool_]
 
 HUNG: Final = ("traffic_light", "stop_sign", "yield_sign", "speed_limit", "sign")
-"""Kinds that belong to no storey: the signals of the vocabulary."""
+"""Kinds without a storey: the signals of the vocabulary."""
 
 UPRIGHT: Final = (
     *("car", "truck", "van", "bus", "motorcycle", "bicycle", "trailer", "train", "vehicle"),
     *("person", "animal", "building", "pole", "barrier", "vegetation"),
 )
-"""Kinds that have a height, recorded or not: the vehicles of the vocabulary, and more."""
+"""Kinds that have a height, recorded or not: the vehicles of the vocabulary, and others."""
 
 OPTIONAL: Final = ("low", "high", "node_id", "carrier", "pitch")
-"""Columns of an entity without which a number of a pair has a value all the same.
+"""Optional columns of an entity: a number of a pair has a value without them.
 
-Heights of its lower and upper side (m), node id, that of its carrier, and its pitch (rad).
+Heights of its lower and upper side (m), node id, node id of its carrier, and its pitch (rad).
 """
 
 TOUCH: Final = 1e-4
-"""Distances that mean nothing: rounding of positions far from the origin; m."""
+"""Distances below this count as zero: rounding of positions far from the origin; m."""
 
 STOREY: Final = 2.5
-"""Difference of the lower sides from which on storeys differ, where a height is not known; m."""
+"""Least difference of the lower sides of different storeys, for an unknown height; m."""
 
 
 GRADE: Final = 0.1
-"""Grade by which a road may climb where no pitch says how steep it is."""
+"""Grade that a road may have if the pitch is unknown."""
 
 STEEPEST: Final = 0.25
-"""Greatest grade that a pitch is taken for."""
+"""Greatest grade that is derived from a pitch."""
 
 
 UNEVEN: Final = {"flat": 1, "storeys": 2, "carried": 4, "near_flat": 8, "near_storeys": 16}
-"""Bits of what a trace has that is no pair of bodies; ``near``: among what moves, and static road users."""
+"""Bits of special pairs in a trace; ``near``: among moving entities and static road users."""
 
 
 def all_level(low: Floats, high: Floats, frame: NDArray[np.int64] | None = None) -> bool:
-    """Return whether no two of some bodies are on different storeys, whichever of them share a frame.
+    """True if no two bodies are on different storeys, for any assignment to frames.
 
     Parameters
     ----------
     low, high : (N,) float64
     frame : (N,) int64, optional
-        Only those of one frame are compared.
+        Only bodies of one frame are compared.
     """
     if not len(low):
         return True
@@ -82,14 +83,14 @@ def all_level(low: Floats, high: Floats, frame: NDArray[np.int64] | None = None)
 
 
 def climb(distance: Floats, pitch_a: Floats, pitch_b: Floats) -> Floats:
-    """Height that a road may climb between two bodies; m.
+    """Return the height that a road may climb between two bodies; m.
 
     Parameters
     ----------
     distance : (K,) float64
-        Of their centres in the plane; m.
+        Plane distance of their centres; m.
     pitch_a, pitch_b : (K,) float64
-        NaN: not known; rad.
+        NaN means unknown; rad.
 
     Returns
     -------
@@ -100,19 +101,19 @@ def climb(distance: Floats, pitch_a: Floats, pitch_b: Floats) -> Floats:
 
 
 def low_and_high(z: Floats, height: Floats, hung: Bools, upright: Bools) -> tuple[Floats, Floats]:
-    """Heights of the lower and the upper side of bodies.
+    """Return the heights of the lower and the upper side of bodies.
 
     Parameters
     ----------
     z, height : (N,) float64
-        Of the centre of the box, and its extent; m.
+        Height of the centre of the box, and its extent; m.
     hung, upright : (N,) bool
-        Whether the kind is one of :data:`HUNG`, and one of :data:`UPRIGHT`.
+        Masks of the kinds in :data:`HUNG`, and in :data:`UPRIGHT`.
 
     Returns
     -------
     low, high : (N,) float64
-        Metres; NaN of signals, and where the place is not known; ``high`` also where the height is not known.
+        Metres; NaN for signals and unknown positions; ``high`` also for unknown heights.
     """
     half = np.where(upright & (height == 0), np.nan, height / 2)
     low = np.where(hung, np.nan, z - np.where(np.isnan(half), 0.0, half))
@@ -120,9 +121,9 @@ def low_and_high(z: Floats, height: Floats, hung: Bools, upright: Bools) -> tupl
 
 
 def low_and_high_sql(column: Callable[[str], str], *, upright: bool = False) -> dict[str, str]:
-    """Return the same as SQL, given the SQL of the columns ``z``, ``height`` and ``kind``.
+    """Return :func:`low_and_high` as SQL, from the SQL of the columns ``z``, ``height`` and ``kind``.
 
-    ``upright``: whether all are known to be upright, and no signals.
+    ``upright``: all bodies are known to be upright and not signals.
     """
     z, height, kind = (column(name) for name in ("z", "height", "kind"))
     if upright:

@@ -1,4 +1,4 @@
-"""Mild case: when two boxes could first meet although nobody steers, brakes or accelerates hard."""
+"""Mild case: first possible contact of two boxes without hard steering, braking or acceleration."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 _AXES: Final = (1, 2, 3, 4)
 
 NUMBERS: Final[Mapping[str, PairFunction]] = {
-    # Who accelerates by up to 2 m/s² along and across its axis is, after t, somewhere in its footprint grown by
-    # t² on each side. On one axis the shadows of such boxes are apart in at most two intervals of time: as long
-    # as b has not come, and once it is past, until the growth, which is quadratic, reaches it. The boxes first
-    # meet at the first time that lies in no interval of any of the four axes.
+    # A box that accelerates by up to 2 m/s² along and across its axis is, after t, somewhere in its
+    # footprint grown by t² on each side. On one axis the shadows of such boxes are apart in at most
+    # two intervals of time: before b has come, and after b has passed, until the quadratic growth
+    # reaches it. The boxes first meet at the first time outside the intervals of all four axes.
     "ttc_mild": measure(
         "mild-case time to collision: before it their footprints cannot touch, if both keep their heading and"
         " accelerate by at most 2 m/s² along and 2 m/s² across their axes",
@@ -40,7 +40,8 @@ PARTS: Final[Mapping[str, str]] = {
     **{f"outrun{i}": f"rate{i} + sqrt(CASE WHEN caught{i} > 0 THEN caught{i} END)" for i in _AXES},
     **{f"past_from{i}": f"2 * (reach{i} - place{i}) / outrun{i}" for i in _AXES},
     **{f"past_to{i}": f"outrun{i} / (2 * growth)" for i in _AXES},
-    # Whoever waits until the end of each interval that it is in has left all four after four times.
+    # Waiting four times until the end of the current interval leaves the intervals of all four
+    # axes.
     "mild0": f"greatest({', '.join(f'until{i}' for i in _AXES)})",
     **{
         f"mild{n}": f"greatest(mild{n - 1}, "

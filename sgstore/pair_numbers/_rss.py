@@ -16,11 +16,12 @@ _RSS: Final = (
 )
 
 _STANDS: Final = "1e-3"
-"""Speed up to which an entity stands: more than rounding leaves of one that drives across; m/s."""
+"""Greatest speed of a standing entity: above rounding for crossing traffic; m/s."""
 
 NUMBERS: Final[Mapping[str, PairFunction]] = {
-    # Response 1 s, in it accelerating by 3.5 m/s² (0.2 sideways), then braking by at least 4 m/s² (0.8 aside, 3
-    # in one's own lane against who comes), who is ahead by at most 8; 0.1 m between: as in ad-rss-lib.
+    # Response time 1 s with an acceleration of 3.5 m/s² (0.2 sideways). Then braking by at least 4
+    # m/s² (0.8 sideways, 3 in one's own lane against oncoming traffic); the vehicle ahead brakes by
+    # at most 8. The margin is 0.1 m, as in ad-rss-lib.
     "rss_lon": measure(
         "safe distance of RSS along a's axis: that the one behind, or both who come towards one another, must"
         " keep",
@@ -51,12 +52,13 @@ NUMBERS: Final[Mapping[str, PairFunction]] = {
 }
 
 PARTS: Final[Mapping[str, str]] = {
-    # Speeds towards one another, along a's axis and across it. Of two that go apart nobody chases; of one that
-    # goes away sideways even after the response, the way of stopping counts with its sign.
+    # Speeds towards each other, along a's axis and across it. Two diverging entities have no
+    # follower. For one that still moves away sideways after the response time, the stopping
+    # distance counts with its sign.
     "toward_a": "CASE WHEN lon > 0 THEN v1 WHEN lon <= 0 THEN -v1 END",
     "toward_b": "CASE WHEN lon > 0 THEN -v2 WHEN lon <= 0 THEN v2 END",
-    # Definition 2 of the source: b comes towards a, which drives towards b, or stands and faces it. All others
-    # are of one direction (definition 1), with a standing leader, too.
+    # Definition 2 of the source: b approaches a, and a drives towards b, or stands and faces it.
+    # All other pairs have one direction (definition 1), also with a standing leader.
     "meets_head_on": f"CASE WHEN toward_b > {_STANDS} AND (toward_a > {_STANDS}"
     f" OR lon > 0 AND toward_a + {_STANDS} >= 0) THEN 1 ELSE 0 END",
     "faster": "greatest(toward_a, toward_b, 0)",

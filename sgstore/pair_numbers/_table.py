@@ -22,34 +22,34 @@ if TYPE_CHECKING:
 
     from sgstore.pair_numbers._declared import PairFunction
 
-# New columns come behind.
+# New columns are appended.
 _FAMILIES: Final = (boxes, encounter, following, crossing, rss, evading, mild, contact)
 
 PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
     name: one for family in _FAMILIES for name, one in family.NUMBERS.items()
 }
-"""Numbers of two entities by name, in the order of the views; NULL where what they need is not known."""
+"""Numbers of two entities by name, in the order of the views; NULL if an input is unknown."""
 
 EXPRESSIONS: Final[Mapping[str, str]] = {
     **{name: sql for family in _FAMILIES for name, sql in family.PARTS.items()},
     **{name: one.sql for name, one in PAIR_FUNCTIONS.items() if one.sql},
 }
-"""Expressions of SQL by name: parts that numbers share, and numbers."""
+"""Expressions of SQL by name: shared parts, and numbers."""
 
 _NAME: Final = re.compile(r"\b[a-z]\w*\b(?!\()")
-"""A part: words of SQL are in capitals, functions have a bracket behind them."""
+"""A part: words of SQL are in capitals, functions are followed by a bracket."""
 
 
 MARKS: Final = frozenset({"level", "solid"})
-"""Parts that almost all numbers have; they make those of what is no pair of bodies NULL."""
+"""Parts of almost all numbers; they are NULL for special pairs, such as an entity and its carrier."""
 STOREYS: Final = "apart"
-"""Part of ``level`` that tells storeys; what is left of it tells trailers and riders."""
+"""Part of ``level`` for storeys; the rest of ``level`` handles trailers and riders."""
 Marks = frozenset[str]
 
 
 @cache
 def _expression(name: str, without: Marks) -> str:
-    """The SQL of a number or part, without some marks: where no pair needs them they cost time."""
+    """Return the SQL of a number or part, without unneeded marks, which cost time."""
     text = EXPRESSIONS[name]
     for mark in without:
         text = text.replace(f" + {mark}", "").replace(f"{mark} > 0 OR ", "")
@@ -58,13 +58,13 @@ def _expression(name: str, without: Marks) -> str:
 
 @cache
 def parts_of(name: str, without: Marks = frozenset()) -> tuple[str, ...]:
-    """The numbers, parts and columns that a number of a pair is made of."""
+    """Return the numbers, parts and columns that a number of a pair uses."""
     return tuple(sorted({*_NAME.findall(_expression(name, without))}))
 
 
 @cache
 def stage_of(name: str, without: Marks = frozenset()) -> int:
-    """Return the number of layers before a number of a pair; 0 for a column of an entity."""
+    """Return the number of layers below a number of a pair; 0 for a column of an entity."""
     if name not in EXPRESSIONS:
         return 0
     return 1 + max(stage_of(part, without) for part in parts_of(name, without))
@@ -72,13 +72,13 @@ def stage_of(name: str, without: Marks = frozenset()) -> int:
 
 @cache
 def needed_for(name: str, without: Marks = frozenset()) -> frozenset[str]:
-    """A number of a pair with all that it is made of; nothing for one that is looked up.
+    """Return a number with all its inputs, recursively; empty for a number that is looked up.
 
     Parameters
     ----------
     name : str
     without : frozenset of str
-        Those of :data:`MARKS`, and :data:`STOREYS`, that no pair needs.
+        Members of :data:`MARKS`, and :data:`STOREYS`, that no pair needs.
     """
     if name in WAYS:
         return frozenset()
@@ -89,7 +89,7 @@ def needed_for(name: str, without: Marks = frozenset()) -> frozenset[str]:
 
 
 def columns_needed(name: str) -> tuple[frozenset[str], frozenset[str]]:
-    """The columns of a and those of b without which a number of a pair is unknown: not those of heights."""
+    """Return the required columns of a and of b, without the optional columns of heights."""
     raw = [part for part in needed_for(name, MARKS) if part not in EXPRESSIONS]
     raw = [part for part in raw if part[2:] not in {*OPTIONAL, "z"}]
     a, b = (frozenset(part[2:] for part in raw if part[0] == one) for one in "ab")
@@ -100,12 +100,12 @@ def columns_needed(name: str) -> tuple[frozenset[str], frozenset[str]]:
 
 
 _WRITTEN_OUT: Final = 2000
-"""Columns that a number may be spelled out to, before DuckDB is kept from it; ``ttc`` has 1,500."""
+"""Greatest number of columns in an expanded number that DuckDB may inline; ``ttc`` has 1,500."""
 
 
 @cache
 def _spelled(name: str) -> int:
-    """Number of columns that stand in a number of a pair when each part in it is replaced by its expression."""
+    """Return the number of columns in a number when each part is replaced by its expression."""
     if name not in EXPRESSIONS:
         return 1
     return sum(
@@ -115,16 +115,17 @@ def _spelled(name: str) -> int:
 
 @cache
 def _is_apart(name: str) -> bool:
-    """Tell whether conditions on a number are not to be replaced by conditions on its parts."""
+    """True if DuckDB must not inline the number into conditions."""
     return name in MARKS or _spelled(name) > _WRITTEN_OUT
 
 
 def pair_sql(name: str, column: Callable[[str], str], without: Marks = frozenset()) -> str:
-    """A number of a pair as SQL, given the columns of what it is made of; ``without`` some marks.
+    """Return a number of a pair as SQL, from the SQL of its inputs, ``without`` some marks.
 
-    DuckDB moves a condition below a layer by writing the layer's expressions into it, which for ``wttc`` are 21
-    million columns, and a minute's work for some others. It leaves a condition where it is if a column in it is
-    volatile: so a large number is made so, at no cost, because nothing is drawn where the number is known.
+    DuckDB moves a condition below a layer by inlining the layer's expressions. For ``wttc`` these
+    are 21 million columns, and for some others it takes a minute. A volatile column prevents this.
+    Therefore a large number is made volatile, at no cost: the random function is not evaluated for
+    known values.
     """
     text = _NAME.sub(lambda found: column(found[0]), _expression(name, without))
     return f"coalesce({text}, CASE WHEN random() > 2 THEN 0 END)" if _is_apart(name) else text
@@ -132,22 +133,22 @@ def pair_sql(name: str, column: Callable[[str], str], without: Marks = frozenset
 
 _KEPT: Final = ("frame_id", "src", "dst", "src_kind", "dst_kind", "src_is_ego", "dst_is_ego")
 _BEFORE_KINDS: Final = 10
-"""Numbers before the kinds in the views, which keep the order of their columns; new ones come behind."""
+"""Numbers before the kinds in the views, which keep the order of their columns; new ones are appended."""
 
 
 def _is_of(name: str, one: str) -> bool:
-    """Tell whether something is a function (a sine, a root) of columns of a alone, or of b alone."""
+    """True for a function (a sine, a root) of columns of a alone, or of b alone."""
     return "(" in EXPRESSIONS.get(name, "") and all(
         part[:2] == f"{one}_" and part not in EXPRESSIONS for part in parts_of(name)
     )
 
 
 def _side(one: str, names: Sequence[str]) -> str:
-    """The states as those of a or b, with functions of it alone: worked out once, not for each of its pairs."""
+    """Return the states as those of a or b, with functions of one entity computed once per state."""
     made = [f"{pair_sql(name, lambda n: f'{n[2:]}::DOUBLE')} AS {name}" for name in names]
     if one == "b":
         return f"(SELECT {', '.join(['*', *made])} FROM inside.state) b"  # noqa: S608
-    # Once for each state of a, so that pairs of ordinary traces cost next to nothing.
+    # Once for each state of a, so that pairs of ordinary traces are almost free.
     bits = UNEVEN["near_flat"] | UNEVEN["near_storeys"] | UNEVEN["carried"]
     made.append(f"coalesce(t.uneven & {bits} <> 0, true) AS uneven")
     return (
@@ -162,18 +163,18 @@ _DOUBTFUL: Final = (
     " OR coalesce(a.carrier = b.node_id OR b.carrier = a.node_id OR a.carrier = b.carrier, FALSE)"
     " ELSE FALSE END AS doubtful"
 )
-"""Whether a pair may have a mark. Most have none: their boxes are solid and overlap in height."""
+"""Test for pairs with a mark. Most have none: their boxes are solid and overlap in height."""
 _CALLED: Final = {
     "a_kind": "src_kind",
     "b_kind": "dst_kind",
     "a_node_id": "src",
     "b_node_id": "dst",
 }
-"""Columns of the views that marks are made of."""
+"""Columns of the views that marks use."""
 
 
 def _marked(pairs: str) -> str:
-    """Pairs of states with their marks, which are worked out for the doubtful ones only."""
+    """Return pairs of states with their marks, computed for the doubtful pairs only."""
     heights = {
         f"{one}_{side}": made
         for one in "ab"
@@ -197,7 +198,7 @@ def _part_of_mark(name: str) -> str:
 
 
 def pairs_view(view: str = "pairs") -> tuple[str, str]:
-    """Return the statement of a view of pairs, without its head, and the documentation of what is first in it.
+    """Return the body of the statement of a view of pairs, and the documentation of its new columns.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What is told by lanes, and is no expression but looked up: distances along them, and how they run."""
+"""Numbers that are looked up from lanes: distances along them, curvature and slope."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 LANE_DIST: Final = "lane_dist"
-"""From one entity to another."""
+"""Distance along the lanes from one entity to another."""
 PART_DIST: Final = "part_dist"
-"""``lane_dist`` where one of the two is a part of the map, which is told by the labels of a query."""
+"""``lane_dist`` with one part of the map, recognised by the labels of a query."""
 
 NEXT_PARTS: Final[Mapping[str, str]] = {
     "to_junction": "junction",
@@ -26,18 +26,18 @@ NEXT_PARTS: Final[Mapping[str, str]] = {
     "to_yield_sign": "yield_sign",
     "to_speed_limit": "speed_limit",
 }
-"""Functions of one entity → the sort of the part of the map that comes next along the lanes."""
+"""Functions of one entity → the kind of the next map part along the lanes."""
 
 COURSES: Final = ("curvature", "slope")
-"""Functions of one entity that tell how the lane runs where it is: columns of ``map_course``."""
+"""Functions of one entity for the course of its lane: columns of ``map_course``."""
 
 WAYS: Final = frozenset({LANE_DIST, PART_DIST, *NEXT_PARTS, *COURSES})
 OF_ONE: Final = (*NEXT_PARTS, *COURSES)
-"""Those of one entity, which stands for both of a pair."""
+"""Functions of one entity, used for both entities of a pair."""
 
 
 def as_written(name: str, a: str, b: str) -> str:
-    """A number of a pair as the language has it, given the names of both entities."""
+    """Return a number of a pair as written in the language, with the names of both entities."""
     if name in OF_ONE:
         return f"{name}({a})"
     return f"{LANE_DIST if name == PART_DIST else name}({a}, {b})"
