@@ -1,8 +1,8 @@
-"""Abstractions: scene graphs reduced to labels, as the literature has them, and a class for each.
+"""Abstractions reduce scene graphs to labelled graphs from the literature, with a class for each graph.
 
-An abstraction is a function from columns (:class:`Seen`) to columns (:class:`Labelled`). Those that are shipped
-are listed in :data:`ABSTRACTIONS`; a client's own are registered with :func:`register`, or as an entry point of
-the group ``sgstore.abstractions``. ``classes`` says what a class is.
+An abstraction is a function from columns (:class:`GraphColumns`) to columns (:class:`Labelled`).
+:data:`ABSTRACTIONS` lists the built-in ones. Users add their own with :func:`register`, or as an
+entry point of the group ``sgstore.abstractions``. ``_classes`` defines classes.
 """
 
 import lazy_loader

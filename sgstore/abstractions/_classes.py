@@ -1,13 +1,15 @@
 """Canonical forms and class identifiers of labelled graphs.
 
-An order of the nodes of one graph that depends on the graph only, where colours do not tell all nodes apart.
+The search finds an order of the nodes that depends on the graph only, even if colours do not
+distinguish all nodes.
 
-Colour refinement leaves cells of nodes that look alike. Edges between two cells that hold for all pairs of
-their nodes, and nodes that are alone in their cells, tell nothing about which is which; without them a graph
-falls into components. Each is put in order by itself: at once if each of its cells has one node there; else by
-individualising each node of one cell in turn, refining, and keeping the order with the least form (McKay and
-Piperno: Practical graph isomorphism II, 2014). Two orders with the same form are an automorphism, and nodes
-that automorphisms map to one another need not be tried again.
+Colour refinement leaves cells of nodes that look alike. Two kinds of parts do not distinguish
+nodes: edges between two cells that exist for all pairs of their nodes, and nodes alone in their
+cells. Without them a graph splits into components. Each component is ordered by itself. If each of
+its cells has one node there, the order is clear. Otherwise each node of one cell is individualised
+in turn, the colours are refined, and the order with the smallest form is kept (McKay and Piperno:
+Practical graph isomorphism II, 2014). Two orders with the same form are an automorphism, and a node
+equivalent to a tested one need not be tested.
 """
 
 from __future__ import annotations
@@ -40,21 +42,21 @@ Form = tuple[object, ...]
 
 
 _DEEPEST: Final = 150
-"""Nodes that may be individualised one within the other."""
+"""Greatest depth of nested individualised nodes."""
 
 
 class TooSymmetricError(Exception):
-    """The work that was allowed does not suffice. Never leaves the room."""
+    """The search exceeds its work limit; the package handles it internally."""
 
 
 @dataclass(slots=True)
 class SymmetrySearch:
-    """The search for the canonical order of one graph.
+    """Search for the canonical order of one graph.
 
     Parameters
     ----------
     work : int
-        How many edges may be looked at; the same graph takes the same work on every machine.
+        Greatest number of visited edges; the same on every machine.
     """
 
     work: int
@@ -64,20 +66,20 @@ class SymmetrySearch:
     def order(
         self, colours: Sequence[int], edges: Iterable[tuple[int, int, int]]
     ) -> list[int] | None:
-        """Nodes 0, 1, … in an order that is the same up to automorphisms, however they were numbered.
+        """Return the nodes in a canonical order, the same for isomorphic graphs up to automorphisms.
 
         Parameters
         ----------
         colours : sequence of int
-            Of the nodes; numbers that mean the same in every graph.
+            Colours of the nodes; the same numbers in every graph.
         edges : iterable of (int, int, int)
-            Source, label, destination; one for a pair of nodes in one direction, no loops. The numbers of
-            labels mean the same in every graph.
+            Source, label, destination; at most one for a pair of nodes in one direction, without
+            loops. Labels have the same numbers in every graph.
 
         Returns
         -------
         list of int or None
-            ``None`` if it takes more work than is allowed.
+            ``None`` means that the search exceeds its work limit.
         """
         arcs: Arcs = {node: {} for node in range(len(colours))}
         for src, label, dst in edges:
@@ -88,7 +90,7 @@ class SymmetrySearch:
             return None
 
     def _canonical(self, arcs: Arcs, colour: dict[int, int]) -> list[int]:
-        """The order of a graph: refined, cut into components, each in order."""
+        """Return the order of a graph: refine it, split it into components, order each."""
         colour = self._refined(arcs, colour)
         sizes = Counter(colour.values())
         alone = sorted((n for n in colour if sizes[colour[n]] == 1), key=colour.__getitem__)
@@ -101,7 +103,7 @@ class SymmetrySearch:
         return alone + [node for _, order in parts for node in order]
 
     def _connected(self, arcs: Arcs, colour: dict[int, int]) -> list[int]:
-        """The order of a connected graph with stable colours."""
+        """Return the order of a connected graph with stable colours."""
         cells: dict[int, list[int]] = defaultdict(list)
         for node, of in colour.items():
             cells[of].append(node)
@@ -115,7 +117,7 @@ class SymmetrySearch:
             if _root(orbit, node) in {_root(orbit, other) for other in explored}:
                 continue
             explored.add(node)
-            # Beyond all colours there are: the node gets one of its own.
+            # A colour above all others, for this node only.
             self.depth += 1
             order = self._canonical(arcs, colour | {node: max(cells) + 1})
             self.depth -= 1
@@ -128,7 +130,7 @@ class SymmetrySearch:
         return tried[min(tried)]
 
     def _refined(self, arcs: Arcs, colour: dict[int, int]) -> dict[int, int]:
-        """Stable colours: ranks, which mean the same in every graph."""
+        """Return stable colours: ranks with the same meaning in every graph."""
         back: Arcs = {node: {} for node in arcs}
         for src, to in arcs.items():
             for dst, label in to.items():
@@ -162,7 +164,7 @@ class SymmetrySearch:
 
 
 def _telling(arcs: Arcs, colour: dict[int, int], sizes: Counter[int]) -> Arcs:
-    """The part of a graph that tells nodes of one cell apart."""
+    """Return the edges of a graph that distinguish nodes of one cell."""
     many = Counter(
         (colour[src], label, colour[dst]) for src, to in arcs.items() for dst, label in to.items()
     )
@@ -204,7 +206,7 @@ def _components_of_graph(arcs: Arcs) -> list[Arcs]:
 
 
 def _form(arcs: Arcs, colour: dict[int, int], order: Sequence[int]) -> Form:
-    """A coloured graph as its nodes in an order, and its edges by their places in it."""
+    """Return a coloured graph as its ordered nodes, and its edges by places in this order."""
     place = {node: i for i, node in enumerate(order)}
     edges = sorted(
         (place[src], place[dst], label) for src, to in arcs.items() for dst, label in to.items()
@@ -219,57 +221,55 @@ def _root(orbit: dict[int, int], node: int) -> int:
     return node
 
 
-# Classes of graphs: 128 bits of a canonical form, equal exactly if the graphs are isomorphic ----
-# Two labelled multigraphs have the same class if and only if there is a bijection of their nodes that keeps the
-# labels of nodes and, for each ordered pair of nodes, how often each label of an edge occurs (but for a
-# collision of 128-bit hashes). A class depends on its graph and on nothing else: not on the machine, not on the
-# graphs beside it.
-#
-# How. Colour refinement runs over all graphs of a block at once. Colours are 64-bit hashes and only *order* the
-# nodes; the class is the hash of the whole graph written down in that order. So a collision of colours costs
-# work and never an answer. Where colours leave several nodes alike, edges that hold between all nodes of two
-# cells are set aside, and what is left falls into components. If no component has two nodes of one colour,
-# those that look alike are interchangeable (twins are the simplest case): with stable colours, components
-# that share a colour are then isomorphic. Only what remains goes through
-# :mod:`sgstore.abstractions._classes`, with a bound on its work; beyond it the class is unknown, and says so,
-# rather than wrong.
+# Classes of graphs: 128 bits of a canonical form, equal exactly for isomorphic graphs. Two labelled
+# multigraphs have the same class if and only if there is a bijection of their nodes that preserves
+# the labels of nodes and, for each ordered pair of nodes, the count of each edge label (except for
+# a collision of 128-bit hashes). A class depends only on its graph: not on the machine, and not on
+# other graphs. Colour refinement processes all graphs of a block at once. Colours are 64-bit hashes
+# and only *order* the nodes; the class is the hash of the whole graph in that order. Therefore a
+# collision of colours costs time but never gives a wrong result. If several nodes keep the same
+# colour, edges between all nodes of two cells are ignored, and the rest splits into components. If
+# no component has two nodes of one colour, similar nodes are interchangeable (for example twins):
+# with stable colours, components that share a colour are then isomorphic. Only the other graphs
+# need the search in :mod:`sgstore.abstractions._classes`, which has a work limit. Beyond the limit
+# the class is unknown instead of wrong.
 
 Words = NDArray[np.uint64]
 
 WORK: Final = 5_000_000
-"""Edges that may be looked at to put one graph in order: some seconds."""
+"""Greatest number of visited edges for the order of one graph: some seconds."""
 
 REMEMBERED: Final = 8192
-"""Graphs whose classes are remembered, so that one that comes again costs nothing."""
+"""Number of graphs with cached classes."""
 
 _A: Final = np.uint64(0x9E3779B97F4A7C15)
 _B: Final = np.uint64(0xBF58476D1CE4E5B9)
 _C: Final = np.uint64(0x94D049BB133111EB)
 _D: Final = np.uint64(0xD6E8FEB86659FD93)
 _SHIFT: Final = np.uint64(32)
-"""Constants of SplitMix64 and of Mulvey's rrmxmx: odd, and of mixed bits."""
+"""Constants of SplitMix64 and of Mulvey's rrmxmx: odd, with mixed bits."""
 
 _EDGE: Final = np.dtype([("src", "<u4"), ("dst", "<u4"), ("low", "<u8"), ("high", "<u8")])
 
 
 def classes_of(graphs: Labelled, work: int = WORK) -> list[str]:
-    """The class of each frame's graph: 32 hexadecimal digits, or empty if it takes more than ``work``.
+    """Return the class of each frame's graph: 32 hexadecimal digits, or empty above the ``work`` limit.
 
     Raises
     ------
     ValueError
-        An edge ends at what is no node of its frame: a defect of the abstraction.
+        An end of an edge is not a node of its frame: a defect of the abstraction.
     """
     return Classes(work).of(graphs)
 
 
 class Classes:
-    """Classes of graphs, which remembers the last ones.
+    """Classes of graphs, with a cache.
 
     Parameters
     ----------
     work : int
-        Most work for one graph.
+        Work limit for one graph.
     """
 
     def __init__(self, work: int = WORK) -> None:
@@ -277,7 +277,7 @@ class Classes:
         self._known: OrderedDict[bytes, str] = OrderedDict()
 
     def of(self, *graphs: Labelled) -> list[str]:
-        """As :func:`classes_of`, of one after another: together they take as many steps as one."""
+        """Return the classes of several blocks of graphs in one pass, as :func:`classes_of`."""
         block = _Block.beside([_Block.of(one) for one in graphs])
         contents = block.contents()
         fresh = {content: i for i, content in enumerate(contents) if content not in self._known}
@@ -295,11 +295,11 @@ _TOLD[[RELATION_CODE[name] for name in OF_JUNCTION]] = True
 
 
 def contents_of(seen: GraphColumns) -> list[bytes]:
-    """256 bits for each frame; where they are equal, so is all that the abstractions made at ingest see of it.
+    """Return 256 bits per frame; frames with equal bits are equal for the abstractions of ingest.
 
-    These are its nodes, the edges that ``junction`` has, and its lanes as the ego has them. Two frames that are
-    equal in this have the same classes in ``E``, ``EL``, ``ER``, ``RSV`` and ``junction``, and none needs a
-    labelled graph if the other had one. The map has to be the same.
+    The bits cover the nodes, the edges of ``junction``, and the lanes relative to the ego. Two
+    equal frames have the same classes in ``E``, ``EL``, ``ER``, ``RSV`` and ``junction``; only one
+    of them needs a labelled graph. Both must have the same map.
     """
     lanes = ego_lanes(seen)
     own = seen.kind.astype(np.int64) * 2 + seen.is_ego
@@ -313,7 +313,7 @@ def contents_of(seen: GraphColumns) -> list[bytes]:
 
 
 def _told(sums: Words, sort: int, frame: Ints, *columns: NDArray[Any]) -> None:
-    """Add two words for each row, of a sort of rows, to the sums of its frame."""
+    """Add two hash words for each row to the sums of its frame; ``sort`` distinguishes tables."""
     if not len(frame):
         return
     words = np.full(len(frame), sort, np.uint64)
@@ -327,10 +327,10 @@ def _told(sums: Words, sort: int, frame: Ints, *columns: NDArray[Any]) -> None:
 
 @dataclass(frozen=True)
 class _Block:
-    """Graphs side by side: nodes in order of their graph, edges in order of their ends.
+    """Graphs in columns: nodes ordered by graph, edges ordered by their ends.
 
-    Parallel edges are one: the words of its label are the sums of theirs, which tell any two apart.
-    ``low`` and ``high`` are the two words of the digests of labels.
+    Parallel edges are merged: the words of the label are the sums of their words, which still
+    distinguish any two sets. ``low`` and ``high`` are the two words of the digests of labels.
     """
 
     graphs: int
@@ -374,7 +374,7 @@ class _Block:
 
     @classmethod
     def beside(cls, blocks: Sequence[_Block]) -> _Block:
-        """Several blocks as one."""
+        """Concatenate several blocks."""
         if len(blocks) == 1:
             return blocks[0]
         graphs = np.cumsum([0, *(block.graphs for block in blocks)])
@@ -396,7 +396,7 @@ class _Block:
         return cls(int(graphs[-1]), *map(np.concatenate, zip(*columns, strict=True)))
 
     def contents(self) -> list[bytes]:
-        """128 bits for each graph that are equal if nodes, edges and labels are the same."""
+        """Return 128 bits per graph, equal if nodes, edges and labels are equal."""
         of_node = _mixed(self.node.view(np.uint64) * _A + self.node_low)
         src, dst = self.node[self.src].view(np.uint64), self.node[self.dst].view(np.uint64)
         of_edge = _mixed(_mixed(src * _B + self.low) + dst * _C)
@@ -413,7 +413,7 @@ class _Block:
         return [blake2b(row.astype("<u8").tobytes(), digest_size=16).digest() for row in sums]
 
     def taken(self, rows: list[int]) -> _Block:
-        """Some of the graphs, in ascending order."""
+        """Return these graphs, in ascending order."""
         if len(rows) == self.graphs:
             return self
         number = np.full(self.graphs, -1)
@@ -436,14 +436,14 @@ class _Block:
         )
 
     def classes(self, work: int) -> list[str]:
-        """The class of each graph."""
+        """Return the class of each graph."""
         order, known = _ordered(self, _refined(self), work)
         return _hashed(self, order, known)
 
 
 @lru_cache(maxsize=64)
 def _digests(labels: tuple[str, ...]) -> NDArray[np.uint64]:
-    """(L, 2): 128 bits of each label; not to be written to."""
+    """Return 128 bits of each label as two words, (L, 2); read-only."""
     raw = b"".join(
         blake2b(label.encode("utf-8", "surrogatepass"), digest_size=16).digest() for label in labels
     )
@@ -451,7 +451,7 @@ def _digests(labels: tuple[str, ...]) -> NDArray[np.uint64]:
 
 
 def _on_edges(words: Words, bundles: tuple[tuple[int, ...], ...]) -> Words:
-    """The words of labels as edges add them up: for each label, and from the end for each bundle."""
+    """Return the hash words of labels for sums over edges: each label, then each bundle from the end."""
     words = _mixed(words)
     several = bundles[::-1]
     flat = np.array([label for bundle in several for label in bundle], np.int64)
@@ -469,7 +469,7 @@ def _mixed(words: Words) -> Words:
 
 
 def _sums(owner: Ints, values: Words, count: int) -> Words:
-    """Sums of values by owner, modulo 2⁶⁴; owners ascend."""
+    """Return sums of values by owner, modulo 2⁶⁴; owners must ascend."""
     total = np.zeros(count, np.uint64)
     if len(owner):
         starts = np.flatnonzero(np.append(True, owner[1:] != owner[:-1]))
@@ -478,10 +478,10 @@ def _sums(owner: Ints, values: Words, count: int) -> Words:
 
 
 def _refined(block: _Block) -> Words:
-    """Stable colours of the nodes.
+    """Return stable colours of the nodes.
 
-    Each graph stops by itself, when a round has told no more nodes apart: how many rounds it takes, and so
-    its colours, depend on it alone. A loop is part of the first colour.
+    Each graph stops independently, when a round distinguishes no more nodes. Therefore its number
+    of rounds and its colours depend on the graph alone. A loop is part of the first colour.
     """
     nodes = len(block.graph)
     colour = block.node_low.copy()
@@ -507,7 +507,7 @@ def _refined(block: _Block) -> Words:
 
 
 def _cells(block: _Block, colour: Words) -> Ints:
-    """Number of colours in each graph."""
+    """Return the number of colours in each graph."""
     order = np.lexsort((colour, block.graph))
     graph, of = block.graph[order], colour[order]
     fresh = np.ones(len(of), np.bool_)
@@ -516,7 +516,7 @@ def _cells(block: _Block, colour: Words) -> Ints:
 
 
 def _ordered(block: _Block, colour: Words, work: int) -> tuple[Ints, Bools]:
-    """Nodes in canonical order, graph after graph; and of which graphs it is known."""
+    """Return the nodes in canonical order, graph after graph, and a mask of ordered graphs."""
     nodes = len(block.graph)
     order = np.lexsort((colour, block.graph))
     cell = np.zeros(nodes, np.int64)
@@ -538,12 +538,12 @@ def _ordered(block: _Block, colour: Words, work: int) -> tuple[Ints, Bools]:
         found_order = _searched(block, cell, rows, number, work)
         known[number] = found_order is not None
         if found_order is not None:
-            order[rows] = found_order  # rows of a graph are consecutive, and so are their places
+            order[rows] = found_order  # the rows of a graph are contiguous, and so are their places
     return order, known
 
 
 def _components_of_block(block: _Block, cell: Ints, size: Ints) -> Ints:
-    """Components of what tells nodes of one colour apart: for each node the least row in its component."""
+    """Return for each node the smallest row in its component of distinguishing edges."""
     part = np.arange(len(cell))
     src, dst = block.src, block.dst
     rows = np.flatnonzero((src != dst) & (size[cell[src]] > 1) & (size[cell[dst]] > 1))
@@ -572,7 +572,7 @@ def _components_of_block(block: _Block, cell: Ints, size: Ints) -> Ints:
 
 
 def _searched(block: _Block, cell: Ints, rows: Ints, number: int, work: int) -> Ints | None:
-    """Rows of the nodes of one graph in canonical order, by individualisation."""
+    """Return rows of the nodes of one graph in canonical order, by individualisation."""
     first, last = np.searchsorted(block.edge_graph, [number, number + 1])
     src, dst = block.src[first:last], block.dst[first:last]
     low, high = block.low[first:last].tolist(), block.high[first:last].tolist()
@@ -591,7 +591,7 @@ def _searched(block: _Block, cell: Ints, rows: Ints, number: int, work: int) -> 
 
 
 def _hashed(block: _Block, order: Ints, known: Bools) -> list[str]:
-    """Graphs written down in an order of their nodes, and hashed."""
+    """Hash the graphs with their nodes in this order."""
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
     nodes = np.stack([block.node_low[order], block.node_high[order]], axis=1).astype("<u8")

@@ -1,7 +1,7 @@
-"""The input and output of abstractions: graphs of many frames as columns, with lane roles.
+"""Input and output of abstractions: graphs of many frames as columns, with lane roles.
 
-An abstraction is a function from :class:`GraphColumns`, what a scene graph holds of nodes and edges, to
-:class:`Labelled`, a directed multigraph for each frame whose nodes and edges have nothing but labels.
+An abstraction is a function from :class:`GraphColumns`, the nodes and edges of scene graphs, to
+:class:`Labelled`, one directed multigraph per frame with labels on nodes and edges.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ Part = tuple[NDArray[Any], ...]
 """Columns of nodes or of edges."""
 
 EGO: Final = "ego"
-"""Label of the ego in every abstraction, as the literature has it."""
+"""Label of the ego in every abstraction, as in the literature."""
 
 EGOS: Final = (EGO, "ego_car")
-"""Labels that one node of a frame has, which is called by it."""
+"""Labels of the single ego node; they serve as its name."""
 
 _SMALL: Final = np.zeros(MOST_KINDS, np.bool_)
 _SMALL[[KIND_CODE[kind] for kind in SCENERY]] = True
@@ -63,13 +63,13 @@ class MapColumns:
     kind : (K,) int8
         Codes of :data:`sgstore.vocabulary.KINDS`.
     name, lane_type, road, junction : (K,) str
-        As in :class:`sgstore.roads.MapNodes`; empty where there is none.
+        As in :class:`sgstore.roads.MapNodes`; empty if there is none.
     lane : (K,) int64
-        Number of the lane in its road; 0 for what is no lane.
+        Number of the lane in its road; 0 for other parts.
     relation : (M,) int8
         Codes of :data:`sgstore.vocabulary.RELATIONS`.
     src, dst : (M,) int64
-        Node ids, below zero.
+        Node ids, negative.
     """
 
     kind: Codes
@@ -84,7 +84,7 @@ class MapColumns:
 
     @classmethod
     def of(cls, road_map: RoadMap) -> MapColumns:
-        """Columns of a road map's nodes and edges; the same ones again as long as the map is kept."""
+        """Return the columns of a road map's nodes and edges, cached while the map is in use."""
         if (known := _MAPS.get(road_map)) is not None:
             return known
         nodes, edges = road_map.nodes, road_map.edges
@@ -107,17 +107,17 @@ class MapColumns:
 
     @cached_property
     def strands(self) -> Strands:
-        """The strands of its lanes."""
+        """Return the strands of its lanes."""
         return Strands(self)
 
     @cached_property
     def driving(self) -> Bools:
-        """(K,): whether it is a lane that is driven on."""
+        """Return a mask (K,) of the driving lanes."""
         return (self.kind == _LANE) & np.array([of in DRIVING for of in self.lane_type], np.bool_)
 
 
 _MAPS: Final[WeakKeyDictionary[RoadMap, MapColumns]] = WeakKeyDictionary()
-"""Columns of road maps; forgotten with the map."""
+"""Cached columns of road maps; removed with the map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,21 +127,21 @@ class GraphColumns:
     Attributes
     ----------
     frames : int
-        How many there are.
+        Number of frames.
     node_frame, node : (N,) int64
         Frame, counted from 0, and node id; ascending.
     kind : (N,) int8
         Codes of :data:`sgstore.vocabulary.KINDS`.
     is_ego : (N,) bool
     x, y, z, heading : (N,) float64
-        Of what moves or changes; m, rad. NaN of what stands, and where it is missing.
+        Poses of moving or changing nodes; m, rad. NaN for static nodes and for missing values.
     frame : (E,) int64
     relation : (E,) int8
         Codes of :data:`sgstore.vocabulary.RELATIONS`.
     src, dst : (E,) int64
-        Node ids. Edges among parts of the map are not here: see :meth:`lasting`.
+        Node ids. Edges among parts of the map are excluded: see :meth:`lasting`.
     ego_lane : (frames,) int64
-        Node id of the lane that the ego is in above all; 0 where there is none.
+        Node id of the ego's primary lane, or 0.
     grounds : MapColumns or None
         The road map; ``None`` without one.
     """
@@ -164,13 +164,13 @@ class GraphColumns:
 
     @classmethod
     def sorted(cls, frames: int, nodes: Mapping[str, Any], **columns: Any) -> GraphColumns:
-        """From nodes in any order: ``node_frame, node, kind, is_ego, x, y, z, heading``."""
+        """Sort nodes in any order (``node_frame, node, kind, is_ego, x, y, z, heading``) into columns."""
         order = np.lexsort((nodes["node"], nodes["node_frame"]))
         return cls(frames, **{name: of[order] for name, of in nodes.items()}, **columns)
 
     @classmethod
     def of(cls, graph: GraphBlock, kinds: Codes, grounds: MapColumns | None) -> GraphColumns:
-        """Columns of a block of scene graphs.
+        """Convert a block of scene graphs to columns.
 
         Parameters
         ----------
@@ -211,7 +211,7 @@ class GraphColumns:
         )
 
     def lasting(self, relations: Sequence[int]) -> tuple[Ints, Codes, Ints, Ints]:
-        """Edges among parts of the map, in each frame in which both their ends are present.
+        """Return edges among parts of the map, for each frame that contains both ends.
 
         Returns
         -------
@@ -235,18 +235,18 @@ class GraphColumns:
 
     @cached_property
     def is_traffic(self) -> Bools:
-        """(N,): whether a node is an entity that the literature has, which scenery is not."""
+        """Return a mask (N,) of the entities of the literature, which exclude scenery."""
         return are_entities(self.kind) & ~_SMALL[self.kind]
 
     @cached_property
     def pairs(self) -> tuple[Ints, Ints, Ints, Ints]:
-        """Ordered pairs of such entities, each once in a frame, with all that the literature has between them.
+        """Return ordered pairs of traffic entities, each once per frame, with all their relations.
 
         Returns
         -------
         frame, src, dst : (K,)
         relations : (K,)
-            Bit i stands for the relation with code i.
+            Bit i represents the relation with code i.
         """
         kept = np.flatnonzero(self.is_traffic)
         node_frame, node = self.node_frame[kept], self.node[kept]
@@ -265,7 +265,7 @@ class GraphColumns:
         return frame, node[starts[frame] + a], node[starts[frame] + b], bits
 
     def taken(self, frames: Ints) -> GraphColumns:
-        """Some of the frames, in ascending order."""
+        """Return these frames, in ascending order."""
         if len(frames) == self.frames:
             return self
         number = np.full(self.frames, -1)
@@ -287,12 +287,12 @@ class GraphColumns:
         return some
 
     def row_of(self, frame: Ints, node: Ints) -> Ints:
-        """Rows of nodes in frames; -1 where they are not in the graph."""
+        """Return rows of nodes in frames; -1 for nodes outside the graph."""
         return found(self.node_frame, self.node, frame, node)
 
 
 def _united(cell: Ints, bit: Ints, bound: int) -> tuple[Ints, Ints]:
-    """Cells below a bound that have bits, ascending, and all bits of each."""
+    """Return cells below a bound with bits, ascending, and the union of bits of each."""
     if bound <= _CELLS:
         sums = np.bincount(cell, weights=np.exp2(bit))
         cells = np.flatnonzero(sums)
@@ -302,18 +302,18 @@ def _united(cell: Ints, bit: Ints, bound: int) -> tuple[Ints, Ints]:
         bits = np.bincount(number, weights=np.exp2(bit)).astype(np.int64)
     if int(np.bitwise_count(bits).sum()) == len(cell):
         return cells, bits
-    once = np.unique(np.stack([cell, bit]), axis=1)  # sums are unions of what is there once
+    once = np.unique(np.stack([cell, bit]), axis=1)  # sums are unions if each value occurs once
     return _united(once[0], once[1], bound)
 
 
 def found(frames: Ints, nodes: Ints, frame: Ints, node: Ints) -> Ints:
-    """Rows of (frame, node) in columns that name each once; -1 where there is none."""
+    """Return rows of (frame, node) in columns of unique pairs, or -1."""
     if not len(nodes):
         return np.full(len(node), -1)
     low, span = int(nodes.min()), int(nodes.max()) - int(nodes.min()) + 1
     here = int(frames.max()) + 1
     if here * span <= _TABLE:
-        table = np.full((here + 1, span + 1), -1)  # what is beyond it lies at its edges
+        table = np.full((here + 1, span + 1), -1)  # values outside the table use its edges
         table[frames, nodes - low] = np.arange(len(nodes))
         at = node - low
         return table[np.minimum(frame, here), np.where((at < 0) | (at > span), span, at)]
@@ -331,35 +331,36 @@ def found(frames: Ints, nodes: Ints, frame: Ints, node: Ints) -> Ints:
 
 
 _TABLE: Final = 1 << 18
-"""Up to so many numbers are looked up in a table, which is faster than searching."""
+"""Greatest size of a look-up table, which is faster than a binary search."""
 
 _CELLS: Final = 1 << 23
-"""Up to so many ordered pairs are counted in a table."""
+"""Greatest number of ordered pairs that are counted in a table."""
 
 
 @dataclass(frozen=True)
 class Labelled:
-    """A directed multigraph for each of many frames, with labels on nodes and edges.
+    """One directed multigraph per frame, with labels on nodes and edges.
 
     Attributes
     ----------
     frames : int
-        How many frames there are; a frame without nodes has the empty graph.
+        Number of frames; a frame without nodes has the empty graph.
     labels : tuple of str
-        All labels, of nodes and of edges; no two are equal.
+        All distinct labels of nodes and edges.
     node_frame, node : (N,) int64
-        Frame, counted from 0, and a number that tells the nodes of a frame apart: a node id, or one that the
-        abstraction makes up. Ascending.
+        Frame, counted from 0, and a number that is unique in the frame: a node id, or a number made
+        by the abstraction. Ascending.
     node_label : (N,) int32
         Index into ``labels``.
     frame, src, dst : (E,) int64
-        Edges; both ends are nodes of the same frame. An edge may be there more than once.
+        Edges; both ends are nodes of the same frame. An edge may occur more than once.
     label : (E,) int32
-        Index into ``labels``; -1 less an index into ``bundles`` for several edges with the same ends.
+        Index into ``labels``, or -1 minus an index into ``bundles`` for several edges with the same
+        ends.
     bundles : tuple of tuple of int
         Indices into ``labels``.
     names : mapping of int to str
-        What nodes are called that are not called by their label: parts of the map.
+        Names of nodes that are not named by their label: parts of the map.
     """
 
     frames: int
@@ -384,10 +385,10 @@ class Labelled:
         names: Mapping[int, str] | None = None,
         bundles: Sequence[Sequence[int]] = (),
     ) -> Labelled:
-        """From parts: nodes ``(frame, node, label)`` in any order, edges ``(frame, src, label, dst)``.
+        """Build graphs from parts: nodes ``(frame, node, label)``, edges ``(frame, src, label, dst)``.
 
-        Labels are indices into ``labels``, which may repeat texts; one below zero stands for a bundle. A node
-        that comes twice in a frame is one.
+        Labels are indices into ``labels``, which may repeat texts; a negative one represents a
+        bundle. Nodes may have any order. A node that occurs twice in a frame is merged.
         """
         table = tuple(dict.fromkeys(labels))
         index = {text: i for i, text in enumerate(table)}
@@ -415,11 +416,11 @@ class Labelled:
         )
 
     def related(self) -> tuple[Ints, Ints, Ints, Ints]:
-        """Edges whose label is a relation, one row each: frame, source, code of the relation, destination."""
+        """Return edges whose label is a relation, one row each: frame, source, relation code, destination."""
         code = {name: i for i, name in enumerate(RELATIONS)}
         parts = [(code.get(text, -1),) for text in self.labels]
         bundles = [tuple(parts[label][0] for label in bundle) for bundle in self.bundles]
-        several = parts + bundles[::-1]  # a label below zero counts from the end
+        several = parts + bundles[::-1]  # a negative label counts from the end
         many = np.array([len(of) for of in several] or [0])
         starts = np.cumsum(many) - many
         flat = np.array([one for of in several for one in of] or [-1], np.int64)
@@ -433,10 +434,10 @@ class Labelled:
         return self.frame[edge], self.src[edge], relation[known], self.dst[edge]
 
     def named(self, number: int) -> tuple[dict[str, str], list[tuple[str, str, str]]]:
-        """One of the frames by names: nodes ``name → label``, and edges ``(name, label, name)``.
+        """Return one frame by names: nodes ``name → label``, and edges ``(name, label, name)``.
 
-        The ego and what a graph has once are called by their label, parts of a map by their name, and all
-        else ``label_node``, such as ``car_12``.
+        The ego and unique nodes are named by their label, parts of the map by their name, and all
+        others ``label_node``, such as ``car_12``.
         """
         rows = np.flatnonzero(self.node_frame == number)
         labels = [self.labels[code] for code in self.node_label[rows].tolist()]
@@ -467,7 +468,7 @@ def _columns(parts: Iterable[Part], count: int) -> list[NDArray[Any]]:
 
 
 def repeated(columns: Part) -> Bools:
-    """Mask of the rows that have come before."""
+    """Return a mask of the rows that repeat an earlier row."""
     again = np.zeros(len(columns[0]), np.bool_)
     if len(again):
         order = np.lexsort(columns)
@@ -478,31 +479,31 @@ def repeated(columns: Part) -> Bools:
     return again
 
 
-# Lanes as an ego has them: ``Ego Lane``, ``Left 1 of Ego Lane``, ``Opposing Lane 0`` and so on ----
-# A *strand* is lanes one behind the other: a lane and the only one that follows it, if that follows no other.
-# Outside of junctions and inside of them strands are apart. It is a matter of the map alone, and is found once.
+# Lanes relative to the ego: ``Ego Lane``, ``Left 1 of Ego Lane``, ``Opposing Lane 0`` and so on. A
+# *strand* is a chain of lanes: a lane and its only successor, if that has no other predecessor.
+# Strands end at the borders of junctions. They depend on the map only, and are computed once.
 
 OPPOSING: Final = 1 << 16
 """Roles from here on: ``Opposing Lane 0``, ``1``, …"""
 
 _MOST: Final = 1000
-"""Lanes to one side of the ego's that have a name."""
+"""Greatest number of named lanes on one side of the ego's lane."""
 
 UNNAMED: Final = -(1 << 21)
-"""What stands for no role among those that names say."""
+"""Role code for names without a role."""
 
 
 class Strands:
-    """The strands of a map, and how they lie beside one another.
+    """Strands of a map, and their neighbours.
 
     Attributes
     ----------
     of : (K,) int64
-        For each part of the map a node id: of the lane that stands for its strand, the one with the greatest
-        node id; 0 for what is no lane that is driven on.
+        For each part of the map the node id that represents its strand: the greatest one among its
+        lanes. 0 for other parts than driving lanes.
     named : (K,) int64
-        For each part of the map the role that its name says, as in graphs that came from elsewhere;
-        :data:`UNNAMED` where it says none.
+        For each part of the map the role in its name, as in graphs from other sources;
+        :data:`UNNAMED` without a role.
     """
 
     def __init__(self, grounds: MapColumns) -> None:
@@ -527,7 +528,7 @@ class Strands:
         return self._roles[ego]
 
     def _beside(self, grounds: MapColumns, relation: str) -> defaultdict[int, set[int]]:
-        """Strand → strands next to it on one side, that run the same way."""
+        """Map each strand to the strands next to it on one side with the same direction."""
         against = grounds.relation == RELATION_CODE["opposes"]
         pairs = set(zip(grounds.src[against].tolist(), grounds.dst[against].tolist(), strict=True))
         rows = np.flatnonzero(grounds.relation == RELATION_CODE[relation])
@@ -540,7 +541,7 @@ class Strands:
 
 
 def _strands(grounds: MapColumns) -> Ints:
-    """See :attr:`Strands.of`."""
+    """Compute :attr:`Strands.of`."""
     on = grounds.relation == RELATION_CODE["travelsTo"]
     src, dst = -1 - grounds.src[on], -1 - grounds.dst[on]
     driven = grounds.driving
@@ -564,7 +565,7 @@ def _strands(grounds: MapColumns) -> Ints:
 
 
 def role_name(role: int) -> str:
-    """Name of a lane's role in the literature."""
+    """Return the name of a lane's role in the literature."""
     if role == 0:
         return "Ego Lane"
     if role >= OPPOSING:
@@ -583,11 +584,11 @@ _ROLES: Final = {
     "lane_left": 1,
     "lane_right": -1,
 }
-"""Names of lanes with S3C and CARLASGG, and with RoadScene2Vec, whose ego is always in the middle one."""
+"""Lane names of S3C and CARLASGG, and of RoadScene2Vec, whose ego is always in the middle lane."""
 
 
 def _role_named(name: str) -> int:
-    """The role that a name says; the inverse of :func:`role_name`."""
+    """Parse a role name; the inverse of :func:`role_name`."""
     text = name.lower()
     if beside := _BESIDE.fullmatch(text):
         return int(beside[2]) * (1 if beside[1] == "left" else -1)
@@ -599,9 +600,9 @@ def _role_named(name: str) -> int:
 # The lanes of each frame as its ego has them ------------------------------------------------------
 
 OFF_ROAD: Final = -1
-"""Node id of what is off the road."""
+"""Node id of the off-road node."""
 NAMELESS: Final = -(1 << 20)
-"""Role of a lane of which nobody can say how it lies to the ego."""
+"""Role of a lane without a known place relative to the ego."""
 
 _IS_IN: Final = RELATION_CODE["isIn"]
 _NONE: Final = np.zeros(0, np.int64)
@@ -609,20 +610,20 @@ _NONE: Final = np.zeros(0, np.int64)
 
 @dataclass(frozen=True, slots=True)
 class EgoLanes:
-    """The lanes of many frames, as the ego of each has them.
+    """Lanes of many frames, relative to the ego of each frame.
 
     Attributes
     ----------
     frame, strand, role : (L,) int64
-        Lanes that are there: those that traffic is in, those beside the ego's that are in range, and those
-        whose names say their roles. ``role`` as :func:`sgstore.abstractions._columns.role_name` reads it, or
+        Present lanes: lanes with traffic, lanes next to the ego's in range, and lanes with a role
+        in their name. ``role`` as in :func:`sgstore.abstractions._columns.role_name`, or
         :data:`NAMELESS`.
     inside : tuple of (I,) int64
-        Frame, traffic, and the strand that it is in; each once.
+        Frame, traffic entity, and its strand; each once.
     inside_lane : tuple of (J,) int64
-        Frame, and a lane that traffic is in.
+        Frame, and a lane with traffic.
     off_road : tuple of (O,) int64
-        Frame, and what is off the road in it.
+        Frame, and an off-road entity.
     """
 
     frame: Ints
@@ -633,7 +634,7 @@ class EgoLanes:
     off_road: Part
 
     def taken(self, number: Ints) -> EgoLanes:
-        """Those of some frames, by the new number of each; -1: it is left out."""
+        """Return the lanes of some frames; ``number`` has the new number of each frame, or -1."""
 
         def some(frame: Ints, *columns: Ints) -> Part:
             rows = np.flatnonzero(number[frame] >= 0)
@@ -648,7 +649,7 @@ _FOUND: Final[WeakKeyDictionary[GraphColumns, EgoLanes]] = WeakKeyDictionary()
 
 
 def ego_lanes(seen: GraphColumns) -> EgoLanes:
-    """The lanes as the ego of each frame has them; none where there is no map."""
+    """Return the lanes relative to the ego of each frame; empty without a map."""
     if seen not in _FOUND:
         _FOUND[seen] = _found(seen)
     return _FOUND[seen]
@@ -670,12 +671,12 @@ def _found(seen: GraphColumns) -> EgoLanes:
 
 
 def lane_roles(seen: GraphColumns) -> tuple[Ints, Ints, list[str]]:
-    """Roles of the lanes of each frame, relative to the ego, in ``RSV``; lanes without one are left out.
+    """Return roles of the lanes of each frame, relative to the ego, in ``RSV``; without unnamed lanes.
 
     Returns
     -------
     frame, node : (N,) int64
-        Frame, counted from 0, and lane: one that is in range or that somebody is in. Ascending.
+        Frame, counted from 0, and a lane in range or with traffic. Ascending.
     role : list of str
         ``Ego Lane``, ``Left 1 of Ego Lane``, ``Opposing Lane 0`` and so on.
     """
@@ -684,7 +685,7 @@ def lane_roles(seen: GraphColumns) -> tuple[Ints, Ints, list[str]]:
     of = seen.grounds.strands.of
     lanes = ego_lanes(seen)
     said = lanes.role != NAMELESS
-    span = len(of) + 1  # node ids of lanes are below zero, and above -span
+    span = len(of) + 1  # node ids of lanes are negative, and above -span
     known = lanes.frame[said] * span - lanes.strand[said]
     order = np.argsort(known)
     known, role = known[order], lanes.role[said][order]
@@ -700,7 +701,7 @@ def lane_roles(seen: GraphColumns) -> tuple[Ints, Ints, list[str]]:
 
 
 def _inside(seen: GraphColumns) -> tuple[Ints, Ints, Ints]:
-    """Frames, traffic, and the lanes that it is in."""
+    """Return frames, traffic entities, and their lanes."""
     rows = np.flatnonzero((seen.relation == _IS_IN) & (seen.src >= 0) & (seen.dst < 0))
     entity = seen.row_of(seen.frame[rows], seen.src[rows])
     rows = rows[(entity >= 0) & seen.is_traffic[entity]]
@@ -708,7 +709,7 @@ def _inside(seen: GraphColumns) -> tuple[Ints, Ints, Ints]:
 
 
 def _roles(seen: GraphColumns, strands: Strands, inside: Part) -> tuple[Ints, Ints, Ints]:
-    """The lanes of each frame and their roles: ``(frame, strand, role)``."""
+    """Return the lanes of each frame and their roles: ``(frame, strand, role)``."""
     frame, src, strand = inside
     ego = np.where(seen.ego_lane < 0, strands.of[-1 - seen.ego_lane], 0)
     present = np.flatnonzero(seen.kind == KIND_CODE["lane"])
@@ -734,11 +735,11 @@ def _roles(seen: GraphColumns, strands: Strands, inside: Part) -> tuple[Ints, In
 
 
 def _numbered(seen: GraphColumns, inside: Part, lanes: Part) -> Ints:
-    """The roles of lanes, with the opposing ones numbered by the distance of what is in them."""
+    """Return roles of lanes; opposing lanes are numbered by the distance of their nearest entity."""
     here_frame, here, role = lanes
     distance, has_ego = _from_ego(seen)
     rows = np.flatnonzero(role == OPPOSING)
-    if not len(rows) or not len(inside[0]):  # then all of them are there by their names
+    if not len(rows) or not len(inside[0]):  # then all lanes come from names
         return role
     order = rows[np.lexsort((here[rows], here_frame[rows]))]
     frame, src, strand = inside

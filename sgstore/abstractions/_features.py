@@ -1,8 +1,8 @@
-"""Common features of labelled graphs: nodes by label, and edges by the labels of edge and ends.
+"""Features of labelled graphs: counts of nodes by label, and of edges by the labels of edge and ends.
 
-Two graphs are compared as multisets of such features with the weighted Jaccard index (Ruzicka's similarity):
-what both have, by what either has; ``sum(min) / sum(max)`` over the counts. It is 1 for isomorphic graphs, and
-for few others; 0 where nothing is shared.
+The weighted Jaccard index (Ruzicka's similarity) compares two graphs as multisets of features:
+``sum(min) / sum(max)`` over the counts. It is 1 for isomorphic graphs, and for few others; 0
+without common features.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class GraphFeatures:
-    """Features of the graphs of many frames: one row for each frame and feature that it has.
+    """Features of the graphs of many frames, one row per frame and feature.
 
     Attributes
     ----------
     frames : int
     texts : tuple of str
-        ``car``, ``(car)-[near]->(ego)``: what the features are.
+        The features, such as ``car`` and ``(car)-[near]->(ego)``.
     frame, feature, count : (K,) int64
-        Frame, index into ``texts``, and how often.
+        Frame, index into ``texts``, and count.
     """
 
     frames: int
@@ -46,12 +46,12 @@ class GraphFeatures:
 
     @classmethod
     def of(cls, graphs: Labelled) -> GraphFeatures:
-        """The features of labelled graphs."""
+        """Compute the features of labelled graphs."""
         label = graphs.node_label.astype(np.int64)
         frame, src, edge, dst = _single(graphs)
         ends = [label[found(graphs.node_frame, graphs.node, frame, end)] for end in (src, dst)]
         many = len(graphs.labels)
-        codes = (ends[0] * many + edge) * many + ends[1] + many  # beyond those of nodes
+        codes = (ends[0] * many + edge) * many + ends[1] + many  # above the codes of nodes
         cells = np.concatenate([graphs.node_frame, frame]), np.concatenate([label, codes])
         kinds, feature = np.unique(cells[1], return_inverse=True)
         cell, count = np.unique(cells[0] * max(len(kinds), 1) + feature, return_counts=True)
@@ -60,13 +60,13 @@ class GraphFeatures:
         return cls(graphs.frames, texts, at, feature, count)
 
     def counts(self, number: int) -> Counter[str]:
-        """The features of one of the frames."""
+        """Return the features of one frame."""
         rows = np.flatnonzero(self.frame == number)
         names = (self.texts[i] for i in self.feature[rows].tolist())
         return Counter(dict(zip(names, self.count[rows].tolist(), strict=True)))
 
     def likeness(self, example: Counter[str]) -> NDArray[np.float64]:
-        """(frames,): the weighted Jaccard index of each frame and an example; 1 if both are empty."""
+        """Return the weighted Jaccard index of each frame and an example, (frames,); 1 if both are empty."""
         wanted = np.array([example[text] for text in self.texts] or [0])
         both = np.minimum(self.count, wanted[self.feature])
         shared = np.bincount(self.frame, both, self.frames)
@@ -74,7 +74,7 @@ class GraphFeatures:
         return np.divide(shared, either, out=np.ones(self.frames), where=either > 0)
 
     def digests(self) -> NDArray[np.uint64]:
-        """(frames,): a number for each frame that is equal where the features are (but for a collision)."""
+        """Return a hash per frame, (frames,): equal for frames with equal features (except for collisions)."""
         mixed = np.array([_hash(text) for text in self.texts] or [0], np.uint64)
         sums = np.zeros(self.frames, np.uint64)
         np.add.at(sums, self.frame, mixed[self.feature] * self.count.astype(np.uint64))
@@ -82,14 +82,14 @@ class GraphFeatures:
 
 
 def without(graphs: Labelled, ignored: Iterable[str]) -> Labelled:
-    """Labelled graphs without some labels: nodes that have one, with their edges, and edges that have one.
+    """Remove labels from graphs: nodes with their edges, and edges.
 
     Parameters
     ----------
     graphs : Labelled
     ignored : iterable of str
-        Labels, kinds, words for several kinds (``vehicle``), relations; whatever the case. ``lane`` stands for
-        all labels that speak of one (``Ego Lane``).
+        Labels, kinds, words for several kinds (``vehicle``), relations; case-insensitive. ``lane``
+        represents all labels that contain it (``Ego Lane``).
     """
     names = list(ignored)
     dropped = np.array([_ignored(label, names) for label in graphs.labels] or [False])
@@ -114,7 +114,7 @@ def without(graphs: Labelled, ignored: Iterable[str]) -> Labelled:
 
 
 def of_frames(graphs: Labelled, chosen: Bools) -> Labelled:
-    """Labelled graphs of which only some frames (``chosen``) are not empty."""
+    """Return graphs with the frames outside ``chosen`` emptied."""
     nodes, edges = chosen[graphs.node_frame], chosen[graphs.frame]
     return replace(
         graphs,
@@ -129,7 +129,7 @@ def of_frames(graphs: Labelled, chosen: Bools) -> Labelled:
 
 
 def _single(graphs: Labelled) -> tuple[Ints, Ints, Ints, Ints]:
-    """Edges with one label a row: frame, source, label, destination."""
+    """Return edges with one label per row: frame, source, label, destination."""
     label = graphs.label.astype(np.int64)
     if not graphs.bundles:
         return graphs.frame, graphs.src, label, graphs.dst
@@ -173,6 +173,6 @@ def _ignored(label: str, names: list[str]) -> bool:
 
 
 _PLACES: Final = frozenset({"lane", "road", "junction", "crosswalk"})
-"""Words that labels of parts of the map may hold: ``Left 1 of Ego Lane``."""
+"""Words in labels of map parts, such as ``Left 1 of Ego Lane``."""
 
 _EXACT: Final = frozenset({"offroad"})

@@ -1,25 +1,26 @@
-"""Abstractions from the literature, the one of RoadScene2Vec among them.
+"""Abstractions from the literature, including the one of RoadScene2Vec.
 
-The abstractions of the literature: ``E``, ``EL``, ``ER``, ``RSV``, ``junction`` and ``SG``.
+They are ``E``, ``EL``, ``ER``, ``RSV``, ``junction`` and ``SG``.
 
-The names are those of S3C (Woodlief et al., 2024) and of CARLASGG. In all but ``SG``, entities are traffic,
-people, animals, signals and props, without the scenery (buildings, poles, barriers, vegetation); an entity is
-labelled with its kind, the ego with ``ego``; and relations are those of proximity and direction, and left and
-right. ``leads``, ``follows``, ``overlaps``, ``sees`` and ``conflictsWith`` are unknown to the literature.
+The names come from S3C (Woodlief et al., 2024) and CARLASGG. Except in ``SG``, entities are
+traffic, people, animals, signals and props, without scenery (buildings, poles, barriers,
+vegetation). An entity is labelled with its kind, the ego with ``ego``. Relations are proximity,
+direction, and left and right. The literature has no ``leads``, ``follows``, ``overlaps``, ``sees``
+and ``conflictsWith``.
 
-Where our graphs have what theirs lack, this is how it is:
+These rules apply where our graphs have more than those of the literature:
 
-* ``EL``, ``RSV``: lanes are strands (:mod:`sgstore.abstractions._columns`) that are driven on. The ego's is
-that
-  of its primary lane; those beside it that run the same way are ``Left n`` and ``Right n of Ego Lane``, and are
-  there if they are in range. Any other strand that an entity is in is an ``Opposing Lane k`` (CARLASGG's word,
-  whichever way it runs), by the distance of the nearest entity in it from the ego, then by node id; where the
-  ego's place or lane is not known, plainly a ``Lane``. All lanes are in ``Root Road``. What is off the road is
-  in ``Off Road``.
-* ``junction``: lanes, roads and junctions of the map. The sections of a road are one, as with CARLASGG: its
-  lanes are called ``Lane 5_-1``. What a thing is called does not count for the class: a lane that is driven on
-  is labelled ``Lane``, another with its type; so the same scene in another place is of the same class.
-* ``SG``: the scene graph itself, all of it; with waypoints if these were asked for at ingest.
+* ``EL``, ``RSV``: lanes are driving strands (:mod:`sgstore.abstractions._columns`). ``Ego Lane`` is
+  the strand of the ego's primary lane. Strands next to it with the same direction are ``Left n``
+  and ``Right n of Ego Lane``, if they are in range. Any other strand with an entity is an
+  ``Opposing Lane k`` (CARLASGG's word, for both directions), ordered by the distance of its nearest
+  entity from the ego, then by node id. If the ego's place or lane is unknown, the label is
+  ``Lane``. All lanes are in ``Root Road``. Off-road entities are in ``Off Road``.
+* ``junction``: lanes, roads and junctions of the map. The sections of a road are merged, as in
+  CARLASGG: its lanes have names such as ``Lane 5_-1``. Names do not count for the class: a driving
+  lane is labelled ``Lane``, another lane with its type. Therefore the same scene in another place
+  has the same class.
+* ``SG``: the complete scene graph; with waypoints if ingest was configured for them.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ ROOT_ROAD: Final = -(1 << 40)
 """Node number of ``Root Road``."""
 
 _MAPS: Final = 4
-"""Maps of which what follows from them is remembered."""
+"""Number of maps with cached results."""
 
 _IS_IN: Final = RELATION_CODE["isIn"]
 _ON_ROADS: Final = np.zeros(MOST_RELATIONS, np.bool_)
@@ -70,34 +71,34 @@ _ON_ROADS[[RELATION_CODE[r] for r in OF_JUNCTION if r not in BETWEEN_ENTITIES]] 
 
 
 def _kind_labels() -> tuple[str, ...]:
-    """Labels of nodes: the kinds by their codes, and the ego behind them."""
+    """Return the labels of nodes: the kinds by their codes, then the ego."""
     return (*KINDS, EGO)
 
 
 def entities(seen: GraphColumns) -> Labelled:
-    """``E``: the entities."""
+    """Return ``E``: the entities."""
     return Labelled.assembled(seen.frames, [_entities(seen)], [], _kind_labels())
 
 
 def related(seen: GraphColumns) -> Labelled:
-    """``ER``: the entities and their relations."""
+    """Return ``ER``: the entities and their relations."""
     labels = (*_kind_labels(), *RELATIONS)
     edges, bundles = _relations(seen)
     return Labelled.assembled(seen.frames, [_entities(seen)], [edges], labels, bundles=bundles)
 
 
 def in_lanes(seen: GraphColumns) -> Labelled:
-    """``EL``: the entities, and their lanes as the ego has them."""
+    """Return ``EL``: the entities, and their lanes relative to the ego."""
     return _with_lanes(seen, related=False)
 
 
 def road_scene(seen: GraphColumns) -> Labelled:
-    """``RSV``: the entities with their relations, and their lanes as the ego has them."""
+    """Return ``RSV``: the entities with their relations, and their lanes relative to the ego."""
     return _with_lanes(seen, related=True)
 
 
 def whole(seen: GraphColumns) -> Labelled:
-    """``SG``: the scene graph as it is."""
+    """Return ``SG``: the complete scene graph."""
     label = np.where(seen.is_ego, len(KINDS), seen.kind)
     first = len(_kind_labels())
     frame, relation, src, dst = seen.lasting(range(len(RELATIONS)))
@@ -116,7 +117,7 @@ def whole(seen: GraphColumns) -> Labelled:
 def _with_roles(
     seen: GraphColumns, grounds: MapColumns, label: Ints, first: int
 ) -> tuple[Ints, list[str]]:
-    """Labels of nodes, in which lanes whose names say their role are labelled with it; and these labels."""
+    """Return node labels and label texts, with lanes labelled by the role in their name."""
     named = grounds.strands.named
     roles = np.unique(named[named != UNNAMED])
     if not len(roles):
@@ -129,7 +130,7 @@ def _with_roles(
 
 
 def junction(seen: GraphColumns) -> Labelled:
-    """``junction``: the entities with their relations; lanes, roads and junctions of the map."""
+    """Return ``junction``: the entities with their relations; lanes, roads and junctions of the map."""
     grounds = seen.grounds
     first = len(_kind_labels())
     wanted = [RELATION_CODE[name] for name in OF_JUNCTION]
@@ -162,7 +163,7 @@ def junction(seen: GraphColumns) -> Labelled:
 
 
 def _drawn(seen: GraphColumns, kept: Bools, columns: Part, whose: Ints | None) -> Part:
-    """Edges both of whose ends are kept, between what stands for these, each once and none to itself."""
+    """Return edges between kept nodes, with merged ends, each once and without loops."""
     frame, relation, src, dst = columns
     a, b = seen.row_of(frame, src), seen.row_of(frame, dst)
     both = (a >= 0) & (b >= 0) & kept[a] & kept[b]
@@ -185,13 +186,13 @@ def _standing_for(whose: Ints, node: Ints) -> Ints:
 
 @lru_cache(maxsize=_MAPS)
 def _merged(grounds: MapColumns) -> Ints:
-    """For each part of the map the node id that stands for it: of a lane in several sections, the greatest."""
+    """Map each part to its representative node id: for a lane in several sections, the greatest."""
     found = -1 - np.arange(len(grounds.kind))
     lanes = np.flatnonzero(grounds.kind == KIND_CODE["lane"])
     first: dict[tuple[str, int, str], int] = {}
     keys = zip(grounds.road[lanes], grounds.lane[lanes].tolist(), strict=True)
     for row, (road, lane) in zip(lanes.tolist(), keys, strict=True):
-        if not road:  # it has a name and nothing else: a graph that came from elsewhere
+        if not road:  # only a name: a graph from another source
             continue
         key = (road, lane, "Lane" if grounds.driving[row] else grounds.lane_type[row])
         found[row] = first.setdefault(key, -1 - row)
@@ -200,7 +201,7 @@ def _merged(grounds: MapColumns) -> Ints:
 
 @lru_cache(maxsize=_MAPS)
 def _ground_labels(grounds: MapColumns, first: int) -> tuple[Ints, list[str]]:
-    """Label of each part of the map, from ``first`` on, and the labels."""
+    """Return the label of each part of the map, counted from ``first``, and the label texts."""
     words = {"road": "Road", "junction": "Junction", "off_road": "Off Road"}
     text: list[str] = [
         ("Lane" if driven else f"Lane ({kind_of_lane or 'none'})")
@@ -219,7 +220,7 @@ def _ground_labels(grounds: MapColumns, first: int) -> tuple[Ints, list[str]]:
 
 @lru_cache(maxsize=_MAPS)
 def _names(grounds: MapColumns | None) -> dict[int, str]:
-    """Names of parts of the map in the literature, by node id."""
+    """Return names of parts of the map as in the literature, by node id."""
     if grounds is None:
         return {}
     names: dict[int, str] = {}
@@ -248,7 +249,7 @@ def _entities(seen: GraphColumns) -> Part:
 
 
 def _relations(seen: GraphColumns) -> tuple[Part, list[list[int]]]:
-    """Edges between entities, and the bundles of labels, which follow those of the kinds, that they bear."""
+    """Return edges between entities, and their bundles of relation labels."""
     frame, src, dst, bits = seen.pairs
     distinct, number = np.unique(bits, return_inverse=True)
     first = len(_kind_labels())
@@ -272,7 +273,7 @@ def _with_lanes(seen: GraphColumns, *, related: bool) -> Labelled:
 
 
 def _lanes(seen: GraphColumns, first: int) -> tuple[list[Part], list[Part], list[str]]:
-    """Nodes, ``isIn`` edges and labels of the lanes as the ego has them; labels count from ``first``."""
+    """Return nodes, ``isIn`` edges and labels of lanes relative to the ego; labels count from ``first``."""
     is_in = len(_kind_labels()) + _IS_IN
     lanes = ego_lanes(seen)
     roots = np.unique(lanes.frame)
@@ -302,13 +303,14 @@ def _lanes(seen: GraphColumns, first: int) -> tuple[list[Part], list[Part], list
     return nodes, edges, names
 
 
-# ``roadscene2vec``: the graphs of the tool of that name (Malawade et al., 2022), with its own thresholds ----
-# Its actors (``car``, which is whatever is as large, ``moto``, ``bicycle``, ``ped``, ``light``, ``sign``) are
-# related to the ego, ``ego_car``, and to nothing else. There are three lanes in ``Root Road``: the ego is in
-# the middle one, and so is all whose centre is within 6 m to its left and right; the rest is in the left or
-# right one. A distance has the first of five names whose threshold it does not exceed; bins of direction
-# include both their ends, so that at exactly 45° there are two relations. What never moves is there without
-# relations. The tool's slips are not imitated: its angle for CARLA is the difference of yaws.
+# ``roadscene2vec``: graphs of the tool of that name (Malawade et al., 2022), with its own
+# thresholds. Its actors (``car`` for all large vehicles, ``moto``, ``bicycle``, ``ped``, ``light``,
+# ``sign``) are related to the ego, ``ego_car``, only. ``Root Road`` has three lanes. The middle
+# lane contains the ego and all actors with the centre within 6 m to its left and right; the others
+# are in the left or right lane. A distance gets the first of five names whose threshold it does not
+# exceed. Bins of direction include both ends, so that exactly 45° gives two relations. Static
+# entities have no relations. Errors of the tool are not imitated: its angle for CARLA is the
+# difference of yaws.
 
 ACTORS: Final[Mapping[str, str]] = {
     **dict.fromkeys(("car", "truck", "van", "bus", "trailer", "vehicle"), "car"),
@@ -318,7 +320,7 @@ ACTORS: Final[Mapping[str, str]] = {
     "traffic_light": "light",
     **dict.fromkeys(("stop_sign", "yield_sign", "speed_limit", "sign"), "sign"),
 }
-"""Our kinds → its actors; other kinds it does not have."""
+"""Our kinds → its actors; it has no other kinds."""
 
 PROXIMITY: Final = (
     ("near_coll", 4.0),
@@ -335,7 +337,7 @@ DIRECTIONS: Final = (
     ("atSRearOf", 90.0, 135.0),
     ("atDRearOf", 135.0, 180.0),
 )
-"""Names and bins of the bearing, either way; degrees, both ends included."""
+"""Names and bins of the bearing, to both sides; degrees, both ends included."""
 
 LANE_THRESHOLD: Final = 6.0
 """Half the width of the middle lane; m."""
@@ -357,7 +359,7 @@ _LANE_NODES: Final = ROOT_ROAD - 1 - np.arange(len(LANES))
 
 
 def roadscene2vec(seen: GraphColumns) -> Labelled:
-    """``roadscene2vec``: actors, related to the ego, in three lanes."""
+    """Return ``roadscene2vec``: actors, related to the ego, in three lanes."""
     label = np.where(seen.is_ego, _LABEL["ego_car"], _ACTOR[seen.kind])
     rows = np.flatnonzero(label >= 0)
     frames = np.arange(seen.frames)
@@ -381,7 +383,7 @@ def _all(rows: NDArray[np.signedinteger], label: str) -> NDArray[np.signedintege
 
 
 def _of_ego(seen: GraphColumns, rows: NDArray[np.signedinteger]) -> list[Part]:
-    """Lanes of all actors, and their relations to the ego; of those whose places are known."""
+    """Return the lanes of actors with a known place, and their relations to the ego."""
     ego = np.full(seen.frames, -1)
     own = np.flatnonzero(seen.is_ego)
     ego[seen.node_frame[own]] = own

@@ -1,8 +1,8 @@
-"""Abstractions: scene graphs reduced to labels, as the literature has them, and a class for each.
+"""Registry of abstractions: functions that reduce scene graphs to labelled graphs.
 
-An abstraction is a function from columns (:class:`GraphColumns`) to columns (:class:`Labelled`). Those that
-are shipped are listed in :data:`ABSTRACTIONS`; a client's own are registered with :func:`register`, or as an
-entry point of the group ``sgstore.abstractions``. ``classes`` says what a class is.
+An abstraction is a function from columns (:class:`GraphColumns`) to columns (:class:`Labelled`).
+:data:`ABSTRACTIONS` lists the built-in ones. Users add their own with :func:`register`, or as an
+entry point of the group ``sgstore.abstractions``. ``_classes`` defines classes.
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Abstraction:
-    """A way to see scene graphs.
+    """Named function from scene graphs to labelled graphs.
 
     Attributes
     ----------
     name : str
         Compared without regard to case and underscores.
     function : callable
-        From :class:`GraphColumns` to :class:`Labelled`. What it makes of a frame depends on this frame alone.
+        Function from :class:`GraphColumns` to :class:`Labelled`. The result of a frame depends on
+        this frame alone.
     """
 
     name: str
@@ -39,29 +40,30 @@ class Abstraction:
 ABSTRACTIONS: Final = tuple(
     Abstraction(name, plugins.ABSTRACTIONS.load(name)) for name in plugins.ABSTRACTIONS.own
 )
-"""Those that are shipped."""
+"""Built-in abstractions."""
 
 AT_INGEST: Final = ("E", "EL", "ER", "RSV", "junction")
-"""Those whose classes every store has from the start."""
+"""Abstractions whose classes every store has from ingest on."""
 
 _OWN: Final = {normalize_name(one.name): one for one in ABSTRACTIONS}
 _REGISTERED: dict[str, Abstraction] = {}
 
 
 def register(name: str, function: Callable[[GraphColumns], Labelled]) -> Abstraction:
-    """Make a function known under a name, in this process.
+    """Register an abstraction under a name, in this process.
 
     Parameters
     ----------
     name : str
-        Letters, digits, ``_``, ``-`` and ``.``, 64 at most.
+        Letters, digits, ``_``, ``-`` and ``.``, at most 64.
     function : callable
-        See :class:`Abstraction`. If what it does changes, so must its name: stores keep its classes.
+        See :class:`Abstraction`. A changed function needs a new name, because stores keep its
+        classes.
 
     Raises
     ------
     AbstractionError
-        The name is no name, or is taken.
+        The name is invalid or already in use.
     """
     check_name(name)
     if normalize_name(name) in abstractions():
@@ -71,7 +73,7 @@ def register(name: str, function: Callable[[GraphColumns], Labelled]) -> Abstrac
 
 
 def check_name(name: str) -> None:
-    """Refuse what is no name of an abstraction, or of a set of relations.
+    """Reject invalid names of abstractions and of sets of relations.
 
     Raises
     ------
@@ -88,7 +90,7 @@ _LONGEST: Final = 64
 
 
 def abstractions() -> dict[str, Abstraction]:
-    """All that are known, by folded name: shipped, registered, and entry points of other packages."""
+    """Return all abstractions by folded name: built-in, registered, and entry points of other packages."""
     known = _OWN | _REGISTERED
     for name, entry in plugins.ABSTRACTIONS.others().items():
         if normalize_name(name) not in known:
@@ -98,14 +100,14 @@ def abstractions() -> dict[str, Abstraction]:
 
 
 def abstraction_named(name: str) -> Abstraction:
-    """The abstraction of a name.
+    """Return the abstraction with this name.
 
     Raises
     ------
     AbstractionError
-        There is none.
+        The name is unknown.
     """
-    known = _OWN | _REGISTERED  # looking for entry points takes a while
+    known = _OWN | _REGISTERED  # the search for entry points is slow
     if normalize_name(name) in known:
         return known[normalize_name(name)]
     known = abstractions()

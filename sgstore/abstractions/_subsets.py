@@ -1,4 +1,4 @@
-"""Abstractions that are parts of the scene graph: queries see them under their names, and need no arrays."""
+"""Abstractions that are subsets of the scene graph; queries use them by name, without arrays."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SCENERY: Final = ("building", "pole", "barrier", "vegetation")
 """Kinds of entities that only ``SG`` has."""
 
 BETWEEN_ENTITIES: Final = (*PROXIMITY, *DIRECTIONS, "toLeftOf", "toRightOf")
-"""Relations among entities that the literature has."""
+"""Relations among entities in the literature."""
 
 OF_JUNCTION: Final = (
     *BETWEEN_ENTITIES,
@@ -25,12 +25,13 @@ OF_JUNCTION: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Subset:
-    """Part of the scene graph that queries see under an abstraction which adds no nodes or edges.
+    """Subset of the scene graph for queries under an abstraction without new nodes or edges.
 
     Attributes
     ----------
     parts : frozenset of str or None
-        Kinds of parts of the map among its nodes, beside those of traffic; ``None``: all kinds and relations.
+        Kinds of map parts among its nodes, in addition to traffic; ``None`` means all kinds and
+        relations.
     moving : frozenset of str
         Relations of entities, to one another and to parts of the map.
     lasting : frozenset of str
@@ -43,7 +44,7 @@ class Subset:
 
     @property
     def kinds(self) -> frozenset[str] | None:
-        """Kinds of its nodes, as far as they are known now; ``None``: all."""
+        """Return the kinds of its nodes known so far; ``None`` means all."""
         return None if self.parts is None else (entity_kinds() - {*SCENERY}) | self.parts
 
 
@@ -59,4 +60,4 @@ SUBSETS: Final[Mapping[str, Subset]] = {
     "junction": Subset(_PARTS, frozenset(OF_JUNCTION), frozenset(OF_JUNCTION)),
     "SG": Subset(None),
 }
-"""In queries lanes keep the names and the sections that they have in the map."""
+"""In queries lanes keep their names and sections of the map."""
