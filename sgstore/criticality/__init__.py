@@ -1,8 +1,9 @@
-"""Measures of criticality that need what was recorded later: how two entities met, or missed one another.
+"""Measures of criticality that need the later recording: how two entities met or missed each other.
 
-What looks ahead from one frame are numbers of pairs (:mod:`sgstore.pair_numbers`), which patterns and the
-monitor have, too. These here are asked when a drive is over: of an :class:`Encounter`, which is the tracks of
-two entities, or of a whole store by :func:`recorded`. Times are those of frames, and as fine.
+Measures that predict from one frame are numbers of pairs (:mod:`sgstore.pair_numbers`), also for
+patterns and the monitor. The measures here need the complete drive: the tracks of two entities
+(:class:`Encounter`), or a whole store (:func:`recorded`). Their time resolution is that of the
+frames.
 """
 
 import lazy_loader

@@ -1,7 +1,7 @@
-"""The closest encounter as it was recorded, from each frame on.
+"""Closest encounter in the recording, from each frame on.
 
-dce_recorded(t) (m) = min { gap(t′) : t′ ≥ t }, ttce_recorded(t) (s) = the first such t′ less t. Source:
-Eggert, Predictive Risk Estimation for Intelligent ADAS Functions, 2014.
+dce_recorded(t) (m) = min { gap(t′) : t′ ≥ t }, ttce_recorded(t) (s) = the first such t′ minus t.
+Source: Eggert, Predictive Risk Estimation for Intelligent ADAS Functions, 2014.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 
 def dce_recorded(of: Encounter) -> Floats:
-    """(T,): the least gap from each frame on; m. NaN: no gap is known any more."""
+    """Return the least gap from each frame on, (T,); m. NaN if no later gap is known."""
     gap = of.numbers["gap"]
     least = np.minimum.accumulate(np.where(np.isnan(gap), np.inf, gap)[::-1])[::-1]
     return np.where(np.isfinite(least), least, np.nan)
 
 
 def ttce_recorded(of: Encounter) -> Floats:
-    """(T,): the time until the least gap is first there, from each frame on; s."""
+    """Return the time until the least gap first occurs, from each frame on, (T,); s."""
     gap, times, least = of.numbers["gap"], of.times, dce_recorded(of)
     found = np.full(len(times), np.nan)
     when = np.nan

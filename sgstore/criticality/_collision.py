@@ -1,7 +1,8 @@
-"""TTC*: from each frame on, the time until the recorded footprints first touch.
+"""TTC*: time until the recorded footprints first touch, from each frame on.
 
-ttc_recorded(t) (s) = min { t′ − t : t′ ≥ t, the footprints of both at t′ overlap or touch }. Source: Lin and
-Althoff, CommonRoad-CriMe, IV 2023, where the road's edge counts, too, which here it does not.
+ttc_recorded(t) (s) = min { t′ − t : t′ ≥ t, the footprints of both at t′ overlap or touch }.
+Source: Lin and Althoff, CommonRoad-CriMe, IV 2023. There the road's edge counts too; here it does
+not.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def ttc_recorded(of: Encounter) -> Floats:
-    """(T,): time to the recorded collision, of each frame that has both; s. NaN: none follows."""
+    """Return the time to the recorded collision from each common frame, (T,); s. NaN without a collision."""
     times = of.times
     met = np.where(of.numbers["gap"] <= 0, times, np.inf)
     first = np.minimum.accumulate(met[::-1])[::-1]

@@ -1,4 +1,4 @@
-"""Tracks of two entities, and when the footprint of one is where that of the other one is at another time."""
+"""Tracks of two entities, and the times when they cover the same place."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ if TYPE_CHECKING:
     from sgstore.world import Bools, Floats, Ints
 
 _BLOCK: Final = 16
-"""States that are bounded by one circle."""
+"""States with a common bounding circle."""
 _CIRCLES: Final = 1 << 20
-"""Pairs of such circles whose distances are looked at together."""
+"""Pairs of circles whose distances are computed together."""
 _TOGETHER: Final = 256
-"""Pairs of circles that are looked into at once."""
+"""Pairs of circles whose states are compared together."""
 
 
 @dataclass(frozen=True)
 class Track:
-    """States of an entity in the frames of a trace that have it.
+    """States of an entity in its frames of a trace.
 
     Attributes
     ----------
     times : (n,) float64
         Ascending; s.
     states : (n, 10) float64
-        ``x, y, z, heading, length, width, vx, vy, ax, ay``, as :class:`~sgstore.pair_numbers.PairNumbers` takes
-        them.
+        ``x, y, z, heading, length, width, vx, vy, ax, ay``, as input of
+        :class:`~sgstore.pair_numbers.PairNumbers`.
     """
 
     times: Floats
@@ -44,7 +44,7 @@ class Track:
 
     @cached_property
     def circles(self) -> tuple[Floats, Floats, Floats]:
-        """Centre and radius of a circle around the footprints of each block of states."""
+        """Return centre and radius of a circle around the footprints of each block of states."""
         count = -(-len(self) // _BLOCK)
         rows = np.minimum(np.arange(count * _BLOCK), len(self) - 1).reshape(count, _BLOCK)
         x, y = self.states[rows, 0], self.states[rows, 1]
@@ -56,12 +56,12 @@ class Track:
 
 @dataclass(frozen=True)
 class Encounter:
-    """Two entities of one trace, of which a is the one that is judged.
+    """Tracks of two entities of one trace; the measures judge a.
 
     Attributes
     ----------
     a, b : Track
-        Their tracks; they need not begin or end together.
+        Their tracks, with independent begin and end.
     """
 
     a: Track
@@ -69,7 +69,7 @@ class Encounter:
 
     @cached_property
     def together(self) -> tuple[Ints, Ints]:
-        """Rows of a and of b in the frames that have both."""
+        """Return the rows of a and of b in their common frames."""
         _, rows_a, rows_b = np.intersect1d(
             self.a.times, self.b.times, assume_unique=True, return_indices=True
         )
@@ -77,22 +77,22 @@ class Encounter:
 
     @property
     def times(self) -> Floats:
-        """(T,): times of the frames that have both; s."""
+        """Return the times of the common frames, (T,); s."""
         return self.a.times[self.together[0]]
 
     @cached_property
     def numbers(self) -> PairNumbers:
-        """Numbers of the pair in the frames that have both."""
+        """Return the numbers of the pair in their common frames."""
         rows_a, rows_b = self.together
         return PairNumbers(self.a.states[rows_a], self.b.states[rows_b])
 
     @cached_property
     def known(self) -> bool:
-        """Whether the footprints are known in every frame."""
+        """True if the footprints are known in every frame."""
         return not any(np.isnan(one.states[:, [0, 1, 3, 4, 5]]).any() for one in (self.a, self.b))
 
     def crossings(self) -> Iterator[tuple[Ints, Ints]]:
-        """Rows of a and of b whose footprints overlap or touch, each at its own time; some thousand at once."""
+        """Yield rows of a and of b whose footprints overlap or touch at different times, in chunks."""
         if not self.known:
             return
         (x1, y1, r1), (x2, y2, r2) = self.a.circles, self.b.circles
@@ -106,7 +106,7 @@ class Encounter:
                 yield self._touching(first + blocks_a[part], blocks_b[part])
 
     def _touching(self, blocks_a: Ints, blocks_b: Ints) -> tuple[Ints, Ints]:
-        """Rows of a and of b, of some pairs of blocks, whose footprints overlap or touch."""
+        """Return rows in pairs of blocks whose footprints overlap or touch."""
         inner = np.arange(_BLOCK)
         rows_a = (blocks_a[:, None] * _BLOCK + inner)[:, :, None]
         rows_b = (blocks_b[:, None] * _BLOCK + inner)[:, None, :]
@@ -118,7 +118,7 @@ class Encounter:
 
 
 def _touch(a: Floats, b: Floats) -> Bools:
-    """(K,): whether the boxes of each pair overlap or touch."""
+    """Return a mask of the pairs of boxes that overlap or touch, (K,)."""
     apart = np.hypot(a[:, 0] - b[:, 0], a[:, 1] - b[:, 1])
     reach = (np.hypot(a[:, 4], a[:, 5]) + np.hypot(b[:, 4], b[:, 5])) / 2
     found = apart <= reach * (1 + 1e-9)

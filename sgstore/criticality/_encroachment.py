@@ -1,12 +1,12 @@
-"""Encroachment: who was where both drove, and when the other one came.
+"""Encroachment: times when both entities were in their conflict area.
 
-The conflict area of two tracks is what the footprints of both cover, each at some time. Somebody is in it
-while its footprint overlaps one of the other one's, whenever that was there. It comes in with the first frame
-in which it does, and has left with the first frame after the last one.
+The conflict area of two tracks is the area that both footprints cover, at any time. An entity is in
+it while its footprint overlaps any footprint of the other entity, at any time. It enters with the
+first such frame, and leaves with the first frame after the last one.
 
-* PET (s) = entry of the second one − exit of the first one. Source: Allen, Shin and Cooper, Analysis of
-  Traffic Conflicts and Collisions, 1978.
-* ET (s) = exit − entry of one. Source: the same.
+* PET (s) = entry of the second entity − exit of the first entity. Source: Allen, Shin and Cooper,
+  Analysis of Traffic Conflicts and Collisions, 1978.
+* ET (s) = exit − entry of one entity. Source: the same.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Encroachment:
-    """When both were in their conflict area; s. NaN: there is none, or the recording does not say it.
+    """Times of both entities in their conflict area; s. NaN means no area or an unknown time.
 
     Attributes
     ----------
@@ -38,9 +38,9 @@ class Encroachment:
 
 
 def encroachment(of: Encounter) -> Encroachment:
-    """When both were in the area that the footprints of both cover.
+    """Return entry and exit times of both entities in their conflict area.
 
-    Unknown are the entry of who is in it in its first frame, and the exit of who is in it in its last one.
+    An entry is unknown if the first frame is in the area, and an exit if the last frame is.
     """
     inside = [np.zeros(len(one), np.bool_) for one in (of.a, of.b)]
     for rows in of.crossings():
@@ -61,9 +61,10 @@ def _span(track: Track, inside: Bools) -> tuple[float, float]:
 
 
 def pet(of: Encounter) -> float:
-    """Post-encroachment time; s.
+    """Return the post-encroachment time; s.
 
-    NaN where there is no conflict area, both were in it at once, or the recording begins or ends within.
+    NaN without a conflict area, if both were in it at once, or if the recording begins or ends in
+    it.
     """
     when = encroachment(of)
     if when.leaves_a <= when.enters_b:
@@ -74,6 +75,6 @@ def pet(of: Encounter) -> float:
 
 
 def et_recorded(of: Encounter) -> float:
-    """Encroachment time: how long a was in the area; s. NaN where its entry or its exit is not known."""
+    """Return the encroachment time: how long a was in the area; s. NaN for an unknown entry or exit."""
     when = encroachment(of)
     return when.leaves_a - when.enters_a

@@ -1,8 +1,8 @@
 """Exposure to a short time to collision, over the frames of an encounter.
 
-TET (s) = Σ Δt over frames with ttc ≤ τ, TIT (s²) = Σ (τ − ttc) Δt over the same; Δt from a frame to the next
-one. Source: Minderhoud and Bovy, Extended Time-to-Collision Measures for Road Traffic Safety Assessment, AAP
-33, 2001.
+TET (s) = Σ Δt over frames with ttc ≤ τ, TIT (s²) = Σ (τ − ttc) Δt over the same frames; Δt is the
+time to the next frame. Source: Minderhoud and Bovy, Extended Time-to-Collision Measures for Road
+Traffic Safety Assessment, AAP 33, 2001.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ if TYPE_CHECKING:
     from sgstore.criticality._encounter import Encounter
 
 TAU: Final = 2.0
-"""Time to collision up to which somebody is exposed; s."""
+"""Time to collision at or below which an entity is exposed; s."""
 
 
 def tet(of: Encounter, tau: float = TAU) -> float:
-    """Time exposed to a time to collision of at most ``tau``; s."""
+    """Return the total time with a time to collision of at most ``tau``; s."""
     return _summed(of, tau, 0)
 
 
 def tit(of: Encounter, tau: float = TAU) -> float:
-    """The same, each moment weighted by how far below it is; s²."""
+    """Return the exposed time, weighted by the distance of the time to collision below ``tau``; s²."""
     return _summed(of, tau, 1)
 
 

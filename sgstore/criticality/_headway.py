@@ -1,7 +1,8 @@
-"""Headway as it was recorded: until a was where b is now.
+"""Recorded headway: time until a is at b's present place.
 
-headway_recorded(t) (s) = min { t′ − t : t′ ≥ t, the footprint of a at t′ touches the one of b at t }. Source:
-Jansson, Collision Avoidance Theory, 2005, whose path is the recorded one here, so that it may bend.
+headway_recorded(t) (s) = min { t′ − t : t′ ≥ t, the footprint of a at t′ touches the one of b at t
+}. Source: Jansson, Collision Avoidance Theory, 2005. Here the path is the recorded one, so that it
+can bend.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def headway_recorded(of: Encounter) -> Floats:
-    """(T,): the time until a came to where b is, of each frame that has both; s. NaN: it never did."""
+    """Return the time until a reaches b's place, from each common frame, (T,); s. NaN if it never does."""
     comes = np.full(len(of.b), np.inf)
     for rows_a, rows_b in of.crossings():
         later = of.a.times[rows_a] - of.b.times[rows_b]

@@ -1,8 +1,9 @@
-"""Crash potential index: how likely braking alone would not have sufficed, over the frames of an encounter.
+"""Crash potential index: probability that braking alone would not be enough.
 
-CPI = mean over frames of P(MADR < −a_long_req), with the maximum available deceleration MADR normal about
-8.45 m/s² with a deviation of 1.40 m/s², between 4.23 and 12.68 m/s². Source: Cunto and Saccomanno, Microlevel
-Traffic Simulation Method for Assessing Crash Potential at Intersections, TRB 2007.
+CPI = mean over frames of P(MADR < −a_long_req). The maximum available deceleration MADR has a
+normal distribution around 8.45 m/s² with a deviation of 1.40 m/s², between 4.23 and 12.68 m/s².
+Source: Cunto and Saccomanno, Microlevel Traffic Simulation Method for Assessing Crash Potential at
+Intersections, TRB 2007.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ _MOST: Final = 12.68
 
 
 def _below(deceleration: float) -> float:
-    """Probability that somebody can brake by less."""
+    """Return the probability that a vehicle's braking limit is below this deceleration."""
     return (1 + math.erf((deceleration - _MEAN) / _DEVIATION / math.sqrt(2))) / 2
 
 
 def crash_probability(deceleration: Floats) -> Floats:
-    """(n,): probability that a deceleration is more than a vehicle can reach; NaN where it is NaN. m/s²."""
+    """Return the probability that a vehicle cannot reach a deceleration (m/s²), (n,); NaN for NaN."""
     low, high = _below(_LEAST), _below(_MOST)
     found = np.where(deceleration >= _MOST, 1.0, 0.0)
     for row in np.flatnonzero((deceleration > _LEAST) & (deceleration < _MOST)).tolist():
@@ -37,10 +38,10 @@ def crash_probability(deceleration: Floats) -> Floats:
 
 
 def cpi(of: Encounter) -> float:
-    """Crash potential index; 0 … 1.
+    """Return the crash potential index, 0 … 1.
 
-    Frames in which b is not ahead in a's way count as 0, those in which a touches it and does not leave as 1;
-    those in which what it takes is not known do not count. NaN: there are no others.
+    Frames without b ahead in a's path count as 0, frames with contact and without separation as 1;
+    frames with an unknown required deceleration do not count. NaN if no frame counts.
     """
     numbers = of.numbers
     needed = -numbers["a_long_req"]

@@ -1,4 +1,4 @@
-"""The recorded measures by name, and those of a store: the ego with each of those that it could meet."""
+"""Recorded measures by name, and their values in a store for the ego and each possible partner."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ _STATES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class RecordedMeasure:
-    """A measure of an encounter: the function of this room that is called so.
+    """Measure of an encounter, implemented by the function of this package with the same name.
 
     Attributes
     ----------
     name : str
     doc, unit : str
     least : bool
-        Whether the least of the values in the frames is that of the encounter, and not the first one.
+        True if the value of the encounter is the least value of the frames, and not the first one.
     worse : str
-        Which values are the more critical ones: ``low`` or ``high``; empty: neither.
+        The more critical values: ``low`` or ``high``; empty for neither.
     """
 
     name: str
@@ -46,11 +46,11 @@ class RecordedMeasure:
 
     @property
     def meaning(self) -> str:
-        """The documentation in one line."""
+        """Return the documentation in one line."""
         return f"{self.doc}; {self.unit}; of what was recorded: the same in each frame of a trace"
 
     def value(self, encounter: Encounter) -> float:
-        """The value of an encounter; NaN: not known, or there is none."""
+        """Return the value of an encounter; NaN means unknown or undefined."""
         of = getattr(import_module("sgstore.criticality"), self.name)
         found = np.atleast_1d(of(encounter))
         if self.least:
@@ -100,9 +100,9 @@ RECORDED: Final = {
 
 
 _FRAMES: Final = 2**24
-"""Ids that frames of one trace may have: a range, by which the database finds them."""
+"""Range of frame ids per trace, which makes database look-ups fast."""
 FIXED_KINDS: Final = f"({', '.join(map(literal, _FIXED))})"
-"""Kinds of what nobody meets, because it stands fast, as SQL has them."""
+"""Fixed kinds, which nothing can meet, as SQL."""
 
 _columns = ", ".join(f"{column}::DOUBLE AS s{i}" for i, column in enumerate(_STATES))
 TRACKS: Final = f"""
@@ -110,14 +110,14 @@ TRACKS: Final = f"""
   FROM {{nodes}} n JOIN frames f USING (frame_id)
   WHERE n.frame_id BETWEEN $1::BIGINT * {_FRAMES} AND $1::BIGINT * {_FRAMES} + {_FRAMES - 1}
     AND n.kind NOT IN {FIXED_KINDS}"""  # noqa: S608  names of ours
-"""The statement for the states of a trace, in a view ``nodes``, of which :func:`tracks_of` makes tracks."""
+"""Statement for the states of a trace from a view ``nodes``, as input of :func:`tracks_of`."""
 
 KNOWN: Final = "known "
-"""What stands before the name of a measure of all that is known, beyond the graphs, too."""
+"""Prefix of the name of a measure of all known states, also outside the graphs."""
 
 
 def tracks_of(found: Mapping[str, Any]) -> list[tuple[int, str, bool, Track]]:
-    """Tracks of entities, by node id: with the kind, and whether it is ever the ego.
+    """Return tracks of entities by node id, with the kind and True for an ego.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def tracks_of(found: Mapping[str, Any]) -> list[tuple[int, str, bool, Track]]:
 
 
 class _Asked(Protocol):
-    """The file of a store, as far as it is asked here."""
+    """File of a store, with the methods used here."""
 
     def arrays(self, sql: str, parameters: Sequence[object] | None = None) -> Mapping[str, Any]: ...
     def rows(self, sql: str) -> Any: ...
@@ -156,9 +156,9 @@ class _Store(Protocol):
 
 
 def encounters(store: _Store, trace: str) -> Iterator[tuple[int, int, str, Encounter]]:
-    """The ego of a trace with each of those that it could meet: node ids of both, the kind, the tracks.
+    """Yield the ego of a trace with each possible partner: node ids of both, kind, tracks.
 
-    They are known beyond the graphs, too, out to ``[range] world``.
+    The states include known ones outside the graphs, up to ``[range] world``.
 
     Parameters
     ----------
@@ -177,9 +177,9 @@ def encounters(store: _Store, trace: str) -> Iterator[tuple[int, int, str, Encou
 
 
 def recorded(store: _Store, measures: Sequence[str] = tuple(RECORDED)) -> Any:
-    """Recorded measures of each ego with each of those that it could meet; a row for each pair and trace.
+    """Return the recorded measures of each ego with each possible partner, one row per pair and trace.
 
-    They are those of the view ``encounters``.
+    The values come from the view ``encounters``.
 
     Parameters
     ----------
@@ -190,12 +190,13 @@ def recorded(store: _Store, measures: Sequence[str] = tuple(RECORDED)) -> Any:
     Returns
     -------
     Rows
-        ``trace``, ``src``, ``dst``, ``kind``, and each measure. ``None``: not known, or there is none.
+        ``trace``, ``src``, ``dst``, ``kind``, and each measure. ``None`` means unknown or
+        undefined.
 
     Raises
     ------
     ConfigError
-        There is no such measure.
+        The measure is unknown.
     """
     wrong = next((name for name in measures if name not in RECORDED), None)
     if wrong is not None:
