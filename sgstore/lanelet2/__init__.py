@@ -1,11 +1,12 @@
-"""Lanelet2 maps (``.osm``) → text of plain lanes, which is what a store keeps of a map that is no OpenDRIVE.
+"""Conversion of Lanelet2 maps (``.osm``) to text of plain lanes, the form of maps without OpenDRIVE in a store.
 
-``document`` reads the text into points, ways and relations · ``projection`` turns latitude and longitude into
-metres · ``lanes`` makes lanes of lanelets, and signals and crosswalks of what stands beside and on them.
+``_document`` reads the text into points, ways and relations. ``_projection`` converts latitude and
+longitude to metres. ``_lanes`` makes lanes of lanelets, and signals and crosswalks of other
+elements.
 
-A lanelet lies between two ways; those that share a way lie side by side, and those whose ways end in the same
-points follow one another. Lanelets of crosswalks are no lanes but crosswalks, as they are in OpenDRIVE. What
-cannot be used is left out and named in the map's warnings.
+A lanelet is between two ways. Lanelets that share a way are neighbours; lanelets whose ways end in
+the same points are consecutive. Lanelets of crosswalks become crosswalks instead of lanes, as in
+OpenDRIVE. Unusable elements are left out and named in the map's warnings.
 
 Source: the tagging rules of Lanelet2 (``LaneletAndAreaTagging.md``, ``RegulatoryElementTagging.md``,
 ``LinestringTagging.md``), Karlsruhe Institute of Technology, BSD-3.

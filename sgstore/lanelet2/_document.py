@@ -1,4 +1,4 @@
-"""Text of OpenStreetMap's XML → points in metres, ways and relations."""
+"""Conversion of OpenStreetMap XML to points in metres, ways and relations."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 MAX_CHARACTERS: Final = 256 << 20
 MAX_ELEMENTS: Final = 8_000_000
 _FAR: Final = 1e8
-"""Greatest distance of a place from the origin; m."""
+"""Greatest distance of a point from the origin; m."""
 _NODE_TAGS: Final = ("ele", "local_x", "local_y")
 
 
 @dataclass(slots=True)
 class OsmElement:
-    """A node, way or relation; ``members``: type, id and role of each, of a way its nodes."""
+    """Node, way or relation; ``members`` has type, id and role of each member, or a way's nodes."""
 
     kind: str
     ident: str
@@ -33,13 +33,13 @@ class OsmElement:
     place: tuple[str, str] = ("", "")
 
     def members_of(self, role: str, kind: str = "way") -> list[str]:
-        """Ids of the members of a role."""
+        """Return the ids of the members with this role."""
         return [ref for what, ref, own in self.members if own == role and what == kind]
 
 
 @dataclass(slots=True)
 class OsmDocument:
-    """A map: lines (n, 3) by the ids of ways, with their nodes and tags, and the relations."""
+    """Map as lines (n, 3) by way id, with their nodes and tags, and the relations."""
 
     lines: dict[str, Floats]
     nodes: dict[str, list[str]]
@@ -49,12 +49,12 @@ class OsmDocument:
 
 
 def read_osm(text: str, projection: Projection) -> OsmDocument:
-    """The points, ways and relations of a text.
+    """Parse the points, ways and relations of a text.
 
     Raises
     ------
     MapError
-        The text is no XML, no OpenStreetMap data, or exceeds a bound.
+        The text is not XML, not OpenStreetMap data, or exceeds a limit.
     """
     if len(text) > MAX_CHARACTERS:
         raise MapError(f"{len(text):,} characters; a map may have {MAX_CHARACTERS:,}")
@@ -122,7 +122,7 @@ def _number(text: str) -> float:
 
 
 class _OsmBuilder:
-    """Handler of events of XML: elements as they come, but for those that an editor marks as deleted."""
+    """Handler of XML events; skips elements that an editor marks as deleted."""
 
     def __init__(self) -> None:
         self.elements: list[OsmElement] = []
@@ -130,7 +130,7 @@ class _OsmBuilder:
         self._open: OsmElement | None = None
 
     def start(self, tag: str, attributes: dict[str, Any]) -> None:
-        """An element starts."""
+        """Handle the start of an element."""
         self._depth += 1
         if self._depth == 1 and tag != "osm":
             raise MapError(f"the root element is <{tag[:80]}>, expected <osm>")
@@ -152,5 +152,5 @@ class _OsmBuilder:
                 self._open.members.append((kind, ref, role))
 
     def end(self, _tag: str) -> None:
-        """An element ends."""
+        """Handle the end of an element."""
         self._depth -= 1

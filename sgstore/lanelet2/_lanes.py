@@ -1,4 +1,4 @@
-"""Lanelets, regulatory elements, signs and stop lines → text of plain lanes, signals and crosswalks."""
+"""Conversion of lanelets, regulatory elements, signs and stop lines to text of plain lanes."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ _TYPES: Final = {
     "rail": "rail",
     CROSSWALK: CROSSWALK,
 }
-"""Subtypes of lanelets, of Lanelet2 and Autoware → types of lanes as OpenDRIVE has them."""
+"""Subtypes of lanelets, of Lanelet2 and Autoware → lane types of OpenDRIVE."""
 
 _OF_PARTICIPANT: Final = (("vehicle", "driving"), ("bicycle", "biking"), ("pedestrian", "sidewalk"))
-"""What may use a lanelet → type of its lane, the first that fits."""
+"""Participant of a lanelet → type of its lane; the first match counts."""
 _BOTH_WAYS: Final = frozenset({CROSSWALK, "walkway", "shared_walkway", "stairs", "pedestrian_lane"})
-"""Subtypes that one goes along both ways, unless they say otherwise."""
+"""Subtypes that are used in both directions by default."""
 _YES: Final = frozenset({"yes", "true", "1"})
 _PAINTED: Final = frozenset({"line_thin", "line_thick"})
 _CROSSED: Final = {
@@ -66,19 +66,19 @@ _CROSSED: Final = {
     "dashed_solid": (False, True),
     "solid_dashed": (True, False),
 }
-"""Subtype of a painted line → whether one may change from its right to its left, and back."""
+"""Subtype of a painted line → permission to change from its right to its left, and back."""
 _SPEED: Final = re.compile(r"(\d+(?:\.\d+)?)\s*(km/?h|kmph|mph|m/s|mps)?", re.IGNORECASE)
 _UNITS: Final = {"mph": 0.44704, "m/s": 1.0, "mps": 1.0}
 _COUNTRY: Final = re.compile(r"^[a-z]{2}(?=[A-Z0-9])")
-"""The country before the code of a sign: ``de205``, ``usR1-1``."""
+"""Country prefix of a sign code: ``de205``, ``usR1-1``."""
 _MOST_BESIDE: Final = 100
-"""Lanelets that one way may bound, or that may meet in one place."""
+"""Greatest number of lanelets along one way, or at one place."""
 _SHORTEST: Final = 0.01
-"""Least length of the line of a signal: one that stands upright has none from above; m."""
+"""Least length of the line of a signal, because an upright signal is a point from above; m."""
 
 
 class _Lanelet(NamedTuple):
-    """A lanelet between two lines, both in its own direction, with the nodes that they begin and end in."""
+    """Lanelet between two lines, both in its own direction, with their first and last nodes."""
 
     element: OsmElement
     left: Floats
@@ -90,20 +90,20 @@ class _Lanelet(NamedTuple):
 
 
 def lanelet2_text(text: str, projection: Projection | None = None) -> str:
-    """The text of plain lanes (:func:`sgstore.roads.lane_text`) that a Lanelet2 map makes.
+    """Convert a Lanelet2 map to the text of plain lanes (:func:`sgstore.roads.lane_text`).
 
     Parameters
     ----------
     text : str
-        Of an ``.osm`` file. Untrusted: time and memory are bounded by its length.
+        Text of an ``.osm`` file. It is untrusted: its length bounds time and memory.
     projection : Projection, optional
-        From latitude and longitude to metres, if not all points have ``local_x`` and ``local_y``. Without it,
-        the coordinates are those of UTM.
+        Projection from latitude and longitude to metres, if some points lack ``local_x`` and
+        ``local_y``. The default is UTM.
 
     Raises
     ------
     MapError
-        The text is no XML, no Lanelet2 map, exceeds a bound, or has no lanelet that can be used.
+        The text is not XML or not a Lanelet2 map, exceeds a limit, or has no usable lanelet.
     """
     document = read_osm(text, projection or Projection())
     lanelets = _lanelets(document)
@@ -136,11 +136,11 @@ def lanelet2_text(text: str, projection: Projection | None = None) -> str:
 
 
 _AREAS: Final = {"building": "building", "vegetation": "vegetation", "traffic_island": "prop"}
-"""Subtype of an area on which nobody drives → kind of an object."""
+"""Subtype of an area without traffic → kind of an object."""
 
 
 def _areas(document: OsmDocument) -> list[PlainObject]:
-    """Areas on which nobody drives or walks, by their outer borders; others are counted."""
+    """Return areas without traffic by their outer borders; other areas are counted in a warning."""
     found: list[PlainObject] = []
     left: Counter[str] = Counter()
     broken: list[str] = []
@@ -167,7 +167,7 @@ def _areas(document: OsmDocument) -> list[PlainObject]:
 
 
 def _ring(document: OsmDocument, ways: Sequence[str]) -> Floats:
-    """The corners (n, 3) around an area, whose ways follow one another, each either way; none: it is open."""
+    """Return the corners (n, 3) of an area with consecutive ways in any direction; empty if open."""
     pieces = [way for way in ways if way in document.lines]
     if not pieces or len(pieces) < len(ways):
         return np.zeros((0, 3))
@@ -190,7 +190,7 @@ def _ring(document: OsmDocument, ways: Sequence[str]) -> Floats:
 
 
 def _lanelets(document: OsmDocument) -> dict[str, _Lanelet]:
-    """Lanelets by id; those that have no two borders are left out and named."""
+    """Return lanelets by id; a lanelet without two borders is left out with a warning."""
     found: dict[str, _Lanelet] = {}
     broken: list[str] = []
     for ident, element in document.relations.items():
@@ -219,7 +219,7 @@ def _lanelets(document: OsmDocument) -> dict[str, _Lanelet]:
 
 
 def _around(document: OsmDocument) -> dict[str, str]:
-    """Lanelets of roundabouts → the regulatory element of Autoware in which they are ``internal``."""
+    """Map lanelets of roundabouts to Autoware's regulatory element with them as ``internal``."""
     return {
         lanelet: ident[:MAX_NAME]
         for ident, element in document.relations.items()
@@ -230,7 +230,7 @@ def _around(document: OsmDocument) -> dict[str, str]:
 
 
 def _turned(left: Floats, right: Floats) -> tuple[bool, bool]:
-    """Return whether each border runs against the lanelet: its left is to its left."""
+    """Return for each border True if it runs against the lanelet."""
     along = np.hypot(*(left[[0, -1]] - right[[0, -1]])[:, :2].T).sum()
     across = np.hypot(*(left[[0, -1]] - right[[-1, 0]])[:, :2].T).sum()
     apart = bool(along > across)
@@ -241,7 +241,7 @@ def _turned(left: Floats, right: Floats) -> tuple[bool, bool]:
 
 
 def _type(element: OsmElement) -> str:
-    """Type of the lane, by the subtype, and by who may use it where the lanelet says so itself."""
+    """Return the type of a lane by its subtype, or by its declared participants."""
     subtype = element.tags.get("subtype", "")
     told = {
         key.removeprefix("participant:").partition(":")[0]
@@ -294,7 +294,7 @@ def _border(document: OsmDocument, way: str, line: Floats, *, turned: bool) -> B
 
 
 def speed_of(text: str) -> float:
-    """A speed in m/s; without a unit it is in km/h. NaN: it is none."""
+    """Parse a speed to m/s (default unit km/h); NaN for an invalid speed."""
     found = _SPEED.fullmatch(text.strip())
     speed = float(found[1]) * _UNITS.get((found[2] or "").lower(), 1 / 3.6) if found else 0.0
     return speed if 0 < speed < 1000 else np.nan
@@ -303,7 +303,7 @@ def speed_of(text: str) -> float:
 def _beside(
     document: OsmDocument, lines: Sequence[LaneLine], lanelets: dict[str, _Lanelet]
 ) -> list[LaneLine]:
-    """Lanes with those with which they share a border: on its other side, as traffic there sees it."""
+    """Add neighbours that share a border to lanes, each on its side."""
     users: dict[str, list[tuple[str, bool]]] = defaultdict(list)  # lane, to the left of the way
     for line in lines:
         lanelet = lanelets[line.ident]
@@ -333,7 +333,7 @@ def _beside(
 def _joined(
     document: OsmDocument, lines: Sequence[LaneLine], lanelets: dict[str, _Lanelet]
 ) -> list[LaneLine]:
-    """Lanes with those that begin or end in the same two points as they end or begin in."""
+    """Add predecessors and successors to lanes: those with the same two end points."""
     at: dict[tuple[str, str], list[Joint]] = defaultdict(list)
     for line in lines:
         lanelet = lanelets[line.ident]
@@ -371,7 +371,7 @@ def _mean_z(lanelet: _Lanelet) -> float:
 
 @dataclass(slots=True)
 class _Rules:
-    """Regulatory elements: what they refer to, and the lanelets that they are for, by id."""
+    """Regulatory elements with their references, and their lanelets by id."""
 
     elements: list[tuple[OsmElement, list[str]]] = field(
         default_factory=list[tuple[OsmElement, list[str]]]
@@ -380,11 +380,11 @@ class _Rules:
     """Way of a sign → lanelets that it applies to."""
     stop_lines: list[str] = field(default_factory=list[str])
     limits: dict[str, float] = field(default_factory=dict[str, float])
-    """Lanelet → the speed limit that an element tells of it; m/s."""
+    """Lanelet → its speed limit from a regulatory element; m/s."""
 
     @classmethod
     def of(cls, document: OsmDocument, lanelets: dict[str, _Lanelet]) -> _Rules:
-        """The elements of a map."""
+        """Collect the regulatory elements of a map."""
         users: dict[str, list[str]] = defaultdict(list)
         for ident, lanelet in lanelets.items():
             for element in lanelet.element.members_of("regulatory_element", "relation"):
@@ -401,7 +401,7 @@ class _Rules:
         return rules
 
     def take(self, document: OsmDocument, element: OsmElement, users: list[str]) -> None:
-        """Take up an element that these lanelets name."""
+        """Add an element that these lanelets reference."""
         self.elements.append((element, users))
         refers = [way for way in element.members_of("refers") if way in document.lines]
         self.stop_lines += [way for way in element.members_of("ref_line") if way in document.lines]
@@ -423,7 +423,7 @@ class _Rules:
 
 
 def _sign(tags: dict[str, str], element: OsmElement | None = None) -> tuple[str, str]:
-    """Kind of a sign and its code, as ``de274-60``."""
+    """Return the kind of a sign and its code, such as ``de274-60``."""
     code = tags.get("subtype", "")
     if element is not None and not code:
         code = element.tags.get("sign_type", "")
@@ -437,7 +437,7 @@ def _sign(tags: dict[str, str], element: OsmElement | None = None) -> tuple[str,
 def _signals(
     document: OsmDocument, rules: _Rules, lanes: Sequence[PlainLane], row_of: dict[str, int]
 ) -> list[PlainSignal]:
-    """Lights by the ids of their elements, then signs and stop lines by those of their ways."""
+    """Return lights by the ids of their elements, then signs and stop lines by their way ids."""
 
     def rows(lanelets: Iterable[str]) -> tuple[int, ...]:
         return tuple(sorted({row_of[one] for one in lanelets if one in row_of}))
@@ -471,7 +471,7 @@ def _signals(
 
 
 def _standing(name: str, kind: str, line: Floats) -> PlainSignal:
-    """A signal that is a line, or stands there as one."""
+    """Return a signal with this line; a too short line is extended."""
     x, y, z = map(float, line.mean(axis=0))
     flat = line[:, :2]
     if run_of(line)[-1] < _SHORTEST:

@@ -1,8 +1,8 @@
-"""Latitude and longitude → metres, as the makers of Lanelet2 maps project them.
+"""Projection of latitude and longitude to metres, as in Lanelet2 tools.
 
-Sources: C. F. F. Karney, Transverse Mercator with an accuracy of a few nanometers, J. Geodesy 85 (2011), for
-the series (Krüger's, to the sixth order); DMA TM 8358.1, for the grid of MGRS; the words are those of
-``map_projector_info.yaml`` of Autoware.
+Sources: C. F. F. Karney, Transverse Mercator with an accuracy of a few nanometers, J. Geodesy 85
+(2011), for the series (Krüger's, to the sixth order); DMA TM 8358.1, for the grid of MGRS; the
+names come from ``map_projector_info.yaml`` of Autoware.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PROJECTIONS: Final = (
     "TransverseMercator",
     "Local",
 )
-"""``UTM``: as it is, without an origin; the others as Autoware has them."""
+"""``UTM`` has no origin; the others are defined by Autoware."""
 
 _A: Final = 6378137.0
 _F: Final = 1 / 298.257223563
@@ -58,18 +58,18 @@ _GRID: Final = re.compile(r"(\d{1,2})[C-HJ-NP-X]([A-HJ-NP-Z])([A-HJ-NP-V])")
 
 @dataclass(frozen=True, slots=True)
 class Projection:
-    """A way from latitude and longitude to metres.
+    """Projection from latitude and longitude to metres.
 
     Attributes
     ----------
     name : str
         One of :data:`PROJECTIONS`.
     origin : (float, float), optional
-        Latitude and longitude of the place that is (0, 0); degrees.
+        Latitude and longitude of the point (0, 0); degrees.
     grid : str
-        Zone and square of MGRS, as ``54SUE``; empty: those of the map's middle.
+        Zone and square of MGRS, such as ``54SUE``; empty means those of the map's middle.
     scale : float
-        Of ``TransverseMercator``, along its meridian.
+        Scale of ``TransverseMercator`` along its meridian.
     """
 
     name: str = "UTM"
@@ -92,7 +92,7 @@ class Projection:
             raise MapError(f"grid {self.grid!r} of MGRS; expected a zone and a square, as '54SUE'")
 
     def project(self, latitude: Floats, longitude: Floats, height: Floats) -> Floats:
-        """Places (n, 3): x to the east, y to the north, z; m. Latitudes and longitudes in degrees."""
+        """Return places (n, 3): x to the east, y to the north, z; m. The input is in degrees."""
         origin = self.origin
         if self.name == "LocalCartesian" and origin is not None:
             return _tangent_plane(latitude, longitude, height, origin)
@@ -114,7 +114,7 @@ class Projection:
         return np.column_stack((x - x0, y - y0, height))
 
     def _corner(self, x: Floats, y: Floats, zone: int) -> tuple[Floats, Floats]:
-        """The corner, in UTM, of the square of MGRS in which a map lies."""
+        """Return the corner, in UTM, of the MGRS square of a map."""
         grid = _GRID.fullmatch(self.grid)
         if grid is None:
             return tuple(np.floor(np.mean(v, keepdims=True) / _SQUARE) * _SQUARE for v in (x, y))  # type: ignore[return-value]
@@ -128,12 +128,12 @@ class Projection:
 
 
 def read_projector_info(text: str) -> Projection:
-    """The projection that a ``map_projector_info.yaml`` of Autoware tells.
+    """Read the projection from a ``map_projector_info.yaml`` of Autoware.
 
     Raises
     ------
     MapError
-        It tells none, or one that is not known.
+        The projection is missing or unknown.
     """
     told: dict[str, str] = dict(
         re.findall(r"^[ \t]*(\w+)[ \t]*:[ \t]*['\"]?([^'\"#\s]+)", text, re.MULTILINE)
@@ -155,7 +155,7 @@ def read_projector_info(text: str) -> Projection:
 
 
 def utm_zone(latitude: float, longitude: float) -> int:
-    """The zone of UTM in which a place lies, 1 to 60; with the exceptions of Norway and Svalbard."""
+    """Return the UTM zone of a place, 1 to 60, with the exceptions of Norway and Svalbard."""
     if 56 <= latitude < 64 and 3 <= longitude < 12:
         return 32
     if 72 <= latitude < 84 and 0 <= longitude < 42:
@@ -164,7 +164,7 @@ def utm_zone(latitude: float, longitude: float) -> int:
 
 
 def utm(latitude: Floats, longitude: Floats, zone: int, *, south: bool) -> tuple[Floats, Floats]:
-    """Easting and northing (n,) in a zone of UTM; m."""
+    """Return easting and northing (n,) in a zone of UTM; m."""
     x, y = transverse_mercator(latitude, longitude, zone * 6.0 - 183.0, _UTM_SCALE)
     return x + 500_000.0, y + (10_000_000.0 if south else 0.0)
 
@@ -172,7 +172,7 @@ def utm(latitude: Floats, longitude: Floats, zone: int, *, south: bool) -> tuple
 def transverse_mercator(
     latitude: Floats, longitude: Floats, meridian: float, scale: float
 ) -> tuple[Floats, Floats]:
-    """X and y (n,) from the equator and a meridian; m."""
+    """Return x and y (n,) from the equator and a meridian; m."""
     sine = np.sin(np.radians(latitude))
     away = np.radians((longitude - meridian + 180) % 360 - 180)
     conformal = np.sinh(np.arctanh(sine) - _E * np.arctanh(_E * sine))
@@ -188,7 +188,7 @@ def transverse_mercator(
 def _tangent_plane(
     latitude: Floats, longitude: Floats, height: Floats, origin: tuple[float, float]
 ) -> Floats:
-    """Places (n, 3) in the plane that touches the ellipsoid at an origin: east, north, up; m."""
+    """Return places (n, 3) in the tangent plane at an origin: east, north, up; m."""
     phi, lam = np.radians(origin[0]), np.radians(origin[1])
     zero = _earth_centred(np.array([origin[0]]), np.array([origin[1]]), np.zeros(1))
     away = _earth_centred(latitude, longitude, height) - zero
