@@ -1,4 +1,4 @@
-"""Two stores or runs compared: which scenes, verdicts and matches appeared, vanished, changed."""
+"""Comparison of two stores or runs: scenes, verdicts and matches that appeared, vanished or changed."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 
 
 REASONS: Final = ("reason_a", "reason_b")
-"""Columns that say why verdicts are unknown."""
+"""Columns with the reasons for unknown verdicts."""
 APPEARED, VANISHED, CHANGED, SAME = "appeared", "vanished", "changed", "same"
 
 _CHECK: Final = re.compile(r"(?:^|[;\n])\s*CHECK\b", re.IGNORECASE)
 
 
 def scenes(a: Classed, b: Classed) -> ReportTable:
-    """Classes of scenes that are in one selection and not in the other, or have another share of its frames.
+    """Return classes of scenes that are in one selection only, or with different shares of frames.
 
     Parameters
     ----------
@@ -41,15 +41,15 @@ def scenes(a: Classed, b: Classed) -> ReportTable:
     Returns
     -------
     ReportTable
-        ``change``, ``class``, ``frames_a``, ``frames_b``, ``frame`` (the first that has it, in B if it is
-        there, else in A); what appeared first, then what vanished, then what changed, each the largest
-        difference of shares first. Classes with the same share are not listed.
+        ``change``, ``class``, ``frames_a``, ``frames_b``, ``frame`` (the first one, in B if
+        possible, else in A). Order: appeared, vanished, changed; in each group the largest
+        difference of shares first. Classes with equal shares are not listed.
     """
     _, (a, b) = shared(a, b)
     in_a, in_b = a.sizes(), b.sizes()
     total_a, total_b = max(int(in_a.sum()), 1), max(int(in_b.sum()), 1)
     kind = np.select([(in_a == 0) & (in_b > 0), (in_a > 0) & (in_b == 0)], [0, 1], 2)
-    # Shares as whole numbers, so that equal ones are equal.
+    # Shares as integers, for an exact comparison.
     gap = np.abs(in_a * total_b - in_b * total_a)
     order = np.lexsort((np.array(a.names, str), -gap, kind))
     order = order[gap[order] > 0]
@@ -71,13 +71,13 @@ def scenes(a: Classed, b: Classed) -> ReportTable:
 
 
 def by_frame(a: Classed, b: Classed) -> ReportTable:
-    """Traces of one name frame by frame: where the scene is another at the same number.
+    """Compare traces of the same name frame by frame, by the classes of scenes.
 
     Returns
     -------
     ReportTable
-        ``change``, ``trace``, ``frames_a``, ``frames_b``, ``same``, ``different`` (frames of a number that
-        both have, by their classes), and ``first``, the first that is different.
+        ``change``, ``trace``, ``frames_a``, ``frames_b``, ``same``, ``different`` (counts of common
+        frame numbers by class), and ``first``, the first different frame.
     """
     _, (a, b) = shared(a, b)
     of_a, of_b = _traces(a), _traces(b)
@@ -121,27 +121,27 @@ def _tally(rows: list[tuple[Any, ...]], what: str) -> list[str]:
 
 
 def has_checks(text: str) -> bool:
-    """Return whether a text is one of checks, and not a query."""
+    """True if a text contains checks, not a query."""
     return _CHECK.search(text) is not None
 
 
 def verdicts(
     a: Store | Collection, b: Store | Collection, text: str, values: Mapping[str, Any]
 ) -> ReportTable:
-    """Verdicts of checks on the traces of two stores or collections, which are told apart by their names.
+    """Compare verdicts of checks on the traces of two stores or collections, matched by trace name.
 
     Returns
     -------
     ReportTable
-        ``change``, ``check``, ``trace``, ``a``, ``b`` (verdicts, ``None`` where there is no such trace),
-        ``violations_a``, ``violations_b``, ``reason_a``, ``reason_b`` (why a verdict is unknown, else
-        ``None``; it is said, too). What appeared or vanished is a trace. A verdict that is the same counts as
-        changed if its violations are other ones.
+        ``change``, ``check``, ``trace``, ``a``, ``b`` (verdicts, or ``None`` without the trace),
+        ``violations_a``, ``violations_b``, ``reason_a``, ``reason_b`` (the reason of an unknown
+        verdict, also in the notes, or ``None``). Appeared and vanished refer to traces. An equal
+        verdict with other violations counts as changed.
 
     Raises
     ------
     QueryError
-        The text has no checks, or names what a store does not know.
+        The text has no checks, or uses a name unknown to a store.
     """
     found = [{(v.check, v.trace): v for v in store.check(text, **values)} for store in (a, b)]
     rows: list[tuple[Any, ...]] = []
@@ -172,19 +172,19 @@ def _spans(verdict: Verdict | None) -> Any:
 def matches(
     a: Store | Collection, b: Store | Collection, query: str, values: Mapping[str, Any]
 ) -> ReportTable:
-    """Frames that a query finds in the traces of two stores or collections, told apart by their names.
+    """Compare frames that a query finds in the traces of two stores or collections, by trace name.
 
     Returns
     -------
     ReportTable
-        ``change``, ``trace``, ``frames_a``, ``frames_b``, ``only_a``, ``only_b`` (frames, by their
-        numbers), ``first``, the first that is in one alone. What appeared or vanished is that anything of a
-        trace is found at all. A trace that cannot answer in one of the stores is named, with the reason.
+        ``change``, ``trace``, ``frames_a``, ``frames_b``, ``only_a``, ``only_b`` (frame numbers),
+        ``first``, the first frame in one only. Appeared and vanished mean that a trace has matches
+        in one only. A trace that cannot answer in one of the stores is named, with the reason.
 
     Raises
     ------
     QueryError
-        The text is no query, or names what a store does not know.
+        The text is not a query, or uses a name unknown to a store.
     """
     found: list[dict[str, set[int]]] = []
     lost: dict[str, str] = {}

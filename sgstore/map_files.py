@@ -1,4 +1,4 @@
-"""The road maps of recordings: their own, the one that is given, or one of a folder by its name."""
+"""Road maps of recordings: their own map, a file of the caller, or a file of a folder by name."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ if TYPE_CHECKING:
 
 
 MAX_MAP_BYTES: Final = 1 << 28
-"""Largest file that is read as a road map."""
+"""Largest road map file; bytes."""
 
 NO_MAP: Final = "no road map: without road nodes and without relations that need them"
 
 _SHOWN_WARNINGS: Final = 5
-"""Defects of a road map that are named; the others are counted."""
+"""Number of named defects of a road map; further defects are counted."""
 
 PROJECTOR_INFO: Final = "map_projector_info.yaml"
-"""The file of Autoware beside a Lanelet2 map that says how it is projected."""
+"""Autoware's file next to a Lanelet2 map, with its projection."""
 
 AUTOWARE_MAP: Final = "lanelet2_map.osm"
-"""The file of Autoware's folders of a map."""
+"""Name of the map file in Autoware's map folders."""
 
 _LOOKED_AT: Final = 4096
 _LANELETS: Final = re.compile(r"<osm[\s>/]")
@@ -45,13 +45,14 @@ _ENCODING: Final = re.compile(rb"""\s*<\?xml[^>]{0,100}\sencoding=["']([A-Za-z0-
 def read_map_file(path: str | Path, signs: Signs = SIGNS) -> RoadMap:
     """The road map in an OpenDRIVE, Lanelet2 or SUMO file; ``signs`` as in :func:`sgstore.opendrive.read_map`.
 
-    Points of a Lanelet2 map lie where ``local_x`` and ``local_y`` say. Else ``map_projector_info.yaml`` beside
-    it tells how latitude and longitude become metres, as Autoware has it; else they are those of UTM.
+    Points of a Lanelet2 map use ``local_x`` and ``local_y``. Without them,
+    ``map_projector_info.yaml`` in the same folder defines the projection, as in Autoware; the
+    default is UTM.
 
     Raises
     ------
     MapError
-        There is no such file, or it is no road map.
+        The file is missing, or is not a road map.
     """
     path = Path(path)
     try:
@@ -72,7 +73,7 @@ def read_map_file(path: str | Path, signs: Signs = SIGNS) -> RoadMap:
 
 
 def _unpacked(path: Path) -> bytes:
-    """The bytes of a file, unpacked if it is in gzip, as networks of SUMO may be."""
+    """Return the bytes of a file, decompressed if it is gzip, as SUMO networks can be."""
     content = path.read_bytes()
     if content[:2] != b"\x1f\x8b":
         return content
@@ -84,7 +85,7 @@ def _unpacked(path: Path) -> bytes:
 
 
 def _projection(path: Path) -> Projection | None:
-    """The projection that a file beside a map tells; ``None``: there is none."""
+    """Read the projection file next to a map; ``None`` means no file."""
     try:
         text = path.read_text(encoding="utf-8-sig")[:_LOOKED_AT]
     except FileNotFoundError:
@@ -99,7 +100,7 @@ def _projection(path: Path) -> Projection | None:
 
 
 def _decoded(content: bytes) -> str:
-    """The text of an XML file in the encoding that it names, else UTF-8."""
+    """Decode an XML file with its declared encoding, else UTF-8."""
     named = _ENCODING.match(content)
     if named and content[:2] not in {b"\xff\xfe", b"\xfe\xff"}:
         return content.decode(named[1].decode())
@@ -107,20 +108,21 @@ def _decoded(content: bytes) -> str:
 
 
 class Maps:
-    """The road maps of the recordings of a run; each is read once.
+    """Road maps of the recordings of a run; each is read once.
 
     Parameters
     ----------
     given : Path or None
-        A file, for the recordings that carry no OpenDRIVE of their own; or a folder of files ``NAME.xodr`` or
-        ``NAME.osm``, for those that name their map; or Autoware's folder of a map, with ``lanelet2_map.osm``.
+        A file, for recordings without OpenDRIVE; or a folder of files ``NAME.xodr`` or
+        ``NAME.osm``, for recordings that name their map; or Autoware's map folder, with
+        ``lanelet2_map.osm``.
     signs : Signs
-        How their signals are read.
+        Interpretation of their signals.
 
     Raises
     ------
     MapError
-        The file cannot be read, or there is nothing.
+        The file or folder is missing or cannot be read.
     """
 
     def __init__(self, given: Path | None, signs: Signs = SIGNS) -> None:
@@ -133,9 +135,10 @@ class Maps:
         self._given = read_map_file(given, signs) if given is not None and one_file else None
 
     def of(self, info: TraceInfo) -> tuple[RoadMap | None, list[str]]:
-        """The map of a recording, and what is odd about it.
+        """Return the map of a recording, and warnings.
 
-        Its own OpenDRIVE comes first, then what is given, then lanes that the recording tells without one.
+        Its own OpenDRIVE has priority, then the map of the caller, then plain lanes of the
+        recording.
         """
         warnings: list[str] = []
         own = self._own(info.map_text, info.map_name) if info.map_text else None
@@ -164,7 +167,7 @@ class Maps:
         return self._read[text]
 
     def _named(self, name: str, warnings: list[str]) -> RoadMap | None:
-        """The map of that name in the folder: ``Carla/Maps/Town01`` is ``Town01.xodr``."""
+        """Find the map of this name in the folder: ``Carla/Maps/Town01`` is ``Town01.xodr``."""
         if self._folder is None:
             return None
         stem = PurePosixPath(name.replace("\\", "/")).name.removesuffix(OF_LANES)
@@ -192,12 +195,12 @@ class Maps:
 
 
 def lost_lanes(info: TraceInfo, road_map: RoadMap | None) -> list[Loss]:
-    """Lanes that a recording tells and that are of no use, unless it has another map."""
+    """Return losses for the recording's own lanes, unless another map replaces them."""
     if road_map is not None and road_map.text != info.map_text:
         return []
     return [Loss(reason, 0, 0) for reason in info.lost_lanes]
 
 
 def _is_opendrive(text: str) -> bool:
-    """Return whether a text is XML. Lanes that a recording tells otherwise are another text."""
+    """True if a text is XML; plain lanes are another format."""
     return text[:100].lstrip("\ufeff \t\r\n").startswith("<")

@@ -1,10 +1,11 @@
-"""SUMO networks (``.net.xml``) → text of plain lanes: what a store keeps of a map that is no OpenDRIVE.
+"""Conversion of SUMO networks (``.net.xml``) to text of plain lanes, the form of maps without OpenDRIVE.
 
-A lane is a line with a width; lane 0 of an edge is its rightmost. Lanes inside a junction (``:J0_1_0``) are
-lanes of that junction. Crossings become crosswalks, walking areas nothing. What links of a traffic light apply
-to are the lanes through the junction; those that show the same in all phases are one signal, which bears the
-name of the traffic light and, where there are several, the number of its first link (``J/3``). Coordinates are
-the network's own, as they are in all of SUMO's outputs.
+A lane is a line with a width; lane 0 of an edge is its rightmost. Lanes inside a junction
+(``:J0_1_0``) are lanes of that junction. Crossings become crosswalks; walking areas are skipped.
+The links of a traffic light apply to the lanes through the junction. Links with the same state in
+all phases are one signal. Its name is the name of the traffic light, and with several signals also
+the number of its first link (``J/3``). Coordinates are those of the network, as in all outputs of
+SUMO.
 
 Source: SUMO documentation, "SUMO Road Networks" (Eclipse, EPL-2.0).
 """
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
 
 MAX_ELEMENTS: Final = 8_000_000
 WIDTH: Final = 3.2
-"""Width of a lane that tells none; m. (SUMO's default.)"""
+"""Default width of a lane; m. (SUMO's default.)"""
 CROSSING_WIDTH: Final = 4.0
 _ALONE: Final = (
     ({"pedestrian", "wheelchair"}, "sidewalk"),
@@ -54,11 +55,11 @@ _ALONE: Final = (
     ({"rail", "rail_urban", "rail_electric", "rail_fast", "subway", "cable_car"}, "rail"),
     ({"bus", "coach", "taxi", "emergency", "authority"}, "bus"),
 )
-"""Classes of vehicles, and the type of a lane that is for some of these and those before alone."""
+"""Classes of vehicles, and the lane type for these and all previous classes only."""
 _NONE: Final = "all"
 _LOOKED_AT: Final = 1 << 16
 _APART: Final = 1.0
-"""How much farther apart than they are wide lanes may lie that are side by side; m."""
+"""Greatest gap between neighbouring lanes, in addition to their widths; m."""
 
 
 @dataclass(slots=True)
@@ -72,7 +73,7 @@ class _SumoEdge:
 
 @dataclass(slots=True)
 class _SumoNet:
-    """What a network tells: edges, connections, places of junctions, opposite lanes."""
+    """Content of a network: edges, connections, positions of junctions, opposite lanes."""
 
     edges: list[_SumoEdge] = field(default_factory=list[_SumoEdge])
     connections: list[dict[str, str]] = field(default_factory=list[dict[str, str]])
@@ -81,12 +82,12 @@ class _SumoNet:
     """States of the links of each traffic light, in all phases of all programs."""
     roundabouts: list[dict[str, str]] = field(default_factory=list[dict[str, str]])
     beside: dict[str, str] = field(default_factory=dict[str, str])
-    """Lane → the lane of the opposite direction to its left."""
+    """Lane → its left neighbour with the opposite direction."""
     depth: int = 0
     logic: str = ""
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
-        """An element starts."""
+        """Handle the start of an element."""
         self.depth += 1
         if self.depth == 1 and tag != "net":
             raise MapError(f"the root element is <{tag[:80]}>, expected <net>")
@@ -111,23 +112,23 @@ class _SumoNet:
             self.beside[self.edges[-1].lanes[-1].get("id", "")] = attributes.get("lane", "")
 
     def end(self, _tag: str) -> None:
-        """An element ends."""
+        """Handle the end of an element."""
         self.depth -= 1
 
 
 def is_sumo_net(text: str) -> bool:
-    """Return whether a text is a network of SUMO, by its first element."""
+    """True if a text is a SUMO network, by its first elements."""
     start = text[:_LOOKED_AT]
     return "<net " in start and ("<location " in start or "<edge " in start)
 
 
 def sumo_net_text(text: str) -> str:
-    """The text of plain lanes (:func:`sgstore.roads.lane_text`) that a network of SUMO makes.
+    """Convert a SUMO network to the text of plain lanes (:func:`sgstore.roads.lane_text`).
 
     Raises
     ------
     MapError
-        The text is no XML, no network, exceeds a bound, or has no lane that can be used.
+        The text is not XML or not a network, exceeds a limit, or has no usable lane.
     """
     net = _SumoNet()
     try:
@@ -146,7 +147,7 @@ def sumo_net_text(text: str) -> str:
 
 
 def _lines(net: _SumoNet, broken: list[str]) -> tuple[dict[str, LaneLine], list[PlainCrosswalk]]:
-    """Lanes by their ids, and crosswalks."""
+    """Return lanes by their ids, and crosswalks."""
     lines: dict[str, LaneLine] = {}
     crosswalks: list[PlainCrosswalk] = []
     points = 0
@@ -192,7 +193,7 @@ def _lines(net: _SumoNet, broken: list[str]) -> tuple[dict[str, LaneLine], list[
 
 
 def _around(net: _SumoNet) -> dict[tuple[str, str], str]:
-    """Nodes and edges of roundabouts → a name of theirs; they have none, so it is that of their first node."""
+    """Map nodes and edges of roundabouts to a name: the id of the first node."""
     found: dict[tuple[str, str], str] = {}
     for one in net.roundabouts:
         nodes = one.get("nodes", "").split()
@@ -207,13 +208,13 @@ def _crosswalk(ident: str, sections: Sections) -> PlainCrosswalk:
 
 
 def _side(sections: Sections, *, left: bool) -> Border:
-    """A border that may be crossed: lanes of an edge are changed anywhere, unless nobody may drive there."""
+    """Return a border that allows lane changes in both directions, as on SUMO edges."""
     line = sections.left if left else sections.right
     return Border(np.column_stack((line, sections.z)), to_left=True, to_right=True)
 
 
 def _set_beside(net: _SumoNet, edge: _SumoEdge, lines: dict[str, LaneLine]) -> None:
-    """Put lanes of an edge beside one another, the next index to the left."""
+    """Register the lanes of an edge as neighbours; the next index is on the left."""
     idents = [lane.get("id", "") for lane in edge.lanes]
     for right, left in pairwise(idents):
         if right in lines and left in lines:
@@ -225,7 +226,7 @@ def _set_beside(net: _SumoNet, edge: _SumoEdge, lines: dict[str, LaneLine]) -> N
 
 
 def _with_opposites(net: _SumoNet, lines: dict[str, LaneLine]) -> dict[str, LaneLine]:
-    """Put the leftmost lanes of edges there and back beside one another, where they lie so."""
+    """Register the leftmost lanes of opposite edges as neighbours, if they touch."""
     back: dict[tuple[str, str], list[_SumoEdge]] = defaultdict(list)
     for edge in net.edges:
         if not edge.function and edge.lanes:
@@ -242,7 +243,7 @@ def _with_opposites(net: _SumoNet, lines: dict[str, LaneLine]) -> dict[str, Lane
 
 
 def _side_by_side(one: LaneLine, other: LaneLine) -> bool:
-    """Return whether lanes there and back touch at both ends."""
+    """True if lanes of opposite directions touch at both ends."""
     if one.sections is None or other.sections is None:
         return False
     gaps = one.sections.left[[0, -1]] - other.sections.left[[-1, 0]]
@@ -250,7 +251,7 @@ def _side_by_side(one: LaneLine, other: LaneLine) -> bool:
 
 
 def _joined(net: _SumoNet, lines: dict[str, LaneLine]) -> list[LaneLine]:
-    """Lanes with those that traffic flows on to, through the junction where there are lanes in it."""
+    """Add predecessors and successors to lanes, through the junction if it has lanes."""
     after: dict[str, list[Joint]] = defaultdict(list)
     before: dict[str, list[Joint]] = defaultdict(list)
     for told in net.connections:
@@ -267,7 +268,7 @@ def _joined(net: _SumoNet, lines: dict[str, LaneLine]) -> list[LaneLine]:
 
 
 def _lights(net: _SumoNet, lines: dict[str, LaneLine], row_of: dict[str, int]) -> list[PlainSignal]:
-    """Lights, each on the lanes through a junction whose links always show the same."""
+    """Return traffic lights, one for all lanes of a junction with the same link states."""
     links: dict[str, dict[tuple[str, ...], dict[int, str]]] = defaultdict(dict)
     for told in net.connections:
         name, number = told.get("tl", ""), told.get("linkIndex", "0")
@@ -288,7 +289,7 @@ def _lights(net: _SumoNet, lines: dict[str, LaneLine], row_of: dict[str, int]) -
 
 
 def _type(lane: dict[str, str]) -> str:
-    """Type of a lane, by the classes of vehicles that may use it."""
+    """Return the type of a lane by its permitted vehicle classes."""
     allowed = {*lane.get("allow", "").split()}
     if not allowed and _NONE in lane.get("disallow", "").split():
         return "none"
@@ -301,7 +302,7 @@ def _type(lane: dict[str, str]) -> str:
 
 
 def _shape(text: str) -> Floats:
-    """The points (n, 3) of a line; none if it is no line."""
+    """Parse the points (n, 3) of a line; empty for an invalid line."""
     try:
         points = [[float(number) for number in point.split(",")] for point in text.split()]
         line = np.array([(*point, 0.0)[:3] for point in points], np.float64).reshape(-1, 3)
