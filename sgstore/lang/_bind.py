@@ -1,6 +1,6 @@
-"""The binder: syntax trees of queries and checks become IR.
+"""Binder: converts syntax trees of queries and checks to the IR.
 
-Everything that can be the user's fault is found here or in the parser, before any SQL exists.
+The binder and the parser find all errors of the user, before any SQL is built.
 """
 
 from __future__ import annotations
@@ -63,34 +63,34 @@ SETTINGS: Final = (
     "SCOPE",
     "RANGE",
 )
-"""What may stand after ``USING``."""
+"""Settings allowed after ``USING``."""
 
 SCOPES: Final = ("graph", "world")
-"""What a statement is about: the graphs alone, or all that is known around."""
+"""Scopes of a statement: the graphs only, or all known data."""
 
 
 def bind_query(
     text: str, statements: Sequence[s.Statement], catalog: Catalog, parameters: Mapping[str, Any]
 ) -> b.Query:
-    """The meaning of a text: its one ``MATCH``, with the predicates that it defines.
+    """Bind the single ``MATCH`` of a text, with the predicates that the text defines.
 
     Parameters
     ----------
     text : str
-        For messages.
+        Text for messages.
     statements : sequence of Statement
-        As parsed.
+        Parsed statements.
     catalog : Catalog
-        Of the store that is asked.
+        Catalog of the store.
     parameters : mapping of str to value
         Values of ``$name``.
 
     Raises
     ------
     QueryNameError
-        A label, relation, attribute, variable, function or parameter is not known.
+        Unknown label, relation, attribute, variable, function or parameter.
     QueryError
-        Types do not fit, or a part has no meaning where it stands.
+        Types do not match, or a part is not allowed at its place.
     """
     session = Session(text, parameters, _BINDERS)
     session.ask(catalog)
@@ -134,7 +134,7 @@ def _of_match(match: s.MatchClause, session: Session) -> b.Query:
 
 
 def _is_plain(match: s.MatchClause) -> bool:
-    """Tell whether it is one pattern, without a duration or a name."""
+    """True if the query is a single pattern, without a duration or a name."""
     first = match.sequence.steps[0]
     if len(match.sequence.steps) > 1 or not isinstance(first, s.StepClause):
         return False
@@ -142,11 +142,11 @@ def _is_plain(match: s.MatchClause) -> bool:
 
 
 def _of_one_step(match: s.MatchClause, session: Session) -> b.Query:
-    """A pattern of single frames; it becomes a sequence of one step if it looks at other frames as well."""
+    """Bind a single-frame pattern. If it uses other frames, bind it as a sequence of one step."""
     names = SymbolTable(session, ScopeBuilder(session))
     bind_block(match.block, names)
     result = _result(match.returns, names)
-    scope = names.scope.finished()  # after RETURN, where the ego may be named, as anywhere
+    scope = names.scope.finished()  # after RETURN is bound, which may name the ego
     where = tuple(settled(part, session) for part in scope.where)
     when = tuple(part for part in where if b.is_temporal(part))
     if not when and not any(b.is_temporal(value) for value in result.values):
@@ -157,7 +157,7 @@ def _of_one_step(match: s.MatchClause, session: Session) -> b.Query:
 
 
 def _of_steps(match: s.MatchClause, session: Session) -> b.Query:
-    """A sequence of steps."""
+    """Bind a sequence of steps."""
     found = bind_sequence(match.sequence, session, bind_block)
     names = SymbolTable(session, found.scope(), found.meanings)
     result = _result(match.returns, names)
@@ -170,7 +170,7 @@ def _of_steps(match: s.MatchClause, session: Session) -> b.Query:
 
 
 def _told(scope: b.Scope) -> b.Scope:
-    """Return the scope of a found match: nodes and edges that have names, ends of these, and the ego."""
+    """Return the scope of a match: named nodes and edges, the ends of these edges, and the ego."""
     edges = tuple(edge for edge in scope.edges if edge.named)
     ends = {end for edge in edges for end in (edge.src, edge.dst)}
     told = {
@@ -211,13 +211,13 @@ def _only_match(statements: Sequence[s.Statement], session: Session) -> s.MatchC
 
 
 def define(statement: s.Define, session: Session) -> None:
-    """Take over a definition.
+    """Add a definition of a predicate or scenario to the session.
 
     Raises
     ------
     QueryError
-        The name is taken: by another definition, or by a function. (Predicates of the library are not in the
-        way: a query may define its own.)
+        The name is used by another definition or by a function. A query may redefine predicates of the
+        library.
     """
     name = normalize_name(statement.name)
     if name in session.predicates:
@@ -229,7 +229,7 @@ def define(statement: s.Define, session: Session) -> None:
 
 @dataclass(slots=True)
 class UsingChoice:
-    """Choices that ``USING`` makes; ``None``: no choice."""
+    """Settings from ``USING``. ``None`` means not set."""
 
     ego: str | None = None
     unknown_is_false: bool = False
@@ -241,12 +241,12 @@ class UsingChoice:
 
 
 def chosen(settings: Sequence[s.Setting], session: Session, catalog: Catalog) -> UsingChoice:
-    """Return the choices that a statement makes by ``USING``.
+    """Return the ``USING`` settings of a statement.
 
     Raises
     ------
     QueryNameError
-        There is no such setting, or no such value of it.
+        Unknown setting, or unknown value of a setting.
     """
     found = UsingChoice()
     for setting in settings:
@@ -282,7 +282,7 @@ _CHOICES: Final = {
 
 
 def _choose(found: UsingChoice, setting: s.Setting, value: str, session: Session) -> None:
-    """Take note of a setting whose values are a closed list."""
+    """Store a setting that has a closed list of values."""
     name, word = normalize_name(setting.name), value.lower()
     if word not in _CHOICES[name]:
         session.unknown(f"value of {setting.name}", value, setting.span, _CHOICES[name])
@@ -302,7 +302,7 @@ def _choose(found: UsingChoice, setting: s.Setting, value: str, session: Session
 
 
 def _metres(value: str, setting: s.Setting, session: Session) -> float:
-    """Return how far a check looks."""
+    """Return the range of a check in metres."""
     try:
         metres = float(value)
     except ValueError:
@@ -321,7 +321,7 @@ def _setting_value(setting: s.Setting, session: Session) -> str:
 
 
 def refuse_unused(session: Session) -> None:
-    """Refuse parameters that came with a query and are not in it."""
+    """Reject parameters that the query does not use."""
     unused = sorted(set(session.parameters) - session.used)
     if unused:
         name, hint = unused[0], f"it would be written ${unused[0]}"
@@ -331,7 +331,7 @@ def refuse_unused(session: Session) -> None:
 
 
 def refuse_strange(session: Session, catalog: Catalog) -> None:
-    """Refuse relations that the abstraction that is asked does not have."""
+    """Reject relations that the abstraction does not have."""
     if catalog.relations is None:
         return
     strange = sorted(session.relations - catalog.relations)
@@ -348,8 +348,7 @@ def refuse_strange(session: Session, catalog: Catalog) -> None:
 def bind_block(block: s.Block, names: SymbolTable) -> None:
     """Bind the paths and the condition of a block into the scope of ``names``.
 
-    Names of all nodes and edges are known before any condition is bound, so that a condition inside a node
-    may speak of what stands further on.
+    All nodes and edges are bound before any condition. So a condition inside a node can use later nodes.
     """
     pending: list[tuple[s.NodePattern | s.EdgePattern, str]] = []
     for path in block.paths:
@@ -389,7 +388,7 @@ _BINDERS: Final[Binders] = {
     s.OverExpression: over_match,
     s.Temporal: tense,
 }
-"""The binder of every kind of expression."""
+"""Binder of each kind of expression."""
 
 
 def _node(node: s.NodePattern, names: SymbolTable) -> str:
@@ -413,7 +412,7 @@ def _node(node: s.NodePattern, names: SymbolTable) -> str:
 
 
 def _refuse_bare_label(node: s.NodePattern, names: SymbolTable) -> None:
-    """``(Car)`` would be any node, called Car, and that is not what is meant."""
+    """Reject ``(Car)``, which is a node named Car. The user probably means ``(:Car)``."""
     if node.name and node.name[0].isupper() and not node.label and node.name in labels():
         names.session.refuse(
             f"({node.name}) would be any node, called {node.name}",
@@ -423,7 +422,7 @@ def _refuse_bare_label(node: s.NodePattern, names: SymbolTable) -> None:
 
 
 def _known_node(node: s.NodePattern, names: SymbolTable) -> str | None:
-    """The key of a node that the pattern speaks of again; ``None`` for a new one."""
+    """Return the key of a node that is already bound. ``None`` means a new node."""
     if node.name is None:
         return None
     if node.name in RESERVED:
@@ -438,7 +437,7 @@ def _known_node(node: s.NodePattern, names: SymbolTable) -> str | None:
 
 
 def _the_ego(node: s.NodePattern, names: SymbolTable) -> str | None:
-    """The key of the ego, if the pattern speaks of it by the name that is always bound."""
+    """Return the key of the ego if the node has the reserved name ``ego``, or None."""
     if node.name != THE_EGO:
         return None
     if names.scope.parent is None:
@@ -494,7 +493,7 @@ def _edge(edge: s.EdgePattern, left: str, right: str, names: SymbolTable) -> str
 
 
 def _inline(pattern: s.NodePattern | s.EdgePattern, key: str, names: SymbolTable) -> None:
-    """The properties and the condition that stand inside a node or an edge."""
+    """Bind the properties and the condition inside a node or an edge."""
     for prop in pattern.properties:
         attribute_of = node_attribute if isinstance(pattern, s.NodePattern) else edge_attribute
         attribute = attribute_of(key, prop.name, prop.name_span, names)
@@ -504,7 +503,7 @@ def _inline(pattern: s.NodePattern | s.EdgePattern, key: str, names: SymbolTable
 
 
 def _equality(attribute: b.Bound, prop: s.Property, names: SymbolTable) -> b.Bound:
-    """``name: value`` as a comparison; the attribute stands in it under a name that no query can write."""
+    """Bind the property ``name: value`` as a comparison. The attribute gets a name unavailable to queries."""
     inner = names.body({"": Symbol(value=attribute)})
     inner.parent = names
     span = TextSpan(prop.name_span.start, prop.value.span.end)
@@ -517,7 +516,7 @@ def kinds_of(label: s.LabelExpression, session: Session) -> b.Kinds:
     Raises
     ------
     QueryNameError
-        There is no such label.
+        Unknown label.
     """
     if isinstance(label, s.Label):
         return _labelled(label, session)
@@ -604,7 +603,7 @@ def _result(returns: s.Returns | None, names: SymbolTable) -> b.Result:
     result = replace(result, having=_having(returns.having, result, inner))
     _check_result(result, returns, names.session)
     if result.aggregated or result.form in {"intervals", "clips"}:
-        # Each comes once as it is, and DISTINCT must not drop what is counted.
+        # Each row is unique already, and DISTINCT must not remove rows that are counted.
         result = replace(result, distinct=False)
     order = tuple(b.SortKey(_key(k.value, result, inner), k.descending) for k in returns.order)
     sample, top = _sampling(returns.sample, result, inner), _top(returns.top, result, inner)
@@ -612,7 +611,7 @@ def _result(returns: s.Returns | None, names: SymbolTable) -> b.Result:
 
 
 def _special(returns: s.Returns, session: Session) -> s.Item | None:
-    """The one result that is no value: ``FRAMES``, ``INTERVALS``, ``SUBGRAPHS`` or ``CLIPS``."""
+    """Return the item ``FRAMES``, ``INTERVALS``, ``SUBGRAPHS`` or ``CLIPS``, or None."""
     special = [item for item in returns.items if item.form not in {"value", "all"}]
     if len(special) > 1:
         session.refuse("one of FRAMES, INTERVALS, SUBGRAPHS and CLIPS at a time", special[1].span)
@@ -620,13 +619,13 @@ def _special(returns: s.Returns, session: Session) -> s.Item | None:
 
 
 def _columns(items: Iterable[s.Item], names: SymbolTable) -> tuple[b.ReturnColumn, ...]:
-    """The values to return; one that is counted of all matches may speak of those that it stands beside."""
+    """Bind the values to return. An aggregating value may use the grouping values beside it."""
     items = [item for item in items if item.form == "value"]
     found = [_column(item, names) for item in items]
     keys = _group_keys(found)
     columns: list[b.ReturnColumn] = []
     for item, column in zip(items, found, strict=True):
-        assert item.value is not None  # noqa: S101 - the form of the item says so
+        assert item.value is not None  # noqa: S101 - the form of the item guarantees it
         value = _of_groups(column.value, keys) if b.is_counted(column.value) else column.value
         _refuse_mixed(value, item.value.span, names.session)
         columns.append(replace(column, value=value))
@@ -634,13 +633,13 @@ def _columns(items: Iterable[s.Item], names: SymbolTable) -> tuple[b.ReturnColum
 
 
 def _group_keys(columns: Iterable[b.ReturnColumn]) -> dict[b.Bound, str]:
-    """Return the values by which matches are grouped, and what they are called."""
+    """Return the values by which matches are grouped, with their names."""
     plain = (one for one in columns if not b.is_counted(one.value))
     return {one.value: one.name for one in plain if not isinstance(one.value, b.Value)}
 
 
 def _of_groups(value: b.Bound, keys: Mapping[b.Bound, str]) -> b.Bound:
-    """An expression about groups of matches: what tells these apart stands in it by name."""
+    """Replace grouping values in an expression by references to their columns."""
     if value in keys:
         return b.GroupKey(keys[value], value.type)
     if isinstance(value, b.Operation):
@@ -649,7 +648,7 @@ def _of_groups(value: b.Bound, keys: Mapping[b.Bound, str]) -> b.Bound:
 
 
 def _column(item: s.Item, names: SymbolTable) -> b.ReturnColumn:
-    assert item.value is not None  # noqa: S101 - the form of the item says so
+    assert item.value is not None  # noqa: S101 - the form of the item guarantees it
     value = settled(names.bind(item.value), names.session)
     if value.type is Type.list and not (isinstance(value, b.Aggregate) or b.is_passed_on(value)):
         names.session.refuse("a list cannot be returned", item.span)
@@ -658,7 +657,7 @@ def _column(item: s.Item, names: SymbolTable) -> b.ReturnColumn:
 
 
 def _refuse_mixed(value: b.Bound, span: TextSpan, session: Session) -> None:
-    """Refuse a value that is of each match and of all matches at once."""
+    """Reject a value that mixes single matches with an aggregate over all matches."""
     if b.is_counted(value) and _of_each(value):
         session.refuse(
             "a value of each match cannot stand beside one of all matches",
@@ -668,14 +667,14 @@ def _refuse_mixed(value: b.Bound, span: TextSpan, session: Session) -> None:
 
 
 def _of_each(value: b.Bound) -> bool:
-    """Tell whether a value speaks of single matches, but for what is counted of all."""
+    """True if a value depends on single matches outside its aggregates."""
     if isinstance(value, b.Operation):
         return any(_of_each(operand) for operand in value.operands)
     return not isinstance(value, b.Aggregate | b.GroupKey | b.Value | b.Choices)
 
 
 def _having(written: s.Expression | None, result: b.Result, names: SymbolTable) -> b.Bound | None:
-    """Return the condition on groups of matches, or on intervals."""
+    """Return the condition on groups of matches or on intervals, or None."""
     if written is None:
         return None
     session = names.session
@@ -711,7 +710,7 @@ def _having(written: s.Expression | None, result: b.Result, names: SymbolTable) 
 
 
 def _key(value: s.Expression, result: b.Result, names: SymbolTable) -> b.Bound | str:
-    """Return a key to order or to sample by: the name of a result, or a value of each match."""
+    """Return a sort or sampling key: the name of a result, or a value of each match."""
     own = {column.name: column.value for column in result.columns}
     known = (*result.names, *own)
     taken = isinstance(value, s.Variable) and names.meaning(value.name) is not None
@@ -758,7 +757,7 @@ _TRACE_NAME: Final = b.TraceAttribute(TRACE_ATTRIBUTES["name"], Type.text)
 
 
 def _top(top: s.Sample | None, result: b.Result, names: SymbolTable) -> b.Sampling | None:
-    """``LIMIT n PER value``: the first rows of each value."""
+    """Bind ``LIMIT n PER value``: the first rows for each value."""
     if top is None or top.per is None:
         return None
     per = _key(top.per, result, names)
@@ -785,12 +784,12 @@ def _check_result(result: b.Result, returns: s.Returns, session: Session) -> Non
         session.refuse("matches are either counted or listed, not both", returns.span, hint)
 
 
-# ``CHECK``: what must be true of a trace, bound -------------------------------------------------
+# ``CHECK``: rules for whole traces -------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class CheckInCatalog:
-    """A check with the catalog that it was bound to: of the store, or of the abstraction that it names."""
+    """Check with the catalog to which it was bound: of the store, or of an abstraction."""
 
     check: o.BoundCheck
     catalog: Catalog
@@ -802,22 +801,22 @@ def bind_checks(
     seen: Callable[[Statement], Catalog],
     parameters: Mapping[str, Any],
 ) -> tuple[CheckInCatalog, ...]:
-    """Every ``CHECK`` of a text, with the predicates that it defines before it.
+    """Bind every ``CHECK`` of a text, with the predicates defined before it.
 
     Parameters
     ----------
     text : str
-        For messages.
+        Text for messages.
     statements : sequence of Statement
     seen : function
-        The catalog that a statement is asked of.
+        Function that returns the catalog for a statement.
     parameters : mapping of str to value
         Values of ``$name``.
 
     Raises
     ------
     QueryError
-        There is none, or one has no meaning; it says where.
+        No check, or an invalid check. The error has the place.
     """
     found: list[CheckInCatalog] = []
     defined: dict[str, Define] = {}
@@ -886,12 +885,12 @@ def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog)
 
 
 def _knows_no_more(traces: Iterable[TraceFacts], limit: float) -> bool:
-    """Tell whether nothing is known of entities farther from the ego."""
+    """True if no trace has data on entities beyond the limit around the ego."""
     return all(one.reach is not None and one.reach.farthest <= limit for one in traces)
 
 
 def _returned(written: WrittenCheck, names: SymbolTable) -> tuple[b.ReturnColumn, ...]:
-    """The values that are told of each violation."""
+    """Bind the values that are returned for each violation."""
     inner = replace(names, over=True)
     found = tuple(_column(item, inner) for item in written.returns)
     taken = [node.name for one in written.quantifiers for node in one.nodes]

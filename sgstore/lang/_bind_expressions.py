@@ -1,4 +1,4 @@
-"""Expressions: names resolved, types checked, words of the vocabulary in their canonical spelling."""
+"""Binding of expressions: resolve names, check types, and normalise words of the vocabulary."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 
 MAX_NUMBER: Final = 1e300
-"""Largest number that a query may speak of."""
+"""Largest number allowed in a query."""
 
 _ORDERED: Final = frozenset({"<", "<=", ">", ">="})
 
@@ -81,12 +81,12 @@ def _parameter(e: s.Parameter, names: SymbolTable) -> b.Bound:
 
 
 def parameter(e: s.Parameter, names: SymbolTable) -> Any:
-    """The value that came with the query for a parameter.
+    """Return the value of a query parameter.
 
     Raises
     ------
     QueryNameError
-        None came.
+        The parameter has no value.
     """
     session = names.session
     if e.name not in session.parameters:
@@ -156,7 +156,7 @@ def _attribute(e: s.AttributeOf, names: SymbolTable) -> b.Bound:
 
 
 def _column(e: s.AttributeOf, names: SymbolTable) -> b.FrameAttribute:
-    """A column of a user's own table: what its row for the frame says."""
+    """Bind a column of a user table: the value in its row for the frame."""
     table, session = names.session.tables[e.owner.name], names.session
     found = table.attribute(e.name)
     if found is None:
@@ -171,7 +171,7 @@ def _column(e: s.AttributeOf, names: SymbolTable) -> b.FrameAttribute:
 
 
 def _class_attribute(name: str, names: SymbolTable) -> Attribute | None:
-    """``class_NAME``, which is also written ``class('NAME')``."""
+    """Return the attribute ``class_NAME``, also written ``class('NAME')``, or None."""
     of = (
         one
         for one in names.session.classed
@@ -193,12 +193,12 @@ def _tail(e: s.AttributeOf) -> TextSpan:
 
 
 def node_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b.NodeAttribute:
-    """An attribute of a node.
+    """Bind an attribute of a node.
 
     Raises
     ------
     QueryNameError
-        There is none of that name, or not for nodes of these kinds.
+        Unknown attribute, or not an attribute of these kinds.
     """
     kinds = names.scope.kinds(key).every
     possible = [a.name for a in NODE_ATTRIBUTES.values() if a.kinds & kinds] + [*names.session.own]
@@ -226,7 +226,7 @@ def node_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
 
 
 def _own_attribute(name: str, own: Mapping[str, Type]) -> Attribute | None:
-    """An attribute of a client's own: the one that is spelled so, or else so but for case and underscores."""
+    """Return a user-defined attribute. An exact spelling wins over one that ignores case and underscores."""
     wanted = normalize_name(name)
     same = next((one for one in own if normalize_name(one) == wanted), None)
     spelled = name if name in own else same
@@ -234,7 +234,7 @@ def _own_attribute(name: str, own: Mapping[str, Type]) -> Attribute | None:
 
 
 def _no_attribute(name: str) -> str | None:
-    """Return a hint for a name that is no attribute but a relation or a predicate; ``None``: no idea."""
+    """Suggest a relation or a predicate for an unknown attribute name, or None."""
     if relation_named(name):
         return f"it is a relation: EXISTS {{(a)-[:{name}]->(b)}}"
     return call_hint(name)
@@ -244,15 +244,15 @@ FOLLOWED: Final = tuple(frozenset({relation}) for relation in FOLLOWING)
 
 
 def edge_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b.EdgeAttribute:
-    """An attribute of an edge.
+    """Bind an attribute of an edge.
 
     Raises
     ------
     QueryNameError
-        There is none of that name.
+        Unknown attribute.
     QueryError
-        The edge is not one of those that have it: ``isIn`` by itself, or ``leads`` or ``follows`` one way; a
-        single one, one way, of an attribute of a client's own.
+        The edge cannot have the attribute. Built-in attributes need a single relation: ``isIn``, or a
+        directed ``leads`` or ``follows``. User-defined attributes need a single directed edge.
     """
     found = EDGE_ATTRIBUTES.get(EDGE_ALIASES.get(normalize_name(name), normalize_name(name)))
     found = found or _own_attribute(name, names.session.own_edges)
@@ -309,7 +309,7 @@ def _logic(e: s.Logic, names: SymbolTable) -> b.Operation:
 
 
 def _between(operands: tuple[s.Expression, ...], names: SymbolTable) -> str:
-    """Return the text between the first operand and the second."""
+    """Return the text between the first and the second operand."""
     return names.session.text[operands[0].span.end : operands[1].span.start]
 
 
@@ -342,7 +342,7 @@ def _comparison(e: s.Comparison, names: SymbolTable) -> b.Operation:
 
 
 def _check_sides(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTable) -> None:
-    """Refuse to compare with NULL or with a list, as a property would, too."""
+    """Reject comparisons with NULL or with a list."""
     prop = isinstance(e.left, s.Variable) and not e.left.name
     where = "in place of the property, behind WHERE: x." if prop else ""
     if prop:
@@ -360,7 +360,7 @@ def _check_sides(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTa
 
 
 def _of_sides(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTable) -> str | None:
-    """A hint where one side is not of the type that its writer took it for; ``None``: no idea."""
+    """Return a hint for a comparison with an unexpected type on one side, or None."""
     for written, side, other in ((e.left, left, right), (e.right, right, left)):
         if isinstance(written, s.Parameter):
             return f"${written.name} is the {side.type.value} {names.session.parameters[written.name]!r}"
@@ -372,7 +372,7 @@ def _of_sides(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTable
 
 
 def _of_name(e: s.Expression, side: b.Bound, other: b.Bound, names: SymbolTable) -> str | None:
-    """A hint where the id of something is compared with a text, which may be its name."""
+    """Suggest the name attribute if an id is compared with a text, or None."""
     of_trace = isinstance(side, b.TraceAttribute)
     ids = isinstance(side, b.NodeAttribute | b.TraceAttribute) and side.attribute.name in {
         "id",
@@ -386,7 +386,7 @@ def _of_name(e: s.Expression, side: b.Bound, other: b.Bound, names: SymbolTable)
 
 
 def _canonical(value: b.Bound, other: b.Bound, span: TextSpan, names: SymbolTable) -> b.Bound:
-    """A text that is compared with an attribute of a closed vocabulary, in the spelling of the store."""
+    """Return a compared text in the canonical spelling of a closed vocabulary."""
     known = _vocabulary(other)
     if not known or not isinstance(value, b.Value) or not isinstance(value.value, str):
         return value
@@ -463,7 +463,7 @@ def _membership(e: s.Membership, names: SymbolTable) -> b.Bound:
 
 
 def _in_dataset(operand: b.Bound, e: s.Call, names: SymbolTable) -> b.FrameAttribute:
-    """``frame.class IN dataset_classes('train')``; a second argument names the abstraction again."""
+    """Bind ``frame.class IN dataset_classes('train')``. A second argument repeats the abstraction."""
     session = names.session
     if (
         not isinstance(operand, b.FrameAttribute)
@@ -488,7 +488,7 @@ def _in_dataset(operand: b.Bound, e: s.Call, names: SymbolTable) -> b.FrameAttri
 
 
 def _case(e: s.Case, names: SymbolTable) -> b.Operation:
-    """``CASE``: its operands are condition and value of each branch, then what it is otherwise, or NULL."""
+    """Bind a ``CASE``: condition and value of each branch, then the ``ELSE`` value or NULL."""
     operands: list[b.Bound] = []
     written = [branch.value for branch in e.branches]
     written += [e.otherwise] if e.otherwise is not None else []
@@ -561,4 +561,4 @@ BINDERS: Final[Binders] = {
     s.Negative: _negative,
     s.Case: _case,
 }
-"""The binders of what this file is about; :mod:`~sgstore.lang._bind` adds those of calls, blocks and time."""
+"""Binders of basic expressions. :mod:`~sgstore.lang._bind` adds those of calls, blocks and time."""

@@ -1,4 +1,4 @@
-"""The binder of values over a match: ``MIN(ttc(e, v)) OVER match``, ``OVER cutin``, ``OVER a..b``."""
+"""Binding of values over a match: ``MIN(ttc(e, v)) OVER match``, ``OVER cutin``, ``OVER a..b``."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _VALUES: Final = frozenset({Type.number, Type.text, Type.boolean})
 
 
 def over_match(e: s.OverExpression, names: SymbolTable) -> b.OverMatch:
-    """A number made of the values that an expression has during a match, or a part of it.
+    """Bind a function over the frames of a match, or over a part of it.
 
     Raises
     ------
     QueryError
-        It stands where there is no match, names no step, or its operand is no value of a frame.
+        It is used without a match, names an unknown step, or its operand is not a value of a frame.
     """
     session = names.session
     if not names.over and names.aggregated:
@@ -44,7 +44,7 @@ def over_match(e: s.OverExpression, names: SymbolTable) -> b.OverMatch:
             hint = "how long it lasts is LAST(frame.t) OVER match - FIRST(frame.t) OVER match"
         known = ", ".join(map(str.upper, b.OF_MATCH))
         session.refuse(f"expected one of {known} before OVER", call.span, hint)
-    assert isinstance(call, s.Call)  # noqa: S101 - what is counted was refused
+    assert isinstance(call, s.Call)  # noqa: S101 - COUNT(*) was rejected
     most = 2 if word in b.PLACES else 1
     found = len(call.arguments)
     if not 1 <= found <= most:
@@ -98,7 +98,7 @@ def _seconds() -> b.Bound:
 
 
 def _range(e: s.OverExpression, names: SymbolTable) -> tuple[int | None, int | None]:
-    """The numbers of the steps that a stretch begins and ends with; ``None``: the match itself."""
+    """Return the numbers of the first and last step of the range. ``None`` means the whole match."""
     if e.start is None:
         return None, None
     start = _step(e.start, names)

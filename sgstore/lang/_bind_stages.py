@@ -1,8 +1,8 @@
-"""The binder of queries in several parts: ``OPTIONAL MATCH``, ``WITH``, a ``MATCH`` behind them, named paths.
+"""Binding of queries with ``OPTIONAL MATCH``, ``WITH``, later ``MATCH`` clauses or named paths.
 
-All parts are about one frame. A part sees what those before it have bound, as a block sees what is bound
-around it; what ``WITH`` does not pass on keeps its place among the matches, unless they are grouped, but has no
-name any more.
+All stages are about one frame. A stage can use the variables of earlier stages, as a block can use the
+variables around it. A variable that ``WITH`` does not pass on loses its name. Without grouping, it remains
+part of the matches.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class StagedScope(ScopeBuilder):
-    """All that is bound so far. The ego is bound by the first pattern, wherever it is named.
+    """Scope of all stages bound so far. The ego is always bound by the first pattern.
 
     Attributes
     ----------
     first : ScopeBuilder
     ego : str
-        The key of the ego, once it was named ``ego``.
+        Key of the ego after its first use as ``ego``.
     """
 
     first: ScopeBuilder = field(kw_only=True)
     ego: str = ""
 
     def the_ego(self, span: TextSpan) -> str:
-        """The key of the ego."""
+        """Return the key of the ego."""
         self.ego = self.first.the_ego(span)
         self.nodes.setdefault(self.ego, replace(self.first.nodes[self.ego], role="unnamed"))
         return self.ego
@@ -57,14 +57,14 @@ class StagedScope(ScopeBuilder):
 
 @dataclass(slots=True)
 class _With:
-    """``WITH`` as it is bound, and what is bound before and after it."""
+    """Bound ``WITH`` stage, with the nodes before and after it."""
 
     stage: b.WithStage
     before: dict[str, b.Node]
     after: dict[str, b.Node]
 
     def finished(self, ego: b.Node | None) -> b.WithStage:
-        """The stage, which passes the ego on, too, where a part behind it speaks of the ego."""
+        """Return the final stage. If a later stage uses the ego, this stage passes it on."""
         stage = self.stage
         if ego is not None:
             self.before.setdefault(ego.key, ego)
@@ -76,26 +76,26 @@ class _With:
 
 
 class StageBinder:
-    """Binds the parts of a query, one after the other.
+    """Binder of the stages of a query, in order.
 
     Parameters
     ----------
     match : MatchClause
     session : Session
     bind_block : function
-        Binds a block into the scope of a symbol table.
+        Function that binds a block into the scope of a symbol table.
     bind_columns : function
-        Binds values to return.
+        Function that binds values to return.
 
     Attributes
     ----------
     names : SymbolTable
-        What the part behind the last one may speak of.
+        Names that the next stage can use.
 
     Raises
     ------
     QueryError
-        It goes on from a sequence, or a part has no meaning.
+        A stage follows a sequence, or a stage is invalid.
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class StageBinder:
             )
 
     def _checked(self, value: b.Bound) -> b.Bound:
-        """An expression about one frame in which no block speaks of what ``WITH`` passes on."""
+        """Return a single-frame expression. Its blocks must not use values passed by ``WITH``."""
         found = settled(value, self._session)
         if b.is_temporal(found):
             self._session.refuse(
@@ -168,7 +168,7 @@ class StageBinder:
         told, session = self._told, self._session
         before, old = dict(told.nodes), replace(self.names, aggregates=True)
         symbols, values, places = self._passed(clause, old)
-        before |= told.nodes  # the ego, where it was named here
+        before |= told.nodes  # the ego, if it was named here
         grouped = clause.distinct or any(b.is_counted(column.value) for column in values)
         nodes, edges = self._renamed(symbols)
         after = {} if grouped else {k: replace(n, role="unnamed") for k, n in before.items()}
@@ -185,7 +185,7 @@ class StageBinder:
         inner = (
             self.names if grouped else replace(self.names, parent=replace(old, aggregates=False))
         )
-        if not grouped:  # what is not passed on may still be asked here
+        if not grouped:  # variables that are not passed on can still be used here
             told.edges = [*{e.key: e for e in (*stage.before.edges, *told.edges)}.values()]
         order = tuple(
             b.SortKey(self._key(key.value, inner), key.descending) for key in clause.order
@@ -213,7 +213,7 @@ class StageBinder:
     def _passed(
         self, clause: s.WithClause, names: SymbolTable
     ) -> tuple[dict[str, Symbol], tuple[b.ReturnColumn, ...], tuple[b.FrameAttribute, ...]]:
-        """What the names behind ``WITH`` mean, the values that it works out, and what stands for these."""
+        """Return the symbols after a ``WITH``, its computed values, and their placeholders."""
         symbols: dict[str, Symbol] = {}
         written: list[s.Item] = []
         for item in clause.items:
@@ -241,7 +241,7 @@ class StageBinder:
     def _named(
         self, item: s.Item, names: SymbolTable, written: list[s.Item]
     ) -> Mapping[str, Symbol]:
-        """What an item passes on: a variable, or a value, which is to be bound with the others."""
+        """Return the symbol that an item passes on: a variable, or a value to bind later."""
         value = item.value
         if isinstance(value, s.Variable):
             symbol = names.meaning(value.name)
@@ -260,7 +260,7 @@ class StageBinder:
     def _renamed(
         self, symbols: dict[str, Symbol]
     ) -> tuple[tuple[tuple[str, str], ...], tuple[tuple[b.Edge, str], ...]]:
-        """The keys of nodes and edges behind ``WITH``, and before it; ``symbols`` mean those behind it."""
+        """Return the keys of passed nodes and edges, after and before ``WITH``. Updates ``symbols``."""
         nodes: list[tuple[str, str]] = []
         edges: list[tuple[b.Edge, str]] = []
         known = {edge.key: edge for edge in self._told.edges}
@@ -284,7 +284,7 @@ class StageBinder:
     # The whole
 
     def result(self, result: b.Result) -> b.Result:
-        """A result in which whole matches have the values, too, that ``WITH`` passed on."""
+        """Return a result whose whole matches also contain the values passed by ``WITH``."""
         for value in result.values:
             self._checked(value)
         if not result.whole:
@@ -298,11 +298,11 @@ class StageBinder:
         return replace(result, columns=(*more, *result.columns))
 
     def scope(self) -> b.Scope:
-        """What is bound in the end."""
+        """Return all nodes and edges bound after the last stage."""
         return _bare(self._told.nodes, self._told.edges)
 
     def stages(self) -> tuple[b.Stage, ...]:
-        """All parts; call it last, for the ego may be named anywhere."""
+        """Return all stages. Call this last, because the ego may be named anywhere."""
         told = self._told
         ego = told.first.nodes.get(told.ego)
         ego = ego and replace(ego, role="unnamed")
@@ -317,11 +317,11 @@ class StageBinder:
 
 
 MOST_WAYS: Final = 100
-"""So many lengths the paths with names of a pattern may have, all combinations counted."""
+"""Largest number of combinations of path lengths in a pattern with named paths."""
 
 
 def _place(name: str, value: b.Bound | None, session: Session) -> b.FrameAttribute:
-    """What stands for a value, or for a path (``None``), that has a name."""
+    """Return a new placeholder for a named value, or for a path if the value is None."""
     session.numbers += 1
     if value is None or b.is_path(value):
         return b.passed_on(f"{b.PASSED}{name} p{session.numbers}", Type.list)
@@ -332,15 +332,15 @@ def _place(name: str, value: b.Bound | None, session: Session) -> b.FrameAttribu
 
 
 def name_path(path: s.Path, nodes: list[str], edges: list[str], names: SymbolTable) -> None:
-    """Take note of a path that has a name; its value is the list of its nodes.
+    """Bind a named path, whose value is the list of its nodes.
 
     Raises
     ------
     QueryError
-        It cannot have a name here, or the name is taken.
+        A name is not allowed here, or is already used.
     """
     session, span = names.session, path.name_span
-    assert path.name is not None  # noqa: S101 - who calls has looked
+    assert path.name is not None  # noqa: S101 - checked by the caller
     assert span is not None  # noqa: S101 - a name has a place
     if names.paths is None:
         hint = "MATCH p = (a)-[:near*1..2]->(b) RETURN nodes(p)"
@@ -355,12 +355,12 @@ def name_path(path: s.Path, nodes: list[str], edges: list[str], names: SymbolTab
 
 
 def _bare(nodes: Mapping[str, b.Node], edges: Iterable[b.Edge]) -> b.Scope:
-    """Nodes and edges without conditions."""
+    """Return a scope of nodes and edges without conditions."""
     return b.Scope(nodes, {}, tuple(edges), (), frozenset())
 
 
 def _in_blocks(values: Iterable[b.Bound]) -> Iterable[b.Bound]:
-    """Everything that stands in the braces of the blocks in some expressions."""
+    """Yield all expressions inside the blocks of some expressions."""
     for value in values:
         for block in b.blocks_of(value):
             for inner in block.inside:

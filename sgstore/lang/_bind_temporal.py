@@ -1,7 +1,7 @@
-"""The binder of temporal operators and sequences.
+"""Binding of temporal operators and sequences.
 
-Operators of time, functions over signals and lengths of time stand in conditions of a ``MATCH``, in what it
-returns, and in a ``CHECK``; inside braces only one frame is looked at.
+Temporal operators, functions over time and durations are allowed in conditions and results of a ``MATCH``,
+and in a ``CHECK``. Inside braces, conditions are about one frame.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ if TYPE_CHECKING:
 
 
 MAX_NS: Final = 10**18
-"""The longest time that a query may speak of: some 30 years; ns."""
+"""Longest duration allowed in a query: about 30 years; ns."""
 
 _UNBOUNDED: Final = frozenset({"NEXT", "WEAKNEXT", "PREVIOUS"})
 _LENGTH: Final = re.compile(r"(\d+(?:\.\d+)?)\s*(ms|s|min|frames)", re.IGNORECASE)
 
 
 def tense(e: s.Temporal, names: SymbolTable) -> b.Tense:
-    """An operator of time.
+    """Bind a temporal operator.
 
     Raises
     ------
     QueryError
-        It stands inside braces, its operands are no conditions, or its bound is none.
+        It is inside braces, an operand is not a condition, or the bound is invalid.
     """
     _refuse_in_block(e.word, e.span, names)
     operands = tuple(names.condition(operand) for operand in e.operands)
@@ -65,12 +65,12 @@ def tense(e: s.Temporal, names: SymbolTable) -> b.Tense:
 
 
 def length(e: s.Duration | s.Parameter, names: SymbolTable) -> o.Length:
-    """A length of time: as written, or what a parameter is: a number of seconds, or a text such as ``2s``.
+    """Bind a duration: as written, or a parameter value in seconds or as text such as ``2s``.
 
     Raises
     ------
     QueryError
-        It is no length of time, or one that is too long.
+        The value is not a duration, or is too long.
     """
     amount, unit = (e.amount, e.unit) if isinstance(e, s.Duration) else _given(e, names)
     if unit == "frames":
@@ -100,22 +100,22 @@ def _given(e: s.Parameter, names: SymbolTable) -> tuple[float, str]:
 
 
 def timespan(e: s.Duration, _: SymbolTable) -> b.Value:
-    """A length of time as a number: of seconds, or of frames where such are counted."""
+    """Bind a duration as a number of seconds, or of frames."""
     if e.unit == "frames":
         return b.Value(e.amount, Type.number, unit="frames", span=e.span)
     return b.Value(e.ns / 1e9, Type.number, unit="s", span=e.span)
 
 
-# Functions of how something went ------------------------------------------------------------------
+# Functions over time ------------------------------------------------------------------
 
 
 def course(e: s.Call, names: SymbolTable) -> b.Bound:
-    """A call of one of :data:`COURSES`: ``prev``, ``delta``, a window, ``run_length``, …, or ``t``.
+    """Bind a call of one of :data:`COURSES`: ``prev``, ``delta``, a window, ``run_length``, …, or ``t``.
 
     Raises
     ------
     QueryError
-        Its arguments do not fit, or it stands inside braces.
+        Invalid arguments, or a call inside braces.
     """
     word = normalize_name(e.name)
     _refuse_in_block(f"{e.name}()", e.name_span, names)
@@ -144,7 +144,7 @@ def _delta(e: s.Call, names: SymbolTable) -> b.SignalCall:
 
 
 def _how_far(e: s.Call, names: SymbolTable) -> o.Length:
-    """The length of time that is the second argument of a call."""
+    """Return the duration in the second argument of a call."""
     back = e.arguments[1]
     if not isinstance(back, s.Duration | s.Parameter):
         names.session.refuse("expected a length of time such as 2s", back.span)
@@ -152,7 +152,7 @@ def _how_far(e: s.Call, names: SymbolTable) -> o.Length:
 
 
 def _window(e: s.Call, names: SymbolTable) -> b.SignalCall:
-    """A number made of the values of the last frames."""
+    """Bind a function over a window of the last frames."""
     word = _WINDOWS[normalize_name(e.name)]
     value = names.number(e.arguments[0])
     _refuse_nested(e, value, names)
@@ -220,7 +220,7 @@ def _moment(e: s.Call, names: SymbolTable) -> b.Bound:
 
 
 FUTURE: Final = frozenset({"ALWAYS", "EVENTUALLY", "NEXT", "WEAKNEXT", "UNTIL", "RELEASE"})
-"""Operators that look ahead."""
+"""Temporal operators that use future frames."""
 
 _WINDOWS: Final = {normalize_name(word): word for word in b.WINDOWS}
 
@@ -235,7 +235,7 @@ COURSES: Final[dict[str, Callable[[s.Call, SymbolTable], b.Bound]]] = {
     "existsnow": _exists_now,
     "t": _moment,
 }
-"""Functions of how something went, by folded name."""
+"""Functions over time, by folded name."""
 
 
 def _refuse_in_block(word: str, span: TextSpan, names: SymbolTable) -> None:
@@ -256,12 +256,12 @@ def _refuse_nested(e: s.Call, value: b.Bound, names: SymbolTable) -> None:
 
 
 def settled(expression: b.Bound, session: Session) -> b.Bound:
-    """An expression in which every length of a run counts what it is compared with: frames, or time.
+    """Return an expression whose run lengths have the unit of the compared value: frames or time.
 
     Raises
     ------
     QueryError
-        A number of frames is compared with something else.
+        A number of frames is compared with another kind of value.
     """
     found = _settled(expression)
     for value in _lengths(found):
@@ -284,7 +284,7 @@ def _settled(expression: b.Bound) -> b.Bound:
 
 
 def _compared(parts: tuple[b.Bound, ...]) -> tuple[b.Bound, ...]:
-    """The sides of a comparison, the lengths of runs in them as the numbers beside them count."""
+    """Return the sides of a comparison, with run lengths in the unit of the compared numbers."""
     inside = [part for side in parts for part in b.walk(side)]
     if not any(isinstance(p, b.SignalCall) and p.word in _RUNS for p in inside):
         return parts
@@ -296,7 +296,7 @@ def _compared(parts: tuple[b.Bound, ...]) -> tuple[b.Bound, ...]:
 _RUNS: Final = frozenset({"run_length", "since_true"})
 
 
-def _counting(expression: b.Bound, frames: bool | None) -> b.Bound:  # noqa: FBT001 - what is counted
+def _counting(expression: b.Bound, frames: bool | None) -> b.Bound:  # noqa: FBT001 - the unit
     match expression:
         case b.Operation(word, operands, kind):
             return b.Operation(word, tuple(_counting(o, frames) for o in operands), kind)
@@ -309,7 +309,7 @@ def _counting(expression: b.Bound, frames: bool | None) -> b.Bound:  # noqa: FBT
 
 
 def _lengths(expression: b.Bound) -> Iterator[b.Value]:
-    """The lengths of time in an expression and in the blocks in it."""
+    """Yield the constants in an expression and in its blocks."""
     for part in b.walk(expression):
         match part:
             case b.Value():
@@ -321,40 +321,40 @@ def _lengths(expression: b.Bound) -> Iterator[b.Value]:
                 pass
 
 
-# Sequences: the steps and links of a ``MATCH``, bound; scenarios become the steps that they stand for ----
-# Each step is a scope of its own, about one frame. A node that several steps speak of has the same key in all
-# of them: it is the same entity.
+# Sequences: the steps and links of a ``MATCH``; scenarios are replaced by their steps ----
+# Each step has its own scope, about one frame. A node that several steps use has the same key in all of them:
+# it is the same entity.
 
 MAX_STEPS: Final = 50
-"""Most steps that a sequence may have, those of scenarios in it included."""
+"""Largest number of steps in a sequence, including the steps of its scenarios."""
 
 SEQUENCES: Final = frozenset({"concept", "scenario"})
-"""Kinds of patterns of the library that stand for steps."""
+"""Kinds of library patterns that can be used as steps."""
 
 
 @dataclass(slots=True)
 class StepScope(ScopeBuilder):
-    """The scope of one step, which may speak of nodes that other steps have bound.
+    """Scope of one step, which can use nodes bound by other steps.
 
     Attributes
     ----------
     known : dict of str to Node
-        What those steps have bound, by key.
+        Nodes bound by other steps, by key.
     """
 
     known: dict[str, b.Node] = field(default_factory=dict[str, b.Node])
 
     def mention(self, key: str) -> None:
-        """Take note that a node is spoken of; one of another step becomes one of this step, too."""
+        """Record the use of a node. A node of another step becomes a node of this step too."""
         if key not in self.nodes and key in self.known:
             self.nodes[key] = self.known[key]
 
     def kinds(self, key: str) -> b.Kinds:
-        """Return the kinds that a node may have here."""
+        """Return the kinds that a node may have in this step."""
         return self.nodes[key].kinds if key in self.nodes else self.known[key].kinds
 
     def the_ego(self, span: TextSpan) -> str:
-        """The key of the ego: of the node that is labelled so, here or in another step; or a new one."""
+        """Return the key of the ego node, of this step or another step, or add one."""
         for node in (*self.nodes.values(), *self.known.values()):
             if not node.kinds.other:
                 self.mention(node.key)
@@ -364,24 +364,24 @@ class StepScope(ScopeBuilder):
 
 @dataclass(slots=True)
 class BoundSequence:
-    """A sequence as it is bound.
+    """Sequence during binding.
 
     Attributes
     ----------
     session : Session
     known : dict of str to Node
-        The nodes that steps have bound and that others may speak of: those with names, and the ego.
+        Nodes that later steps can use: named nodes and the ego.
     edges : list of Edge
-        Those with names.
+        Named edges.
     ends : dict of str to Node
-        The nodes at their ends, named or not.
+        Nodes at the ends of these edges, named or not.
     meanings : dict of str to Symbol
-        What names mean after all steps.
+        Symbols by name, after all steps.
     partial : set of str
-        Names that some of the steps before bind, but not in every sequence that these stand for.
+        Names that are bound only in some of the possible sequences.
     steps : list
     ways : list
-        The sequences that they stand for.
+        Sequences that the steps stand for.
     """
 
     session: Session
@@ -394,13 +394,13 @@ class BoundSequence:
     ways: list[o.StepWay] = field(default_factory=list[o.StepWay])
 
     def scope(self) -> ScopeBuilder:
-        """Scope of the values of a match: nodes and edges that have names, and the ego."""
+        """Return the scope of values of a match: named nodes, named edges and the ego."""
         return ScopeBuilder(self.session, nodes=self.ends | self.known, edges=list(self.edges))
 
     def take_in_ego(self, told: ScopeBuilder) -> None:
-        """Make the ego a node of the last step that happens, if it is named in none, but somewhere.
+        """Add the ego to the last required step if the query uses it, but no step contains it.
 
-        ``told`` is what values of a match speak of.
+        ``told`` is the scope of the values of a match.
         """
         key = self.session.the_ego
         if key is None:
@@ -425,9 +425,9 @@ class BoundSequence:
 
 @dataclass(frozen=True, slots=True)
 class _Written:
-    """A step as it stands in the text, with the values of the scenario that it belongs to.
+    """Step as written, with the parameter values of its scenario.
 
-    ``called`` is where that is named, if its own text is in the library.
+    ``called`` is the place of the call, if the text of the scenario is in the library.
     """
 
     step: s.StepClause
@@ -438,13 +438,13 @@ class _Written:
 
 @dataclass(frozen=True, slots=True)
 class _WrittenSteps:
-    """Steps as they stand in the text with the links between them."""
+    """Steps as written, with the links between them."""
 
     steps: list[_Written | _WrittenGroup]
     links: list[tuple[s.LinkClause, Mapping[str, Any] | None]]
 
     def changed(self, change: Callable[[_Written], _Written]) -> _WrittenSteps:
-        """The same with a change made to every step."""
+        """Return a copy with a function applied to every step."""
         return _WrittenSteps(
             [
                 change(one)
@@ -456,7 +456,7 @@ class _WrittenSteps:
         )
 
     def given(self, values: Mapping[str, Any]) -> _WrittenSteps:
-        """The same with values of parameters, in steps and links, unless they have these already."""
+        """Return a copy with parameter values added to steps and links. Existing values are kept."""
         links: list[tuple[s.LinkClause, Mapping[str, Any] | None]] = [
             (link, {**values, **(more or {})}) for link, more in self.links
         ]
@@ -469,7 +469,7 @@ class _WrittenSteps:
         return _WrittenSteps(steps, links)
 
     def flat(self) -> Iterator[_Written]:
-        """Every step, in reading order."""
+        """Yield every step in reading order."""
         for one in self.steps:
             if isinstance(one, _Written):
                 yield one
@@ -480,7 +480,7 @@ class _WrittenSteps:
 
 @dataclass(frozen=True, slots=True)
 class _WrittenGroup:
-    """Alternatives, and how often they are repeated."""
+    """Group of alternative sequences with its number of repetitions."""
 
     group: s.GroupStep
     alternatives: list[_WrittenSteps]
@@ -489,19 +489,19 @@ class _WrittenGroup:
 def bind_sequence(
     sequence: s.SequenceClause, session: Session, bind_block: Callable[[s.Block, SymbolTable], None]
 ) -> BoundSequence:
-    """The steps of a ``MATCH``.
+    """Bind the steps of a ``MATCH``.
 
     Parameters
     ----------
     sequence : syntax.BoundSequence
     session : Session
     bind_block : function
-        Binds paths and a condition; it belongs to the binder.
+        Function of the binder that binds paths and a condition.
 
     Raises
     ------
     QueryError
-        A step or a link has no meaning where it stands.
+        A step or a link is not allowed at its place.
     """
     found = BoundSequence(session)
     written = _spelled_out(sequence, session, 0)
@@ -524,13 +524,13 @@ def bind_sequence(
 _Way = tuple[list[_Written], list[tuple[s.LinkClause, "Mapping[str, Any] | None"]]]
 
 MAX_WAYS: Final = 100
-"""Most sequences that an expression of steps may stand for."""
+"""Largest number of sequences that an expression of steps can stand for."""
 
 
 def _ways(
     written: _WrittenSteps, before: list[_Way], span: TextSpan, session: Session
 ) -> list[_Way]:
-    """The sequences that steps stand for, in reading order, with what comes before them."""
+    """Return all sequences that the steps stand for, appended to the given beginnings."""
     found = before or [([], [])]
     for number, one in enumerate(written.steps):
         if number:
@@ -548,7 +548,7 @@ def _ways(
 
 
 def _ways_on(written: _WrittenGroup, before: list[_Way], session: Session) -> list[_Way]:
-    """Sequences with those that a group stands for behind them."""
+    """Return sequences extended by all repetitions and alternatives of a group."""
     group, found = written.group, list[_Way]()
     again = s.LinkClause("then", None, None, group.span)
     open_ended = before
@@ -574,7 +574,7 @@ def _bind_steps(
     *,
     again: bool = False,
 ) -> None:
-    """Bind steps in reading order; ``again``: they may happen several times."""
+    """Bind steps in reading order. ``again`` is true if they are repeated."""
     for one in written.steps:
         if isinstance(one, _Written):
             if again and one.step.name is not None:
@@ -595,14 +595,14 @@ def _bind_group(
     *,
     again: bool,
 ) -> None:
-    """Bind alternatives: each sees what is bound before; what all of them bind, others see, too."""
+    """Bind alternatives. Later steps can use only the names that all alternatives bind."""
     session = found.session
     known, meanings, keys = dict(found.known), dict(found.meanings), set(session.keys)
     edges, ends, partial = list(found.edges), dict(found.ends), set(found.partial)
     told: list[tuple[dict[str, b.Node], dict[str, Symbol], set[str]]] = []
     taken = set(keys)
     for one in written.alternatives:
-        # The same name is the same node in all of them, and so has the same key.
+        # The same name is the same node in all alternatives, so it has the same key.
         found.known, found.meanings, session.keys = dict(known), dict(meanings), set(keys)
         found.edges, found.ends, found.partial = list(edges), dict(ends), set(partial)
         _bind_steps(one, found, bind_block, again=again)
@@ -622,7 +622,7 @@ def _bind_group(
 
 
 def _either(nodes: list[b.Node]) -> b.Node:
-    """A node that is one of several kinds, as alternatives have it."""
+    """Return a node that allows the kinds of all alternatives."""
     kinds = nodes[0].kinds
     for node in nodes[1:]:
         kinds = kinds | node.kinds
@@ -630,7 +630,7 @@ def _either(nodes: list[b.Node]) -> b.Node:
 
 
 def _spelled_out(sequence: s.SequenceClause, session: Session, depth: int) -> _WrittenSteps:
-    """Steps and links, scenarios being what they stand for."""
+    """Return steps and links with scenarios replaced by their steps."""
     steps: list[_Written | _WrittenGroup] = []
     links: list[tuple[s.LinkClause, Mapping[str, Any] | None]] = []
     taken = names_written(sequence)
@@ -674,26 +674,26 @@ def _with_own_names(
     taken: frozenset[str],
     session: Session,
 ) -> _WrittenSteps:
-    """The steps of a pattern, whose variables have the names that they are given."""
+    """Return the steps of a pattern with its variables renamed by the caller."""
     names = own_names(step, [one.step for one in inner.flat()], parameters, taken, session)
     return inner.changed(lambda one: replace(one, step=renamed(one.step, names)))
 
 
 def _entry(step: s.ScenarioStep) -> NamedPattern | None:
-    """The pattern of the library that a step names."""
+    """Return the library pattern that a step names, or None."""
     name = normalize_name(step.name)
     like = (p for p in patterns().values() if normalize_name(p.name) == name)
-    return patterns().get(step.name) or next(like, None)  # CutIn and cut_in are two
+    return patterns().get(step.name) or next(like, None)  # CutIn and cut_in are different patterns
 
 
 def _parameters_shipped(step: s.ScenarioStep) -> dict[str, str]:
-    """Parameters of a pattern of the library by name, with their defaults as they are written."""
+    """Return the parameters of a library pattern with their default texts."""
     entry = _entry(step)
     return {} if entry is None else {p.name: p.default for p in entry.parameters.values()}
 
 
 def _shipped(step: s.ScenarioStep, session: Session) -> s.SequenceClause | None:
-    """The sequence of a pattern of the library; ``None`` if the text defines the name, or nothing has it."""
+    """Return the sequence of a library pattern. ``None`` if the query defines the name or it is unknown."""
     entry = None if normalize_name(step.name) in session.predicates else _entry(step)
     if entry is None or entry.kind not in SEQUENCES:
         return None
@@ -730,7 +730,7 @@ def _scenario(step: s.ScenarioStep, session: Session) -> s.Define:
 
 
 def _values(step: s.ScenarioStep, definition: s.Define, session: Session) -> dict[str, Any]:
-    """The values of a scenario's parameters: those given, or else their own."""
+    """Return the parameter values of a scenario: arguments, otherwise defaults."""
     formals = {formal.name: formal for formal in definition.parameters}
     names = SymbolTable(session, ScopeBuilder(session))
     values: dict[str, Any] = {f.name: _value(f.default) for f in formals.values() if f.default}
@@ -741,7 +741,7 @@ def _values(step: s.ScenarioStep, definition: s.Define, session: Session) -> dic
             values[given.name] = _value(given.value)
     missing = [name for name in formals if name not in values]
     strange = (one for one in step.given if not isinstance(one.value, s.Variable))
-    if missing and all(one.name in formals for one in strange):  # the others are told later
+    if missing and all(one.name in formals for one in strange):  # other errors are reported later
         session.refuse(
             f"{definition.name} needs a value of {missing[0]}",
             step.span,
@@ -753,14 +753,14 @@ def _values(step: s.ScenarioStep, definition: s.Define, session: Session) -> dic
 def _value(value: s.Given) -> Any:
     if isinstance(value, s.Constant):
         return value.value
-    assert isinstance(value, s.Duration)  # noqa: S101 - the others were looked at before
+    assert isinstance(value, s.Duration)  # noqa: S101 - other types were handled before
     return f"{value.amount:g}frames" if value.unit == "frames" else value.ns / 1e9
 
 
 def _check_absent(
     steps: list[_Written], links: list[tuple[s.LinkClause, Any]], session: Session
 ) -> None:
-    """Refuse what must not happen where it has no neighbour to stand beside."""
+    """Reject a ``NOT MATCH`` without the required neighbours."""
     for number, written in enumerate(steps):
         if not written.step.absent:
             continue
@@ -853,7 +853,7 @@ def _parameters(
     name: str = "",
     called: TextSpan | None = None,
 ) -> Generator[None]:
-    """While a scenario's text is bound, its parameters are its own, and its errors say its name."""
+    """Context in which a scenario is bound: its own parameters, and its name in errors."""
     outside = session.parameters
     if values is not None:
         session.parameters = values

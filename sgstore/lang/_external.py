@@ -132,7 +132,7 @@ CLOCK_OF_TRACES: Final = f"""{_CLOCK}
 
 BUCKETS: Final = """SELECT "bucket", "valid", "joined" FROM "bucket"
 WHERE "bucket" >= $1 AND "bucket" < $2"""
-"""Buckets of a range, with their numbers of frames and of frames without a gap before; unsorted."""
+"""Buckets of a range, with the masks of their frames and of the frames without a gap before; unsorted."""
 
 TIMES: Final = """SELECT "frame_id", "time_ns" FROM "frame"
 WHERE "frame_id" >= $1 AND "frame_id" < $2"""

@@ -1,6 +1,6 @@
-"""Patterns from Python: built step by step, from networkx, or from an example frame.
+"""Patterns built in Python: step by step, from networkx, or from an example frame.
 
-All become a text of the language and the values of its parameters, so that they mean what the text means.
+Each pattern is converted to query text and parameter values, so it has the meaning of that text.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _RESERVED: Final = frozenset({"label", "kind", "where", "relation", "name"})
 
 @dataclass(frozen=True, slots=True)
 class Pattern:
-    """A pattern that is built step by step; every step gives a new one.
+    """Query pattern that is built step by step. Each method returns a new pattern.
 
     ::
 
@@ -52,13 +52,13 @@ class Pattern:
     Attributes
     ----------
     parts : tuple of str
-        Nodes and edges, as they stand after ``MATCH``.
+        Nodes and edges, as written after ``MATCH``.
     conditions : tuple of str
-        Joined by ``AND``.
+        Conditions, joined by ``AND``.
     returned : str
-        What stands after ``RETURN``; empty for whole matches.
+        Text after ``RETURN``; empty for whole matches.
     parameters : mapping
-        Values that the text speaks of as ``$name``.
+        Values of the parameters ``$name`` in the text.
     """
 
     parts: tuple[str, ...] = ()
@@ -72,16 +72,16 @@ class Pattern:
         Parameters
         ----------
         name : str
-            Of its variable.
+            Name of the variable.
         label : str
-            ``Person``, ``Car|Truck``, ``Vehicle&!Ego``; empty: anything.
+            Label such as ``Person``, ``Car|Truck``, ``Vehicle&!Ego``; empty means any node.
         **properties
-            Attributes that it must have, with their values.
+            Required attribute values.
 
         Raises
         ------
         QueryError
-            The name or the label cannot stand in a pattern.
+            Invalid name or label.
         """
         inside = _checked(name, _NAME, "a name") + _label(label)
         parts, values = self._properties(name, properties)
@@ -106,16 +106,16 @@ class Pattern:
         src, relation, dst : str
             ``relation`` is one, or several as ``near|very_near``; empty: any.
         both : bool
-            Whether it may run either way.
+            True if the edge may have either direction.
         times : str
-            ``2`` or ``1..3``: so many edges, one behind the other.
+            Number of edges in a row: ``2`` or ``1..3``.
         name : str
             Of its variable, if it has one.
 
         Raises
         ------
         QueryError
-            One of these cannot stand in a pattern.
+            One of the arguments is invalid in a pattern.
         """
         ends = [_checked(end, _NAME, "a name") for end in (src, dst)]
         inside = (_checked(name, _NAME, "a name") if name else "") + _label(relation)
@@ -125,18 +125,18 @@ class Pattern:
         return self._with(part=f"({ends[0]})-[{inside}]-{'' if both else '>'}({ends[1]})")
 
     def where(self, condition: str, /, **parameters: Any) -> Pattern:
-        """Add a condition, as it would stand after ``WHERE``, with the values of its parameters."""
+        """Add a condition, as written after ``WHERE``, with the values of its parameters."""
         return self._with(condition=f"({condition})", values=parameters)
 
     def returns(self, what: str, /) -> Pattern:
-        """Say what to return, as it would stand after ``RETURN``."""
+        """Set the values to return, as written after ``RETURN``."""
         return Pattern(self.parts, self.conditions, what, self.parameters)
 
     def __repr__(self) -> str:
         return f"<Pattern {str(self) if self.parts else 'without nodes'!r}>"
 
     def __str__(self) -> str:
-        """The text of the pattern."""
+        """Text of the pattern."""
         if not self.parts:
             raise QueryError("the pattern is empty", hint="add a node")
         text = f"MATCH {', '.join(self.parts)}"
@@ -145,19 +145,20 @@ class Pattern:
 
     @classmethod
     def of(cls, graph: nx.Graph[Any]) -> Pattern:
-        """The pattern that a networkx graph draws.
+        """Return the pattern that a networkx graph represents.
 
         Parameters
         ----------
         graph : networkx graph, directed or not, with one or many edges between two nodes
-            Of a node: ``label`` (or ``kind``), ``where`` (a condition on its name, or on that of others), and
-            any other attribute as a property that it must have. Of an edge: ``relation`` (a text such as
-            ``near|visible``, or several), without one any; either way if the graph is not directed.
+            Attributes of a node: ``label`` (or ``kind``), ``where`` (a condition that uses names of nodes),
+            and any other attribute as a required property. Attribute of an edge: ``relation`` (a text such as
+            ``near|visible``, or several); without it, any relation. Edges of an undirected graph match either
+            direction.
 
         Raises
         ------
         QueryError
-            Something of it cannot stand in a pattern.
+            A part of the graph is invalid in a pattern.
         """
         names = {node: _name_of(node, number) for number, node in enumerate(graph.nodes)}
         pattern = cls()
@@ -216,7 +217,7 @@ def _label(label: str) -> str:
 
 
 def _name_of(node: object, number: int) -> str:
-    """A name for a node: its own, if it can be one."""
+    """Return the name of a node if it is a valid variable name, otherwise ``n`` and a number."""
     text = str(node)
     return text if _NAME.fullmatch(text) else f"n{number}"
 
@@ -225,39 +226,39 @@ def _relations(relation: str | Iterable[str]) -> str:
     return relation if isinstance(relation, str) else "|".join(relation)
 
 
-# A frame as example: the text of a pattern that describes what is around its ego, and so matches that frame
+# A frame as example: a pattern that describes the surroundings of its ego, and matches that frame
 # ------------------------------------------------------------------------------------------------
-# It says where the ego is, and of the traffic that a relation joins with it, how many there are at least of
-# each kind in each place: seen from the ego, and in lanes that are its own, beside it, or against it. Each of
-# these is a block of its own, so that the pattern stays cheap however much there is around.
+# The pattern describes the place of the ego and the traffic related to it: the minimum number of entities of
+# each kind at each place. The place is relative to the ego and to its lane, the neighbouring lanes and the
+# opposing lanes. Each group is its own block, so the pattern stays fast in dense traffic.
 
 _SCENERY: Final = frozenset({"building", "pole", "barrier", "vegetation"})
-"""Kinds that are no traffic."""
+"""Kinds that are not traffic."""
 
 _LANES: Final = {
     "same": "EXISTS {{({0})-[:isIn]->(:Lane)<-[:isIn]-(ego)}}",
     "laneChange": "EXISTS {{({0})-[:isIn]->(:Lane)-[:laneChange]-(:Lane)<-[:isIn]-(ego)}}",
     "opposes": "EXISTS {{({0})-[:isIn]->(:Lane)-[:opposes]-(:Lane)<-[:isIn]-(ego)}}",
 }
-"""How the lanes of an entity lie to those of the ego: by a relation between them, or the same one."""
+"""Relations between the lane of an entity and the lane of the ego."""
 
 _PLACES: Final = ("crosswalk", "off_road")
-"""Kinds of places that an entity may be in, beside lanes."""
+"""Kinds of places that an entity may be in, apart from lanes."""
 
 
 def pattern_of(graph: SceneGraph, ignored: Sequence[str] = ()) -> str:
-    """The text of a pattern that describes a scene graph around its ego, and matches it.
+    """Return a pattern that describes a scene graph around its ego, and matches it.
 
     Parameters
     ----------
     graph : SceneGraph
     ignored : sequence of str
-        Relations, and kinds or words for several kinds, that the pattern leaves out.
+        Relations, kinds, or labels for several kinds, that the pattern omits.
 
     Raises
     ------
     QueryError
-        The frame has no ego, or nothing is called as what is to be ignored.
+        The frame has no ego, or an ignored name is unknown.
     """
     if graph.ego is None or graph.ego not in graph.nodes:
         raise QueryError("the frame has no ego, so nothing is around it")
@@ -271,7 +272,7 @@ def pattern_of(graph: SceneGraph, ignored: Sequence[str] = ()) -> str:
 
 
 def _left(ignored: Sequence[str]) -> tuple[frozenset[str], frozenset[str]]:
-    """The relations and kinds that are left."""
+    """Return the relations and kinds that are not ignored."""
     relations, kinds = set(RELATIONS), {*ENTITY_KINDS, "lane", *_PLACES} - _SCENERY
     for name in ignored:
         relation, several = relation_named(name), kinds_labelled(name)
@@ -306,16 +307,16 @@ class _Around:
                 self._in.setdefault(src, set()).add(dst)
 
     def of_ego(self) -> Iterator[str]:
-        """Place of the ego."""
+        """Yield conditions on the place of the ego."""
         yield from self._places("ego", self._ego)
 
     def others(self) -> list[int]:
-        """The traffic that a relation joins with the ego."""
+        """Return the traffic with a relation to the ego."""
         ends = {src for src, _, dst in self._edges if dst == self._ego and src >= 0}
         return [n for n in self._graph.nodes if n in ends and self._kind(n) in self._kinds]
 
     def block(self, node: int) -> str:
-        """An entity as a block: its kind, its relations to the ego, and the lanes and places it is in."""
+        """Return a block for an entity: its kind, its relations to the ego, its lanes and places."""
         relations = [r for r in RELATIONS if (node, r, self._ego) in self._edges]
         first, *more = relations
         paths = [f"{node_of_kind(self._kind(node), 'x')}-[:{first}]->(ego)"]
@@ -346,9 +347,9 @@ class _Around:
 
 
 def node_of_kind(kind: str, name: str = "", mark: str = "!Ego") -> str:
-    """A node of one kind, and whether it is the ego, as a pattern.
+    """Return a node pattern for one kind, with a mark for the ego or for other nodes.
 
-    A label that stands for several kinds, as ``Vehicle`` does, needs the kind beside it.
+    A label for several kinds, such as ``Vehicle``, also needs the kind as a property.
     """
     exact = f" {{kind: '{kind}'}}" if kind in SUPER_KINDS else ""
     return f"({name}:{_label_of_example(kind)}&{mark}{exact})"

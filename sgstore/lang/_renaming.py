@@ -1,7 +1,7 @@
-"""Patterns with names as steps, with variables of one's own: ``MATCH cut_in(v = w)``.
+"""Named patterns as steps, with renamed variables: ``MATCH cut_in(v = w)``.
 
-A variable of the pattern that is given another name has that name wherever the pattern speaks of it; the others
-keep theirs, and so are the same entity in every step that speaks of them.
+A renamed variable has its new name everywhere in the pattern. Other variables keep their names, so the same
+name is the same entity in every step.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ _NAMED = (s.NodePattern, s.EdgePattern, s.StepClause, s.Variable)
 def values_given(
     step: s.ScenarioStep, parameters: Mapping[str, str], session: Session
 ) -> list[s.Argument]:
-    """Values given for the parameters of a pattern.
+    """Return the arguments that set parameters of a pattern.
 
     Parameters
     ----------
     step : ScenarioStep
     parameters : mapping of str to str
-        Names of the parameters, and a value of each as it is written; empty: none is known.
+        Names of the parameters, each with an example value as text; empty if unknown.
     session : Session
 
     Raises
     ------
     QueryError
-        A parameter is given a variable.
+        The argument of a parameter is a variable.
     """
     found = [given for given in step.given if given.name in parameters]
     for given in found:
@@ -57,27 +57,28 @@ def own_names(
     taken: frozenset[str],
     session: Session,
 ) -> dict[str, str]:
-    """The names that variables of a pattern are given: old name → new name.
+    """Return the new names of the variables of a pattern: old name → new name.
 
-    What braces in it bind, and nobody outside sees, gets a name that no query can write where its own is taken.
+    Variables bound in braces are invisible outside. If their name is already used, they get a name that
+    queries cannot write.
 
     Parameters
     ----------
     step : ScenarioStep
     steps : sequence of StepClause
-        What the pattern stands for.
+        Steps of the pattern.
     parameters : iterable of str
-        Its parameters, whose names win over those of variables.
+        Parameters of the pattern. They take precedence over variables with the same name.
     taken : frozenset of str
-        Names that the text around it binds.
+        Names bound by the surrounding text.
     session : Session
 
     Raises
     ------
     QueryNameError
-        It has neither a parameter nor a variable that is called so.
+        Unknown parameter or variable.
     QueryError
-        A variable is given a value, or two variables would have one name.
+        The argument of a variable is a value, or two variables would have the same name.
     """
     parameters, variables = list(parameters), list(dict.fromkeys(_variables(steps)))
     names: dict[str, str] = {}
@@ -110,7 +111,7 @@ def own_names(
 
 
 def _variables(steps: Sequence[s.StepClause]) -> Iterator[str]:
-    """The names that steps bind (of nodes, of edges, of the steps), and those that they speak of besides."""
+    """Yield the names that steps bind (nodes, edges, steps), then the variables that they use."""
     for step in steps:
         yield from (name for name in _bound(step.block) if name != THE_EGO)
         if step.name is not None:
@@ -120,13 +121,13 @@ def _variables(steps: Sequence[s.StepClause]) -> Iterator[str]:
 
 
 def _bound(block: s.Block) -> list[str]:
-    """The names of the nodes and edges of a block."""
+    """Return the names of the nodes and edges of a block."""
     parts = [part for path in block.paths for part in (*path.nodes, *path.edges)]
     return [part.name for part in parts if part.name]
 
 
 def _spoken_of(part: Any, own: tuple[str, ...]) -> Iterator[str]:
-    """The variables that a part of a text speaks of, but for those that braces around it bind."""
+    """Yield the variables used in a part of a text, except those bound by enclosing braces."""
     if isinstance(part, s.Variable):
         yield from () if part.name in own else (part.name,)
         return
@@ -140,7 +141,7 @@ def _spoken_of(part: Any, own: tuple[str, ...]) -> Iterator[str]:
 
 
 def names_written(sequence: s.SequenceClause) -> frozenset[str]:
-    """The names that a sequence binds, as it is written."""
+    """Return the names that a sequence binds or uses."""
     found: set[str] = set()
     for step in sequence.steps:
         if isinstance(step, s.GroupStep):
@@ -153,7 +154,7 @@ def names_written(sequence: s.SequenceClause) -> frozenset[str]:
 
 
 def renamed(step: s.StepClause, names: Mapping[str, str]) -> s.StepClause:
-    """A step in which variables have other names."""
+    """Return a copy of a step with renamed variables."""
     return _renamed(step, names) if names else step
 
 

@@ -1,8 +1,8 @@
-"""The symbol table, data sets and tests of texts.
+"""Symbol table, datasets, and text tests of the binder.
 
-Two chains run from the inside out. *Names* are what a text may say: those of a block see those around it,
-those of a predicate's body see its parameters only. *Scopes* are where nodes live; a node that is spoken of
-in a scope further in becomes an outer node of every scope between.
+There are two chains from the inside out. *Names*: a block can use the names around it, the body of a
+predicate can use only its parameters. *Scopes* hold nodes: a node used in an inner scope becomes an outer
+node of every scope between.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ if TYPE_CHECKING:
 
 
 THE_EGO: Final = "ego"
-"""The name that is always bound: to the ego of the frame."""
+"""Name that is always bound to the ego of the frame."""
 
 RESERVED: Final = frozenset({"env", "frame", "trace"})
-"""Names of what is not a node but has attributes all the same."""
+"""Names with attributes that are not nodes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Symbol:
-    """Meaning of a name: a node, an edge, or (for the parameter of a predicate) a value."""
+    """Meaning of a name: a node, an edge, or a value (for a predicate parameter)."""
 
     node: str | None = None
     edge: str | None = None
@@ -51,57 +51,57 @@ class Symbol:
 
 
 Binder = Callable[[Any, "SymbolTable"], Bound]
-"""The function that binds one kind of expression."""
+"""Function that binds one kind of expression."""
 
 Binders = Mapping[type, Binder]
 
 
 @dataclass(slots=True)
 class Session:
-    """State that the whole of a query shares while it is bound.
+    """State shared by the whole query during binding.
 
     Attributes
     ----------
     text : str
-        The query, for messages.
+        Text of the query, for messages.
     parameters : mapping of str to value
     binders : mapping of type to Binder
-        The binder of each kind of expression. They are handed in, because calls, blocks and temporal operators
-        hold expressions, and expressions hold them.
+        Binder of each kind of expression. They are passed as arguments, because calls, blocks and temporal
+        operators contain expressions, and expressions contain them.
     predicates : dict of str to Define
-        By folded name.
+        Definitions by folded name.
     injective : bool
-        Whether different nodes of a pattern are bound to different nodes.
+        True if different nodes of a pattern must be bound to different nodes.
     used : set of str
-        Parameters that the query speaks of.
+        Parameters that the query uses.
     relations : set of str
-        Relations that it names.
+        Relations that the query names.
     keys : set of str
-        Keys taken, without regard to case: the database sees no difference.
+        Used keys in lower case, because the database ignores case.
     calls : list of str
         Predicates whose bodies are being bound.
     classed : tuple of str
-        Abstractions in which the store has the classes of frames.
+        Abstractions whose frame classes are in the store.
     tables : mapping of str to TableFacts
-        Tables of users' own that are joined, by name.
+        User tables by name.
     traces : tuple of TraceFacts
-        Of the store.
+        Traces of the store.
     own : mapping of str to Type
-        Attributes of a client's own, by name.
+        User-defined attributes, by name.
     part : bool
-        Whether the store is a part of a collection: see :attr:`sgstore.lang.Catalog.part`.
+        True if the store is a part of a collection: see :attr:`sgstore.lang.Catalog.part`.
     online : bool
-        Whether nothing later is known.
+        True if later frames are unknown.
     dropped : set of str
         Names that a ``WITH`` does not pass on.
     maybe : set of str
-        Keys of nodes that an ``OPTIONAL MATCH`` binds, or leaves NULL.
+        Keys of nodes of an ``OPTIONAL MATCH``, which may be NULL.
     the_ego : str or None
-        The key of the ego, once the query has named it ``ego``, wherever that is.
+        Key of the ego, after its first use as ``ego``.
     numbers, blocks : int
-        Unnamed nodes and edges, and blocks, so far.
+        Numbers of unnamed nodes and edges, and of blocks, so far.
     beyond : Scopes
-        Which relations traces have, of a statement that asks for them beyond the graphs; else empty.
+        Relation scopes of the traces, if a statement uses data beyond the graphs; otherwise empty.
     """
 
     text: str
@@ -128,18 +128,18 @@ class Session:
     beyond: b.Scopes = ()
 
     def ask(self, catalog: Catalog) -> None:
-        """Take over what a catalog says of the store that is asked."""
+        """Copy the needed facts of the store from a catalog."""
         self.classed, self.tables, self.traces = catalog.classed, catalog.tables, catalog.traces
         self.own, self.own_edges, self.part = catalog.own, catalog.own_edges, catalog.part
         self.online = catalog.online
 
     def look_beyond(self, catalog: Catalog, *, world: bool) -> None:
-        """Take over which relations traces have, if a statement asks for them beyond the graphs."""
+        """Set the relation scopes of the traces, if the statement uses data beyond the graphs."""
         if world and (catalog.world or catalog.online):
             self.beyond = scopes_of(self.traces)
 
     def key(self, name: str | None) -> str:
-        """A key that is not taken: the name itself if it can be; ``#1``, ``#2``, … for what has none."""
+        """Return an unused key: the name if possible, or ``#1``, ``#2``, … without a name."""
         self.numbers += name is None
         wanted = name or f"#{self.numbers}"
         key, copy = wanted, 2
@@ -155,14 +155,14 @@ class Session:
     def unknown(
         self, what: str, name: str, span: TextSpan, known: Iterable[str], hint: str | None = None
     ) -> NoReturn:
-        """Raise a :class:`QueryNameError` about a name, with what is most like it or else all that is known."""
+        """Raise a :class:`QueryNameError` for an unknown name, with similar or known names as a hint."""
         hint = hint or hint_at(name, known)
         raise QueryNameError(f"unknown {what} '{name}'", text=self.text, span=span, hint=hint)
 
 
 @dataclass(slots=True)
 class ScopeBuilder:
-    """A scope in the making."""
+    """Scope during binding."""
 
     session: Session
     parent: ScopeBuilder | None = None
@@ -177,18 +177,18 @@ class ScopeBuilder:
         return self.parent.top if self.parent else self
 
     def kinds(self, key: str) -> Kinds:
-        """Return the kinds that a node may have here."""
+        """Return the kinds that a node may have in this scope."""
         return self.nodes[key].kinds if key in self.nodes else self.outer[key]
 
     def mention(self, key: str) -> None:
-        """Take note that a node is spoken of here; it is one of this scope or of one around it."""
+        """Record the use of a node of this scope or of an enclosing scope."""
         if key in self.nodes or key in self.outer or self.parent is None:
             return
         self.parent.mention(key)
         self.outer[key] = self.parent.kinds(key)
 
     def narrow(self, key: str, kinds: Kinds) -> None:
-        """A node is asked to be of some kinds, here."""
+        """Restrict a node to some kinds in this scope."""
         if key in self.outer:
             self.outer[key] = self.outer[key] & kinds
         else:
@@ -196,25 +196,25 @@ class ScopeBuilder:
             self.nodes[key] = replace(node, kinds=node.kinds & kinds)
 
     def add(self, name: str | None, kinds: Kinds, span: TextSpan, *, named: bool) -> str:
-        """A new node; its key."""
+        """Add a node and return its key."""
         key = self.session.key(name)
         self.nodes[key] = Node(key, kinds, "named" if named else "unnamed", span)
         return key
 
     def the_ego(self, span: TextSpan) -> str:
-        """The key of the ego: of the node that is labelled so in ``MATCH``, or of one that is added there."""
+        """Return the key of the ego node of the ``MATCH``, or add one."""
         for node in self.nodes.values():
             if not node.kinds.other:
                 return node.key
         return self.add(THE_EGO, ego_kinds(), span, named=False)
 
     def finished(self) -> Scope:
-        """The scope, with what must differ."""
+        """Return the finished scope, with the pairs of nodes that must differ."""
         where = tuple(self.where)
         return Scope(self.nodes, self.outer, tuple(self.edges), where, self.distinct())
 
     def distinct(self) -> frozenset[tuple[str, str]]:
-        """Return the pairs of nodes that must differ: own nodes from each other and from outer ones."""
+        """Return the pairs of nodes that must differ: own nodes from each other and from outer nodes."""
         if not self.session.injective:
             return frozenset()
         pairs = {*combinations(self.nodes, 2), *product(self.nodes, self.outer)}
@@ -230,7 +230,7 @@ class ScopeBuilder:
 
 @dataclass(slots=True)
 class SymbolTable:
-    """The names that a part of a text may use, and the scope that it stands in.
+    """Names that a part of a text can use, with its scope.
 
     Attributes
     ----------
@@ -238,17 +238,17 @@ class SymbolTable:
     scope : ScopeBuilder
     meanings : dict of str to Symbol
     parent : SymbolTable or None
-        Names around these, visible too.
+        Enclosing names, also visible.
     aggregates : bool
-        Whether ``COUNT(*)`` and the like may stand here.
+        True if aggregates such as ``COUNT(*)`` are allowed here.
     aggregated : bool
-        Whether what stands here is inside of one.
+        True inside an aggregate.
     over : bool
-        Whether values over a match may stand here.
+        True if values over a match are allowed here.
     paths : list of PathValue or None
-        Paths with names, where there may be some.
+        Named paths. ``None`` if they are not allowed here.
     aliases : mapping of str to Bound
-        What ``RETURN`` calls its values, where these may be spoken of; a name of one is no variable there.
+        Values of ``RETURN`` by name, where these can be used. Such a name is not a variable there.
     """
 
     session: Session
@@ -262,15 +262,15 @@ class SymbolTable:
     aliases: Mapping[str, Bound] = field(default_factory=dict[str, "Bound"])
 
     def block(self) -> SymbolTable:
-        """Names for a block in this place."""
+        """Return the symbol table of a block at this place."""
         return SymbolTable(self.session, ScopeBuilder(self.session, self.scope), parent=self)
 
     def body(self, meanings: dict[str, Symbol]) -> SymbolTable:
-        """Names for the body of a predicate that is called in this place."""
+        """Return the symbol table for the body of a predicate called at this place."""
         return SymbolTable(self.session, self.scope, meanings)
 
     def meaning(self, name: str) -> Symbol | None:
-        """Return the meaning of a name here; ``None`` if it is not known. ``ego`` is not looked up."""
+        """Return the meaning of a name, or None if unknown. The name ``ego`` is not resolved here."""
         names: SymbolTable | None = self
         while names is not None:
             if name in names.meanings:
@@ -279,14 +279,14 @@ class SymbolTable:
         return None
 
     def node(self, name: str, span: TextSpan) -> str:
-        """The key of the node that a name means; the scope takes note of it.
+        """Return the key of the node that a name means, and record its use.
 
         Raises
         ------
         QueryNameError
-            No such name.
+            Unknown name.
         QueryError
-            It does not mean a node.
+            The name is not a node.
         """
         meaning = self.meaning(name)
         if meaning is None and name == THE_EGO:
@@ -305,7 +305,7 @@ class SymbolTable:
         return key
 
     def _hint(self, name: str) -> str | None:
-        """Return a hint for a name that has no meaning here."""
+        """Return a hint for a name that is unknown here."""
         if self.session.calls:
             return f"{self.session.calls[-1]}() knows its parameters and ego only"
         if name in self.session.dropped:
@@ -319,9 +319,9 @@ class SymbolTable:
         Raises
         ------
         QueryNameError
-            It names what is not known.
+            An unknown name.
         QueryError
-            Its types do not fit together.
+            Types do not match.
         """
         return self.session.binders[type(expression)](expression, self)
 
@@ -331,7 +331,7 @@ class SymbolTable:
         Raises
         ------
         QueryError
-            It is something else.
+            The expression has another type.
         """
         found = self.bind(expression)
         if found.type not in {Type.boolean, Type.null}:
@@ -349,7 +349,7 @@ class SymbolTable:
         Raises
         ------
         QueryError
-            It is something else.
+            The expression has another type.
         """
         found = self.bind(expression)
         if found.type is not Type.number:
@@ -362,13 +362,13 @@ class SymbolTable:
         return found
 
     def visible(self) -> set[str]:
-        """All names that may be used here, but those of frame and trace."""
+        """Return all names that can be used here, except ``frame``, ``trace`` and ``env``."""
         outside = self.parent.visible() if self.parent else {THE_EGO}
         return outside | set(self.meanings) | set(self.aliases)
 
 
 def call_hint(name: str) -> str | None:
-    """Say how a function of two entities or a predicate of that name is written; ``None`` if there is none."""
+    """Return a hint with the signature of a two-entity function or predicate, or None."""
     word = normalize_name(name)
     if (found := predicates().get(word)) is not None:
         formals = ", ".join(formal.name for formal in found.parameters)
@@ -376,14 +376,14 @@ def call_hint(name: str) -> str | None:
     return f"it is a function: {PAIR_NAMES[word]}(a, b)" if word in PAIR_NAMES else None
 
 
-# Datasets in queries: traces whose names are alike, or a table of one's own that says which -----
+# Datasets in queries: traces selected by a name pattern or by a user table -----
 
 CLASSES_GIVEN: Final = "sgstore_classes"
-"""The table with the classes of all parts of a collection: ``dataset`` (empty: of all frames), ``abstraction``,
-``class``, ``frames``."""
+"""Table with the frame classes of all parts of a collection: ``dataset`` (empty: all frames),
+``abstraction``, ``class``, ``frames``."""
 
 CLASSES: Final = "datasetclasses"
-"""The function after ``IN``, folded: ``frame.class IN dataset_classes('train')``."""
+"""Folded name of the function after ``IN``: ``frame.class IN dataset_classes('train')``."""
 
 
 def traces_in(
@@ -393,17 +393,17 @@ def traces_in(
     *,
     part: bool = False,
 ) -> frozenset[int] | None:
-    """Ids of the traces of a dataset; ``None`` if nothing is called so.
+    """Return the ids of the traces of a dataset. ``None`` means an unknown dataset.
 
     Parameters
     ----------
     name : str
-        A table of one's own whose rows are of traces, or a name of traces, in which ``*`` and ``?`` stand for
-        anything.
+        A user table with one row for each trace, or a pattern of trace names with the wildcards ``*`` and
+        ``?``.
     traces : iterable of TraceFacts
     tables : mapping of str to TableFacts
     part : bool
-        Whether there are other stores, which may have what is not here.
+        True if other stores may contain the dataset.
     """
     if name in tables:
         return tables[name].traces
@@ -412,12 +412,12 @@ def traces_in(
 
 
 def asked(name: str, span: TextSpan, session: Session) -> frozenset[int]:
-    """Ids of the traces that ``USING DATASET`` chooses.
+    """Return the ids of the traces that ``USING DATASET`` selects.
 
     Raises
     ------
     QueryError
-        There is no such dataset, or it is a table of single frames.
+        Unknown dataset, or a table of single frames.
     """
     found = traces_in(name, session.traces, session.tables, part=session.part)
     if found is None and name in session.tables:
@@ -432,12 +432,12 @@ def asked(name: str, span: TextSpan, session: Session) -> frozenset[int]:
 def seen_in(
     classes: b.FrameAttribute, name: str, span: TextSpan, session: Session
 ) -> b.FrameAttribute:
-    """Return the condition that the class of a frame occurs in a dataset: traces, or a table with frames.
+    """Return the condition that the class of a frame occurs in a dataset of traces or frames.
 
     Raises
     ------
     QueryError
-        There is no such dataset.
+        Unknown dataset.
     """
     found = traces_in(name, session.traces, session.tables, part=session.part)
     table = session.tables.get(name)
@@ -460,7 +460,7 @@ def seen_in(
 
 
 def class_count(abstraction: str, *, part: bool = False) -> b.FrameAttribute:
-    """Return the number of frames in the store, or in all parts, that are of the class of the frame."""
+    """Return the number of frames with the class of this frame, in the store or in all parts."""
     attribute = Attribute(
         f"class_count({abstraction})",
         Type.number,
@@ -473,12 +473,12 @@ def class_count(abstraction: str, *, part: bool = False) -> b.FrameAttribute:
 
 
 def abstraction_named(name: str, span: TextSpan, session: Session) -> str:
-    """The abstraction in which the store has the classes of frames, in its own spelling.
+    """Return the exact name of an abstraction whose frame classes are in the store.
 
     Raises
     ------
     QueryNameError
-        The store has none of that name.
+        Unknown abstraction.
     """
     found = next(
         (one for one in session.classed if normalize_name(one) == normalize_name(name)), None
@@ -497,18 +497,18 @@ def _known(
     return found
 
 
-# Tests of texts: ``CONTAINS`` and the like, and regular expressions -----------------------------
+# Text tests: ``CONTAINS`` and similar, and regular expressions -----------------------------
 
 _NOT_RE2: Final = re.compile(r"\(\?(?!:|P<\w+>|[ims]+[:)])|\\[1-9NuUZ]|[*+?}]\+")
 
 
 def text_test(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTable) -> b.Operation:
-    """A test of one text by another, bound.
+    """Bind a test of one text by another, such as ``CONTAINS`` or ``=~``.
 
     Raises
     ------
     QueryError
-        A side is no text, or what stands after ``=~`` is no regular expression that can be searched for.
+        A side is not a text, or the text after ``=~`` is not a valid regular expression.
     """
     for side, written in ((left, e.left), (right, e.right)):
         if side.type is not Type.text:
@@ -521,12 +521,12 @@ def text_test(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTable
 
 
 def regex(text: str) -> re.Pattern[str]:
-    """Compile a regular expression that Python and the database read alike.
+    """Compile a regular expression that Python and the database interpret in the same way.
 
     Raises
     ------
     re.error
-        It is none, or a set in it may hold a set, which they read differently: ``[[:alpha:]]``, ``[a&&b]``.
+        Invalid, or with a nested set, which they interpret differently: ``[[:alpha:]]``, ``[a&&b]``.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("error", FutureWarning)
