@@ -108,7 +108,7 @@ class Entity(NamedTuple):
 
 
 class Frame:
-    """One instant of a scene. The caller adds its entities, lights and events.
+    """Instant of a scene. The caller adds its entities, lights and events.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""sgstore.mcap."""
+"""Guarded reader of MCAP files and rosbag2 bags."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Chunks of MCAP files, decompressed under guard."""
+"""Decompression of MCAP chunks, with limits against damaged files."""
 
 from __future__ import annotations
 
@@ -32,50 +32,50 @@ if TYPE_CHECKING:
     Ints = NDArray[np.int64]
     Memory = Callable[[int], memoryview]
 
-# Containers of messages, as readers of flavours use them: channels, and a walk over messages ------
+# Protocol of message containers for the readers: channels, and a walk over messages.
 
 
 class Recording(Protocol):
-    """A file of messages that is open: an MCAP file, or another container in the same words."""
+    """Protocol of an open file of messages: an MCAP file or another container."""
 
     @property
     def path(self) -> Path:
-        """The file."""
+        """Path of the file."""
         ...
 
     @property
     def size(self) -> int:
-        """Its size in bytes."""
+        """Size of the file; bytes."""
         ...
 
     @property
     def mtime_ns(self) -> int:
-        """Its time of change."""
+        """Modification time of the file; ns."""
         ...
 
     @property
     def schemas(self) -> Mapping[int, Schema]:
-        """Schemas by their id."""
+        """Schemas by id."""
         ...
 
     @property
     def channels(self) -> Mapping[int, Channel]:
-        """Channels by their id."""
+        """Channels by id."""
         ...
 
     @property
     def counts(self) -> Mapping[int, int] | None:
-        """Channel id → messages as the file itself says."""
+        """Number of messages by channel id, as declared in the file."""
         ...
 
     @property
     def has_log_times(self) -> bool:
-        """Whether messages have log times of their own, besides the times in them."""
+        """True if messages have log times, in addition to the times in their data."""
         ...
 
     @property
     def window(self) -> tuple[int, int]:
-        """Log times, both included, between which messages are frames."""
+        """First and last log time of messages that can become frames; both included; ns."""
         ...
 
     def walk(
@@ -85,22 +85,22 @@ class Recording(Protocol):
         keep: Callable[[int], bool] | None = None,
         rank: Callable[[int], int] | None = None,
     ) -> Iterator[Messages]:
-        """All messages; what cannot be read goes to ``report``.
+        """Yield all messages, in runs. Unreadable parts are added to ``report``.
 
-        ``wanted``: whether the chunk at an offset is wanted. ``keep``: whether the messages of a channel will
-        be asked for again, so that a later walk finds them sooner. ``rank``: if it is given, messages come in
-        order of time, and in that of these numbers of their channels at one time; else in file order.
-        A file without log times has its own order.
+        ``wanted``: true for the offset of a chunk to read. ``keep``: true for a channel whose messages a later
+        walk needs again. ``rank``: order number of a channel. With it, messages come in order of time; messages
+        of equal time come in the order of the ranks. Without it, they come in file order. A file without log
+        times has its own order.
 
         Raises
         ------
         OutOfOrder
-            With ``rank``: the messages that were handed out are not in order. The next walk sorts them.
+            With ``rank``: the messages so far are not in order. The next walk sorts them.
         """
         ...
 
     def settle_order(self, rank: Callable[[int], int]) -> None:
-        """Find out whether messages are in order of time: then a walk does not raise :class:`OutOfOrder`."""
+        """Check once whether messages are in order of time. Later walks do not raise :class:`OutOfOrder`."""
         ...
 
     def close(self) -> None:
@@ -109,19 +109,19 @@ class Recording(Protocol):
 
 
 LAST_NS: Final = (1 << 63) - 1
-"""Greatest time that a signed number of 64 bits can hold: the year 2262; ns."""
+"""Greatest time in signed 64 bits: the year 2262; ns."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordPlace:
-    """A record of the file: where it begins, and its length with its head; bytes."""
+    """Place of a record in the file: its offset, and its length with its head; bytes."""
 
     offset: int
     length: int
 
 
 def loss_of_chunk(reason: str, place: RecordPlace, head: ChunkHead | None) -> Loss:
-    """The loss of a chunk, with the time span that its head tells, if it can be."""
+    """Return the loss for an unusable chunk, with the time span of its head if valid."""
     known = head is not None and head.start_ns <= head.end_ns <= LAST_NS
     return Loss(
         reason,
@@ -133,47 +133,46 @@ def loss_of_chunk(reason: str, place: RecordPlace, head: ChunkHead | None) -> Lo
 
 
 def name_of(opcode: int) -> str:
-    """Name of a record's opcode, in words."""
+    """Return the name of a record type, in words."""
     try:
         return Opcode(opcode).name.lower().replace("_", " ")
     except ValueError:
         return f"opcode {opcode}"
 
 
-# Chunks of an MCAP file, decompressed under guard, and the messages in them as columns ----------
-# A chunk comes from a stranger. Its header says how large it is and how large it becomes; either may
-# be a lie, and 65 kB can become 2 GB. So what a chunk declares is held against a limit before a byte
-# is decompressed, what comes out is held against what was declared, a dictionary window larger than
-# the chunk could need is refused, and a record must end where the chunk does. What fails is refused
-# as a whole with a :class:`TraceError` that names the offset; the walk over the file
-# (:mod:`sgstore.mcap._reader`) makes a loss of it and goes on.
+# Chunks of an MCAP file, decompressed with limits, and their messages as columns.
+# A chunk is untrusted input. Both sizes in its header may be wrong, and 65 kB can become 2 GB. Therefore, the
+# declared sizes are checked against a limit before the decompression, the result is checked against the
+# declared size, a dictionary window larger than necessary is rejected, and the last record must end at the end
+# of the chunk. A chunk that fails is rejected as a whole with a :class:`TraceError` that contains the offset.
+# The walk over the file (:mod:`sgstore.mcap._reader`) reports it as a loss and continues.
 #
 # Source: MCAP specification, format version 0 (mcap.dev/spec).
 
 try:
     from isal.isal_zlib import crc32
-except ImportError:  # the extra [fast], whose checksums are the same, ten times sooner
+except ImportError:  # The extra [fast] computes the same checksums ten times faster.
     from zlib import crc32
 
 
 MAX_CHUNK: Final = 256 << 20
-"""Greatest size of a chunk, stored or decompressed, and of a message outside chunks; bytes."""
+"""Maximum size of a chunk, stored or decompressed, and of a message outside chunks; bytes."""
 
 MAX_RECORDS: Final = 2_000_000
-"""Greatest number of records in a chunk: more than 60 MB of the smallest messages."""
+"""Maximum number of records in a chunk: more than 60 MB of the smallest messages."""
 
 IDS: Final = 1 << 16
-"""Ids of channels, and of schemas, that a file may have: they have 16 bits."""
+"""Maximum number of channel ids, and of schema ids, in a file; an id has 16 bits."""
 
 MIN_WINDOW: Final = 32 << 20
-"""Window that a zstd frame may always ask for; bytes. Larger ones only as large as the chunk itself."""
+"""Window size that a zstd frame may always use; bytes. A larger window must not exceed the chunk."""
 
 READ_ERRORS: Final = (
     McapError,
     struct.error,
     zstandard.ZstdError,
-    RuntimeError,  # what lz4.frame raises
-    ValueError,  # among them UnicodeDecodeError
+    RuntimeError,  # raised by lz4.frame
+    ValueError,  # includes UnicodeDecodeError
     KeyError,
     IndexError,
     OverflowError,
@@ -181,13 +180,13 @@ READ_ERRORS: Final = (
     MemoryError,
     OSError,
 )
-"""Whatever the parsers and decompressors below are known to raise on bytes that are not what they seem."""
+"""Known exceptions of the parsers and decompressors for malformed bytes."""
 
 Records = bytes | bytearray | memoryview
 """The records of a chunk, uncompressed."""
 
 HEAD: Final = struct.Struct("<BQ")
-"""Head of every record: opcode, length of what follows."""
+"""Head of every record: opcode, length of its content."""
 
 MESSAGE_HEAD: Final = np.dtype(
     [
@@ -203,7 +202,7 @@ MESSAGE_HEAD: Final = np.dtype(
 
 CHUNK_FIELDS: Final = struct.Struct("<QQQI")
 _PIECE: Final = 1 << 20
-_LZ4_PIECE: Final = 16 << 20  # its decompressor copies what is left of the input for every piece
+_LZ4_PIECE: Final = 16 << 20  # The decompressor copies the remaining input for every piece.
 _MESSAGE: Final = int(Opcode.MESSAGE)
 MESSAGE_FIELDS: Final = MESSAGE_HEAD.itemsize - HEAD.size
 """Bytes of a message record between its head and the data."""
@@ -211,13 +210,13 @@ _DEFINITIONS: Final = frozenset({int(Opcode.SCHEMA), int(Opcode.CHANNEL)})
 
 
 class StrictStream(ReadDataStream):
-    """The parser's stream, but a text or number that ends early is an error instead of a shorter one."""
+    """Parser stream that raises an error for a truncated text or number."""
 
     def __init__(self, record: bytes | memoryview) -> None:
         super().__init__(BytesIO(record))
 
     def read(self, length: int) -> bytes:
-        """Exactly ``length`` bytes."""
+        """Return exactly ``length`` bytes."""
         data = super().read(length)
         if len(data) != length:
             raise EndOfFile
@@ -226,7 +225,7 @@ class StrictStream(ReadDataStream):
 
 @dataclass(frozen=True, slots=True)
 class Messages:
-    """Messages that stand together in a file: those of a chunk, or a run outside chunks; shape (n,).
+    """Columns of consecutive messages in a file: those of one chunk, or a run outside chunks; shape (n,).
 
     Attributes
     ----------
@@ -237,11 +236,11 @@ class Messages:
     log_time_ns : int64
     publish_time_ns : uint64
     offset : int64
-        Byte offset of the record in the chunk, uncompressed, or in the file.
+        Byte offset of the record in the uncompressed chunk, or in the file.
     length : int64
         Bytes of the message's data.
     read : callable
-        ``read(position, length)``: bytes at a position counted as ``offset`` is.
+        ``read(position, length)``: bytes at a position that counts like ``offset``.
     """
 
     COLUMNS: ClassVar[tuple[str, ...]] = (
@@ -267,43 +266,43 @@ class Messages:
 
     @property
     def chunks(self) -> Ints:
-        """Byte offset of the chunk of each message, -1 outside chunks."""
+        """Return the byte offset of the chunk of each message; -1 outside chunks."""
         return np.full(len(self), self.chunk_offset)
 
     def chunk_of(self, row: int) -> int:
-        """Byte offset of the chunk of one message."""
+        """Return the byte offset of the chunk of one message; -1 outside chunks."""
         del row
         return self.chunk_offset
 
     def data(self, row: int) -> memoryview:
-        """The data of one message."""
+        """Return the data of one message."""
         return self.read(int(self.offset[row]) + MESSAGE_HEAD.itemsize, int(self.length[row]))
 
     def span(self, start: int, stop: int) -> Self:
-        """The messages from one row up to another."""
+        """Return the messages from row ``start`` up to row ``stop``, exclusive."""
         return self.take(slice(start, stop))
 
     def take(self, rows: NDArray[np.bool_] | slice) -> Self:
-        """Some of the messages."""
+        """Return the messages of the given rows."""
         return replace(self, **{name: getattr(self, name)[rows] for name in self.COLUMNS})
 
 
 @dataclass(frozen=True, slots=True)
 class ChunkHead:
-    """Fields of a chunk record that stand before its records.
+    """Header fields of a chunk record.
 
     Attributes
     ----------
     offset : int
         Byte offset of the record in the file.
     start_ns, end_ns : int
-        Least and greatest log time of its messages.
+        Minimum and maximum log time of its messages.
     size, crc : int
-        Size and CRC-32 of the records, uncompressed; a CRC of 0 stands for none.
+        Size and CRC-32 of the uncompressed records; a CRC of 0 means no checksum.
     compression : str
         ``zstd``, ``lz4``, or empty.
     data_offset, data_length : int
-        Where the records begin in the file, and how many bytes they take there.
+        Byte offset of the stored records in the file, and their number of bytes.
     """
 
     offset: int
@@ -317,12 +316,12 @@ class ChunkHead:
 
 
 def read_chunk_head(file: BufferedReader, offset: int) -> ChunkHead:
-    """The head of the chunk record at an offset, the offset of its data with it.
+    """Return the head of the chunk record at an offset.
 
     Raises
     ------
     TraceError
-        There is no chunk record, or its head contradicts itself.
+        The record is not a chunk, or its head contradicts itself.
     """
     file.seek(offset)
     try:
@@ -344,9 +343,9 @@ def read_chunk_head(file: BufferedReader, offset: int) -> ChunkHead:
 
 
 def head_of_cut_chunk(rest: bytes, offset: int) -> tuple[ChunkHead, bytes] | None:
-    """The head of a chunk record at an offset whose end is missing, and what there is of its data.
+    """Return the head of a truncated chunk record, and the available part of its data.
 
-    ``rest``: the bytes from there on. ``None`` where not even the head is whole.
+    ``rest``: the bytes from the offset on. ``None`` means that the head itself is truncated.
     """
     try:
         begin, end, size, crc = CHUNK_FIELDS.unpack_from(rest, HEAD.size)
@@ -362,21 +361,21 @@ def head_of_cut_chunk(rest: bytes, offset: int) -> tuple[ChunkHead, bytes] | Non
 def read_records(
     file: BufferedReader, head: ChunkHead, *, verify: bool = True, memory: Memory | None = None
 ) -> Records:
-    """The records of a chunk, decompressed and, if the chunk has a checksum, verified.
+    """Return the records of a chunk, decompressed, and verified if the chunk has a checksum.
 
     Parameters
     ----------
     file : file
     head : ChunkHead
     verify : bool
-        Whether to look at the checksum.
+        False skips the checksum.
     memory : callable, optional
-        Gives memory of some size, for what is read and what it becomes.
+        Returns memory of a given size, for the stored and the decompressed bytes.
 
     Raises
     ------
     TraceError
-        The chunk is too large, cut, not what it declares, or damaged.
+        The chunk is too large, truncated or damaged, or does not match its head.
     """
     stored = read_stored(file, head, memory)
     into = memory(head.size) if memory and head.compression else None
@@ -384,12 +383,12 @@ def read_records(
 
 
 def read_stored(file: BufferedReader, head: ChunkHead, memory: Memory | None = None) -> Records:
-    """The records of a chunk as they stand in the file.
+    """Return the records of a chunk as stored in the file.
 
     Raises
     ------
     TraceError
-        The chunk is too large, or cut.
+        The chunk is too large or truncated.
     """
     if head.size > MAX_CHUNK or head.data_length > MAX_CHUNK:
         largest = max(head.size, head.data_length)
@@ -409,14 +408,14 @@ def read_stored(file: BufferedReader, head: ChunkHead, memory: Memory | None = N
 def records_of(
     stored: Records, head: ChunkHead, *, verify: bool = True, into: memoryview | None = None
 ) -> Records:
-    """The records of a chunk from what :func:`read_stored` gives.
+    """Return the decompressed records for the result of :func:`read_stored`.
 
-    ``into``: memory of the chunk's size that may be used for them.
+    ``into``: optional memory of the chunk's size for the result.
 
     Raises
     ------
     TraceError
-        The chunk is not what it declares, or damaged.
+        The chunk is damaged or does not match its head.
     """
     try:
         records = decompress(stored, head.compression, head.size, into)
@@ -431,14 +430,14 @@ def records_of(
 def decompress(
     stored: Records, compression: str, size: int, into: memoryview | None = None
 ) -> Records:
-    """Decompress a chunk's bytes into exactly ``size`` bytes; never hold more of them in memory.
+    """Decompress a chunk into exactly ``size`` bytes. Memory use never exceeds ``size``.
 
-    ``into``: memory of that size that may be used for them.
+    ``into``: optional memory of that size for the result.
 
     Raises
     ------
     TraceError
-        They become more or fewer, cannot be decompressed, or the compression is not known.
+        The result has another size, the data are damaged, or the compression is unknown.
     """
     if compression not in _DECOMPRESS:
         raise TraceError(f"the compression {compression!r} is not known; known: zstd, lz4, none")
@@ -454,10 +453,10 @@ def decompress(
 
 
 def decompress_head(stored: bytes, compression: str, size: int) -> bytes:
-    """As much as a chunk gives whose end is missing: at most ``size`` bytes, none if nothing can be had."""
+    """Return the first bytes of a truncated chunk, at most ``size``; empty if it is undecodable."""
     pieces: list[bytes] = []
     left = size
-    with suppress(*READ_ERRORS):  # the missing end, met at last: what came before it stands
+    with suppress(*READ_ERRORS):  # The error at the missing end; the earlier bytes are valid.
         if compression == "zstd":
             reader = _zstd(size).stream_reader(stored, read_across_frames=True)
             while left > 0 and (piece := reader.read(min(left, 1 << 16))):
@@ -486,7 +485,7 @@ def _from_zstd(stored: Records, size: int, into: memoryview | None) -> Records:
     if declared == size:
         return _zstd(size).decompress(stored)
     if declared != zstandard.CONTENTSIZE_UNKNOWN and declared > size:
-        # A one-shot decompressor would allocate what the frame declares before it looks further.
+        # A one-shot decompressor would first allocate the declared size.
         raise TraceError(f"the chunk declares {size} bytes, the zstd frame in it {declared}")
     records = bytearray()
     with _zstd(size).stream_reader(stored, read_across_frames=True) as reader:
@@ -506,7 +505,7 @@ def _from_lz4(stored: Records, size: int, _into: memoryview | None) -> Records:
                 break
             piece = decompressor.decompress(b"", max_length=_lz4_piece(records, size))
         if not decompressor.eof:
-            break  # too much, or the input ends before the frame does
+            break  # The output is too long, or the input is truncated.
         stored = bytes(decompressor.unused_data or b"")
     return records
 
@@ -525,7 +524,7 @@ _DECOMPRESS: Final[dict[str, Callable[[Records, int, memoryview | None], Records
 def parse_records(
     records: Records, chunk_offset: int, *, whole: bool = True
 ) -> tuple[Messages, list[tuple[int, memoryview]]]:
-    """The records of a chunk: its messages as columns, and the definitions among them.
+    """Return the messages of a chunk as columns, and its definitions.
 
     Parameters
     ----------
@@ -533,7 +532,7 @@ def parse_records(
     chunk_offset : int
         Byte offset of the chunk in the file.
     whole : bool
-        Whether the records must end where the bytes do. Otherwise what is left at the end is passed over.
+        True if the last record must be complete. Otherwise, an incomplete last record is skipped.
 
     Returns
     -------
@@ -567,20 +566,20 @@ def message_columns(
     chunk_offset: int,
     read: Callable[[int, int], memoryview],
 ) -> Messages:
-    """Message records as columns.
+    """Return message records as columns.
 
     Parameters
     ----------
     heads : (n,) of :data:`MESSAGE_HEAD`
     offsets : (n,) int64
-        Where each record begins.
+        Byte offset of each record.
     chunk_offset, read
-        As :class:`Messages` has them.
+        As in :class:`Messages`.
 
     Raises
     ------
     TraceError
-        A log time lies beyond what 64 bits with a sign can hold: the year 2262.
+        A log time exceeds signed 64 bits (year 2262).
     """
     if len(heads) and int(heads["log_time"].max()) > LAST_NS:
         reason = f"a message bears the log time {int(heads['log_time'].max())} ns"
@@ -598,7 +597,7 @@ def message_columns(
 
 
 def _frame_records(records: Records) -> tuple[Ints, list[tuple[int, int, int]], int]:
-    """Offsets of the messages, spans of the definitions, and where the last whole record ends."""
+    """Return the offsets of messages, the spans of definitions, and the end of the last complete record."""
     offsets = array("q")
     definitions: list[tuple[int, int, int]] = []
     position, total, head_at = 0, len(records), HEAD.unpack_from

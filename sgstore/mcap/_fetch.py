@@ -1,10 +1,9 @@
-"""Access to single messages, and folders of split recordings.
+"""Access to single messages, and to bags (folders of split recordings).
 
-Bags of rosbag2: a folder whose ``metadata.yaml`` lists the MCAP files that one recording was split into.
-
-A bag is its files one after another: a place in it counts from the beginning of its first file, as if they
-were one. Only the list of files is taken from ``metadata.yaml``, so a few words of YAML suffice to read it: a
-key, and behind it a list of plain or quoted texts, as rosbag2 writes it. What it lists lies in the folder.
+A rosbag2 bag is a folder. Its ``metadata.yaml`` lists the MCAP files of one recording. A position in a bag
+counts from the start of its first file, as if the files were one. Only the list of files is read from
+``metadata.yaml``. A small subset of YAML is therefore enough: a key, and its list of plain or quoted texts, as
+rosbag2 writes it. The listed files must lie in the folder.
 
 Source: rosbag2, ``rosbag2_storage/yaml.hpp``.
 """
@@ -44,9 +43,9 @@ _Found = TypeVar("_Found")
 
 METADATA: Final = "metadata.yaml"
 MAX_METADATA: Final = 16 << 20
-"""Greatest ``metadata.yaml`` that is read; bytes. It repeats the settings of every channel."""
+"""Maximum size of ``metadata.yaml``; bytes. It repeats the settings of every channel."""
 MAX_PARTS: Final = 10_000
-"""Most files of a bag."""
+"""Maximum number of files in a bag."""
 
 _MARK: Final = b"rosbag2_bagfile_information"
 _BEGINNING: Final = 4096
@@ -57,15 +56,15 @@ _KEY: Final = re.compile(r"(relative_file_paths|storage_identifier|compression_m
 
 @dataclass(frozen=True, slots=True)
 class BagPart:
-    """A file of a bag.
+    """File of a bag.
 
     Attributes
     ----------
     path : Path
     base : int
-        Where it begins in the bag: the size of all files before it; bytes.
+        Position of its first byte in the bag: the size of all earlier files; bytes.
     size : int
-        -1: there is no such file.
+        -1 means that the file is missing.
     """
 
     path: Path
@@ -74,9 +73,10 @@ class BagPart:
 
 
 def bag_folder(path: Path) -> Path | None:
-    """The folder of the bag that a path means: itself, or that of a ``metadata.yaml``; ``None``: no bag.
+    """Return the folder of the bag at a path (folder or ``metadata.yaml``), or ``None`` without a bag.
 
-    A folder is a bag if its ``metadata.yaml`` begins as rosbag2 writes it; other tools write such files, too.
+    A folder is a bag if its ``metadata.yaml`` begins like those of rosbag2, because other tools write such
+    files, too.
     """
     if path.name == METADATA:
         return path.parent
@@ -93,7 +93,7 @@ def bag_folder(path: Path) -> Path | None:
 
 @lru_cache(maxsize=1024)
 def _is_remote_bag(url: str) -> bool:
-    """Tell whether a folder in an object store is a bag; what is called like a file is none."""
+    """True if a URL is a bag folder in an object store. A URL with a file suffix is not a bag."""
     if url.lower().endswith(_FILES):
         return False
     from sgstore.mcap._remote import open_url
@@ -106,12 +106,13 @@ def _is_remote_bag(url: str) -> bool:
 
 
 def parts_of(folder: Path) -> tuple[BagPart, ...]:
-    """The files of a bag, in the order in which its metadata list them.
+    """Return the files of a bag, in the order of its metadata.
 
     Raises
     ------
     TraceError
-        The metadata cannot be read, list no file, or are of a bag that is not MCAP; or no file of it is there.
+        The metadata are unreadable, list no file, or belong to a bag in another format; or all files are
+        missing.
     """
     parts: list[BagPart] = []
     base = 0
@@ -127,7 +128,7 @@ def parts_of(folder: Path) -> tuple[BagPart, ...]:
 
 
 def part_at(parts: tuple[BagPart, ...], place: int) -> BagPart | None:
-    """The file in which a place of the bag lies, if there is one."""
+    """Return the file of the bag that contains a position, or ``None``."""
     there = (part for part in parts if part.base <= place < part.base + part.size)
     return next(there, None)
 
@@ -155,9 +156,9 @@ def _listed(path: Path) -> list[str]:
 
 
 def read_metadata(text: str) -> dict[str, list[str]]:
-    """Read the files of a bag and their storage from its metadata; an absent key has no values.
+    """Return the files of a bag and its storage format from its metadata. An absent key has no values.
 
-    Other keys are passed over, and so is what is nested in them.
+    Other keys and their nested values are skipped.
     """
     found: dict[str, list[str]] = {
         "relative_file_paths": [],
@@ -185,14 +186,14 @@ def read_metadata(text: str) -> dict[str, list[str]]:
 
 
 def _values(text: str) -> list[str]:
-    """The texts in ``[a, b]``, or the only one."""
+    """Return the texts of a list ``[a, b]``, or the single text."""
     if text.startswith("[") and text.endswith("]"):
         return [part.strip() for part in text[1:-1].split(",") if part.strip()]
     return [text]
 
 
 def _plain(text: str) -> str:
-    """A scalar without its quotes, or without the comment behind it."""
+    """Return a YAML scalar without quotes or trailing comment."""
     quoted = re.match(r"""'((?:[^']|'')*)'|"((?:[^"\\]|\\.)*)\"""", text)
     if quoted is None:
         return re.sub(r"\s+#.*", "", text)
@@ -202,7 +203,7 @@ def _plain(text: str) -> str:
 
 
 def _inside(folder: Path, name: str) -> Path:
-    """The file that is meant. Early versions wrote the name of the folder before it."""
+    """Return the path of a listed file. Early versions prefix the name of the folder."""
     parts = PurePosixPath(name).parts
     if not parts or PurePosixPath(name).is_absolute() or ".." in parts or "\0" in name:
         raise TraceError(f"it lists {name!r}, which is not in its folder", path=folder / METADATA)
@@ -211,7 +212,7 @@ def _inside(folder: Path, name: str) -> Path:
 
 
 def _size(path: Path) -> int:
-    """Size of a regular file; -1 if there is none."""
+    """Return the size of a regular file; -1 if it is missing."""
     try:
         if url_named(path) is not None:
             return mark_of(path)[0]
@@ -221,32 +222,32 @@ def _size(path: Path) -> int:
     return status.st_size if stat.S_ISREG(status.st_mode) else -1
 
 
-# Files of recordings: opened with care, hashed, and asked for one message by its place ----------
+# Files of recordings: safe opening, hashing, and access to single messages.
 
 
 def message_at(path: Path, *, chunk_offset: int, offset: int, length: int) -> bytes:
-    """The data of one message, by its place; parameters and errors are those of :func:`messages_at`."""
+    """Return the data of one message by its position; see :func:`messages_at`."""
     (data,) = messages_at(path, [(chunk_offset, offset, length)])
     return bytes(data)
 
 
 def messages_at(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterator[memoryview]:
-    """The data of messages, in the order in which they are asked for.
+    """Yield the data of messages, in the order of ``places``.
 
     Parameters
     ----------
     path : Path
-        A file, or the folder of a bag, whose places count from the beginning of its first file.
+        A file, or the folder of a bag. Positions in a bag count from the start of its first file.
     places : iterable of (chunk_offset, offset, length)
         Byte offset of the chunk record in the file, -1 outside chunks; byte offset of the message record in the
-        chunk's records, uncompressed, or in the file; bytes of its data. Those of one chunk should come
-        together: the last chunk alone is kept.
+        uncompressed chunk, or in the file; bytes of its data. Group the messages of a chunk, because only the
+        last chunk is cached.
 
     Raises
     ------
     TraceError
-        The file cannot be opened, the chunk is damaged, or there is no message of that length: the file
-        was replaced.
+        The file is unreadable, the chunk is damaged, or the message does not match, because the file was
+        replaced.
     """
     folder = bag_folder(path)
     parts = None if folder is None else parts_of(folder)
@@ -268,7 +269,7 @@ def messages_at(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterator[
 
 
 def _bytes_at(path: Path, offset: int, length: int) -> memoryview:
-    """A message record outside chunks; nothing if the offset is outside the file."""
+    """Return a message record outside chunks; empty if the offset is outside the file."""
     with open_regular(path) as file:
         try:
             file.seek(offset)
@@ -278,7 +279,7 @@ def _bytes_at(path: Path, offset: int, length: int) -> memoryview:
 
 
 def _records_at(path: Path, chunk_offset: int) -> memoryview:
-    """The records of a chunk; none if the offset is outside the file."""
+    """Return the records of a chunk; empty if the offset is outside the file."""
     with open_regular(path) as file:
         try:
             return memoryview(read_records(file, read_chunk_head(file, chunk_offset)))
@@ -294,7 +295,7 @@ def _is_message(record: memoryview, length: int) -> bool:
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of a whole file, or of the files of a bag one after another, in hexadecimal digits.
+    """Return the SHA-256 of a file, or of all files of a bag in order, as hexadecimal digits.
 
     Raises
     ------
@@ -314,13 +315,13 @@ def digest_of(path: Path) -> str:
 
 
 def read_and_digest(path: Path, digest: str, read: Callable[[], _Found]) -> tuple[_Found, str]:
-    """Read a recording and hash its file at the same time, so that it comes from the disk once.
+    """Read a recording and hash its file at the same time, so that the disk is read once.
 
     Parameters
     ----------
     path : Path
     digest : str
-        SHA-256 of the file if it is known; else the empty string, and the file is hashed.
+        Known SHA-256 of the file, or an empty string to compute it.
     read : function
         First reading of the recording.
 
@@ -332,7 +333,7 @@ def read_and_digest(path: Path, digest: str, read: Callable[[], _Found]) -> tupl
     Raises
     ------
     TraceError
-        A file cannot be read; or as ``read`` raises it.
+        A file cannot be read, or ``read`` raises it.
     """
     with ThreadPoolExecutor(1) as beside:
         hashing = None if digest else beside.submit(digest_of, path)
@@ -341,12 +342,12 @@ def read_and_digest(path: Path, digest: str, read: Callable[[], _Found]) -> tupl
 
 
 def check_name(path: Path) -> None:
-    """Refuse a recording of which a store could not say where it is.
+    """Raise if the path of a recording is not valid UTF-8, which a store needs.
 
     Raises
     ------
     TraceError
-        Its name, or that of a folder above it, is no UTF-8.
+        The name of the file or of a parent folder is not UTF-8.
     """
     for name in reversed(path.absolute().parts):
         try:
@@ -358,16 +359,16 @@ def check_name(path: Path) -> None:
 
 
 def mark_of(path: Path) -> tuple[int, int]:
-    """Size and time of change of a recording, which tell whether it was replaced; bytes, ns.
+    """Return the size (bytes) and modification time (ns) of a recording, to detect a replaced file.
 
-    Of a bag: the size of its files together, and the latest time of change among them.
+    For a bag: the total size of its files, and their latest modification time.
 
     Raises
     ------
     OSError
-        There is no such file.
+        The file does not exist.
     TraceError
-        The metadata of the bag cannot be read, or none of its files is there.
+        The metadata of the bag are unreadable, or all its files are missing.
     """
     folder = bag_folder(path)
     if folder is None:
@@ -386,7 +387,7 @@ def _mark(path: Path) -> tuple[int, int]:
 
 
 def mark_of_open(file: BufferedReader) -> tuple[int, int]:
-    """Size and time of change of a file that :func:`open_regular` has opened; bytes, ns."""
+    """Return the size (bytes) and modification time (ns) of an open file."""
     remote: Any = file.raw
     if not isinstance(remote, FileIO):
         return remote.mark
@@ -396,21 +397,21 @@ def mark_of_open(file: BufferedReader) -> tuple[int, int]:
 
 @contextmanager
 def near(path: Path, folder: Path) -> Generator[None]:
-    """Read a recording from a copy in a folder, which is made, while the block lasts, if it lies elsewhere.
+    """Context manager that reads a remote recording from a local copy.
 
-    Everything else goes on calling it by its URL.
+    Other code still uses the URL of the recording.
 
     Parameters
     ----------
     path : Path
-        A recording; nothing is done for one on this machine.
+        A recording. A local one is not copied.
     folder : Path
-        It is made where it is needed.
+        Folder for the copy, created if needed.
 
     Raises
     ------
     TraceError
-        There is no such recording, or it cannot be fetched.
+        The recording does not exist or cannot be fetched.
     """
     if url_named(path) is None:
         yield
@@ -429,12 +430,12 @@ def near(path: Path, folder: Path) -> Generator[None]:
 
 
 def remote_names(url: str) -> list[str]:
-    """URLs of all that is below a URL in an object store.
+    """Return the URLs of all objects below a URL in an object store, sorted.
 
     Raises
     ------
     TraceError
-        The object store does not tell.
+        The object store does not list its objects.
     """
     from sgstore.mcap._remote import names_below
 
@@ -445,7 +446,7 @@ def remote_names(url: str) -> list[str]:
 
 
 def _part_of(path: Path, parts: tuple[BagPart, ...], place: int) -> tuple[Path, int]:
-    """The file of a bag in which a place lies, and the place at which that file begins."""
+    """Return the file of the bag that contains a position, and the position of its first byte."""
     part = part_at(parts, place)
     if part is None:
         raise TraceError("no file of the bag is there: it was replaced", path=path, offset=place)
@@ -453,12 +454,12 @@ def _part_of(path: Path, parts: tuple[BagPart, ...], place: int) -> tuple[Path, 
 
 
 def open_regular(path: Path) -> BufferedReader:
-    """A regular file, opened for reading. Pipes and devices, which one would wait for, are refused.
+    """Open a regular file for reading. Pipes and devices are rejected, because they would block.
 
     Raises
     ------
     TraceError
-        There is no such file, it is a folder or a device, or it may not be read.
+        The file does not exist, is a folder or device, or is not readable.
     """
     try:
         if (url := url_named(path)) is not None:

@@ -1,4 +1,4 @@
-"""Findings of reading a file: what could not be used, and what is odd. Whoever reports needs no parser."""
+"""Findings of the reading of a file: losses and warnings. This module does not need the MCAP parser."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ from dataclasses import dataclass, field
 from typing import Final
 
 MAX_LOSSES: Final = 1000
-"""Losses that are listed one by one; the last of them stands for all that follow."""
+"""Maximum number of listed losses; the last one sums up all further ones."""
 
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """Something in a recording that could not be used, and was not passed over in silence.
+    """Unusable part of a recording, for the report.
 
     Attributes
     ----------
     reason : str
-        What was wrong.
+        Description of the fault.
     messages, bytes : int
-        How much was lost; -1 where it cannot be known.
+        Number of lost messages and bytes; -1 if unknown.
     start_ns, end_ns : int
-        Log times between which it was lost; -1 where they cannot be known.
+        First and last log time of the lost part; -1 if unknown.
     offset : int
-        Byte offset in the file, -1 where there is none.
+        Byte offset in the file; -1 without one.
     """
 
     reason: str
@@ -35,21 +35,21 @@ class Loss:
 
 @dataclass(slots=True)
 class Findings:
-    """Findings from walking over a file; filled while its messages are read.
+    """Findings of a walk over a file, filled during the reading of its messages.
 
     Attributes
     ----------
     warnings : list of str
-        What is odd but lost nothing.
+        Oddities without loss of data.
     losses : list of Loss
-        What could not be used.
+        Unusable parts.
     """
 
     warnings: list[str] = field(default_factory=list[str])
     losses: list[Loss] = field(default_factory=list[Loss])
 
     def lose(self, loss: Loss) -> None:
-        """Report a loss; when there are very many, the last one stands for the rest."""
+        """Add a loss. If the list is full, the last entry sums up all further losses."""
         losses = self.losses
         if len(losses) < MAX_LOSSES:
             losses.append(loss)

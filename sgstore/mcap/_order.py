@@ -1,22 +1,22 @@
-"""Messages in order of time, whatever their order in the file.
+"""Reading of messages in order of time, for any order in the file.
 
-Messages are ordered by log time. Within a channel, messages of equal log time keep their place. Between
+Messages are ordered by log time. Within a channel, messages of equal log time keep their order. Between
 channels, equal log times are ordered by publish time, then by the rank of the channel, then by its topic. The
-place in the file never decides between channels.
+position in the file never decides between channels.
 
-A file whose messages are in this order is read as it is (:class:`OrderCheck`). For any other file an index is
+A file with messages in this order is read directly (:class:`OrderCheck`). For any other file, an index is
 sorted (:class:`TimeOrder`), and messages are read in batches. A batch reads each of its chunks once, and copies
 the data of the channels that a reader needs.
 
 Notes
 -----
-Publish times may run back within a channel. Such a message counts as published with the message before it.
-Without this rule there would be no single order of all messages.
+Publish times may run backwards within a channel. Such a message counts as published with the message before it.
+Without this rule, all messages together would have no unique order.
 
-The index takes 21 bytes a message while it is built and sorted, and 5 bytes afterwards. It is kept in blocks,
-each sorted by log time. The blocks are merged part by part: a part has the messages of all blocks up to some
-time, and is removed from the blocks when it is sorted. If one time has more messages than a part may have, they
-are divided by publish time, then by channel.
+The index needs 21 bytes per message during building and sorting, and 5 bytes afterwards. It consists of blocks,
+each sorted by log time. The blocks are merged part by part. A part contains the messages of all blocks up to
+some time, and is removed from the blocks after its sorting. If one time has more messages than a part may have,
+they are divided by publish time, then by channel.
 """
 
 from __future__ import annotations
@@ -46,27 +46,27 @@ if TYPE_CHECKING:
     Edge = tuple[Any, Literal["left", "right"]] | None
 
 BATCH_MESSAGES: Final = 16_384
-"""Messages of a batch, at most."""
+"""Maximum number of messages in a batch."""
 BATCH_BYTES: Final = 8 << 20
-"""Data that are copied for a batch, at most; bytes. A single message may have more."""
+"""Maximum size of the copied data of a batch; bytes. A single message may be larger."""
 CACHED: Final = 24 << 20
-"""Memory of chunks that are kept from one batch to the next; bytes."""
+"""Memory for chunks cached between batches; bytes."""
 COLUMN_BYTES: Final = 8 * 6
-"""Memory of the columns of a message, beside its data; bytes."""
+"""Memory of the columns of a message, without its data; bytes."""
 OFTEN: Final = 2
-"""A chunk that is read more often in one reading is reported."""
+"""A chunk read more often than this in one reading is reported."""
 
 _ENTRY: Final = np.dtype([("log", "i8"), ("publish", "u8"), ("channel", "u2"), ("row", "u2")])
-_BLOCK: Final = 1 << 15  # a block has fewer than two times as many messages: a row has 16 bits
+_BLOCK: Final = 1 << 15  # A block has less than twice as many messages, because a row has 16 bits.
 _PARTS: Final = 64
 _SAMPLE: Final = 4096
 _KEYS: Final = ("log", "publish", "channel")
 _SIZES: Final = np.floor(2 ** (np.arange(256) / 8)).astype(np.int64)
-"""Code of a size → bytes: sizes are kept in one byte each, rounded up by at most 9 %."""
+"""Size code → bytes. A code has one byte; sizes are rounded up by at most 9 %."""
 
 
 class OutOfOrder(Exception):  # noqa: N818  (a signal, not an error)
-    """A walk in order of time met messages out of order. The next walk sorts them."""
+    """Signal that messages are not in order of time. The next walk sorts them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,9 +78,9 @@ class SortedMessages(Messages):
     places : int64
         Byte offset of the chunk of each message, -1 outside chunks. ``chunk_offset`` has no meaning here.
     held : object
-        The data of each message as bytes; ``None`` if they were not copied.
+        Copied data of each message as bytes; ``None`` means not copied.
     fetch : callable
-        ``fetch(place, offset, length)``: the data of a message that were not copied.
+        ``fetch(place, offset, length)``: returns the data of a message without a copy.
     """
 
     COLUMNS: ClassVar[tuple[str, ...]] = (*Messages.COLUMNS, "places", "held")
@@ -91,15 +91,15 @@ class SortedMessages(Messages):
 
     @property
     def chunks(self) -> Ints:
-        """Byte offset of the chunk of each message, -1 outside chunks."""
+        """Return the byte offset of the chunk of each message; -1 outside chunks."""
         return self.places
 
     def chunk_of(self, row: int) -> int:
-        """Byte offset of the chunk of one message."""
+        """Return the byte offset of the chunk of one message; -1 outside chunks."""
         return int(self.places[row])
 
     def data(self, row: int) -> memoryview:
-        """The data of one message."""
+        """Return the data of one message."""
         held: bytes | None = self.held[row]
         if held is not None:
             return memoryview(held)
@@ -108,7 +108,7 @@ class SortedMessages(Messages):
 
 @dataclass(slots=True)
 class ChannelRanks:
-    """The order of channels at one time.
+    """Order of the channels for messages of equal time.
 
     Attributes
     ----------
@@ -127,12 +127,12 @@ class ChannelRanks:
     _loose: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(IDS, np.bool_))
 
     def of(self, channel: NDArray[Any]) -> Ints:
-        """Position of each channel in the order of channels."""
+        """Return the order number of each channel."""
         self._learn()
         return self._numbers[channel]
 
     def is_loose(self, channel: NDArray[Any]) -> NDArray[np.bool_]:
-        """True for each channel whose place among others of one time does not matter."""
+        """Return a mask of the channels whose order at equal times does not matter."""
         self._learn()
         return self._loose[channel]
 
@@ -152,7 +152,7 @@ class ChannelRanks:
 
 
 def published(log_time: Ints, publish_time: Times, channel: NDArray[Any]) -> Times:
-    """Publish times, raised so that they do not run back within a channel and log time."""
+    """Return the publish times, raised to be ascending within each channel and log time."""
     order = np.lexsort((channel, log_time))  # stable: equal messages keep their place
     log, number, times = log_time[order], channel[order], publish_time[order]
     same = (log[1:] == log[:-1]) & (number[1:] == number[:-1])
@@ -170,7 +170,7 @@ def published(log_time: Ints, publish_time: Times, channel: NDArray[Any]) -> Tim
 
 
 class OrderCheck:
-    """Checks run by run whether messages are in order of time.
+    """Check of the time order of messages, run by run.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ class OrderCheck:
         self._channel = np.zeros(0, np.int64)
 
     def follows(self, run: Messages) -> bool:
-        """Return whether the messages of a run are in order, and behind all earlier ones."""
+        """True if the messages of a run are in order and after all earlier ones."""
         log = np.concatenate([self._log, run.log_time_ns])
         steps = np.diff(log)
         if (steps < 0).any():
@@ -203,7 +203,7 @@ class OrderCheck:
         return True
 
     def _is_in_order(self, log: Ints, publish: Times, channel: Ints) -> bool:
-        """Return whether neighbours of equal log time are in order."""
+        """True if consecutive messages of equal log time are in order."""
         bound = ~self._ranks.is_loose(channel)
         log, publish, number = log[bound], publish[bound], self._ranks.of(channel[bound])
         before = publish[1:] < publish[:-1]
@@ -211,37 +211,40 @@ class OrderCheck:
         return not ((log[1:] == log[:-1]) & before).any()
 
 
-# The sorted index ---------------------------------------------------------------------------------
+# Sorted index.
 
 
 @dataclass(slots=True)
 class _IndexBlock:
-    """Entries of messages that stand together in the file; ``first``: number of the first one in the file."""
+    """Index entries of consecutive messages of a file. ``first`` is the number of the first message."""
 
     first: int
     entries: NDArray[np.void]
 
     def sort(self, key: str) -> None:
-        """Sort the entries by a key; equal ones keep their place."""
+        """Sort the entries by a key, with a stable sort."""
         self.entries = self.entries[np.argsort(self.entries[key], kind="stable")]
 
     def split(self, key: str, edge: Edge) -> _IndexBlock:
-        """Remove the entries before an edge; ``None``: all. The entries are sorted by the key."""
+        """Remove and return the entries before an edge.
+
+        ``None`` means all. The entries must be sorted by the key.
+        """
         at = len(self.entries) if edge is None else np.searchsorted(self.entries[key], *edge)
         part = _IndexBlock(
             self.first, self.entries[:at].copy()
-        )  # no view: the block must become smaller
+        )  # A copy, because the block must become smaller.
         if at:
             self.entries = self.entries[at:].copy()
         return part
 
     def numbers(self) -> Numbers:
-        """The number of each message in the file."""
+        """Return the number of each message in the file."""
         return (self.first + self.entries["row"].astype(np.int64)).astype(np.uint32)
 
 
 class TimeOrder:
-    """The messages of a file, sorted.
+    """Sorted index of the messages of a file.
 
     Parameters
     ----------
@@ -249,9 +252,9 @@ class TimeOrder:
         All messages, in file order.
     ranks : ChannelRanks
     keeps : callable
-        Whether the data of the messages of a channel will be needed.
+        True for a channel if the data of its messages will be needed.
     again : callable
-        ``again(place, count)``: reads a run of ``count`` messages once more. ``place``: byte offset of its
+        ``again(place, count)``: reads a run of ``count`` messages again. ``place``: byte offset of its
         chunk, or of its first record outside chunks.
 
     Attributes
@@ -274,7 +277,7 @@ class TimeOrder:
         self._cache: OrderedDict[int, Messages] = OrderedDict()
         self._last = np.zeros(IDS, np.int64)
         self._back = 0
-        # Of each run: where it begins in the file and among all messages, its data, and whether it is a chunk.
+        # For each run: its file offset, its first message number, its data size, and a flag for chunks.
         self._places, self._starts = array("q"), array("q", [0])
         self._bytes, self._is_chunk = array("q"), array("b")
         codes = bytearray()
@@ -289,7 +292,7 @@ class TimeOrder:
     def _blocks(
         self, runs: Iterable[Messages], keeps: Callable[[int], bool], codes: bytearray
     ) -> Iterator[_IndexBlock]:
-        """Blocks of the index, sorted by log time; appends the code of each message's size to ``codes``."""
+        """Yield the blocks of the index, sorted by log time. Message size codes are added to ``codes``."""
         waiting, first = bytearray(), 0
         for run in runs:
             self._note(run, keeps)
@@ -304,7 +307,7 @@ class TimeOrder:
             yield _block_of(waiting, first)
 
     def _note(self, run: Messages, keeps: Callable[[int], bool]) -> None:
-        """Note the place of a run, the channels in it, and how far log times run back."""
+        """Record the position of a run, its channels, and the backward steps of log times."""
         for number in np.unique(run.channel).tolist():
             self._kept[number] = keeps(number)
             times = run.log_time_ns[run.channel == number]
@@ -320,9 +323,9 @@ class TimeOrder:
     def walk(
         self, report: Findings, wanted: Callable[[int], bool] | None = None
     ) -> Iterator[Messages]:
-        """The messages in order of time; losses and warnings go to ``report``.
+        """Yield the messages in order of time. Losses and warnings are added to ``report``.
 
-        ``wanted``: whether the chunk at an offset is wanted; others are passed over.
+        ``wanted``: true for the offset of a chunk to read; other chunks are skipped.
         """
         report.warnings += self.findings.warnings
         for loss in self.findings.losses:
@@ -358,7 +361,7 @@ class TimeOrder:
         self._cache.clear()
 
     def _batch(self, rows: Ints, of: Ints, reads: Numbers) -> SortedMessages:
-        """Some messages by their row in a run; ``of``: the run of each."""
+        """Return messages by their rows in runs. ``of`` is the run number of each message."""
         columns = np.zeros((7, len(rows)), np.int64)
         held = np.full(len(rows), None, np.object_)
         for run in np.unique(of).tolist():
@@ -391,7 +394,7 @@ class TimeOrder:
         )
 
     def _read(self, number: int, reads: Numbers | None = None) -> Messages:
-        """The messages of a run."""
+        """Return the messages of a run."""
         messages = self._cache.get(number)
         if messages is not None:
             self._cache.move_to_end(number)
@@ -413,25 +416,25 @@ class TimeOrder:
         return self._starts[number + 1] - self._starts[number]
 
     def _memory(self, number: int) -> int:
-        """Memory of the messages of a run; bytes."""
+        """Return the memory of the messages of a run; bytes."""
         return self._bytes[number] + COLUMN_BYTES * self._count(number)
 
     def _cached(self) -> int:
         return sum(map(self._memory, self._cache))
 
     def _fetch(self, place: int, offset: int, length: int) -> memoryview:
-        """The data of a message that were not copied."""
+        """Return the data of a message without a copy."""
         number = bisect_right(self._places, offset if place < 0 else place) - 1
         return self._read(number).read(offset + MESSAGE_HEAD.itemsize, length)
 
 
 def _no_place(_position: int, _length: int) -> memoryview:
-    """Reject a position without a chunk: the messages are from several chunks."""
+    """Raise, because messages of several chunks have no common positions."""
     raise NotImplementedError
 
 
 def _entries_of(run: Messages) -> bytes:
-    """The entries of at most ``_BLOCK`` messages, without their rows."""
+    """Return the index entries of at most ``_BLOCK`` messages, without their rows."""
     entries = np.zeros(len(run), _ENTRY)
     entries["log"], entries["publish"] = run.log_time_ns, run.publish_time_ns
     entries["channel"] = run.channel
@@ -446,16 +449,16 @@ def _block_of(entries: bytearray, first: int) -> _IndexBlock:
 
 
 def _in_order(blocks: Sequence[_IndexBlock], keys: Sequence[str], most: int) -> Iterator[Numbers]:
-    """Numbers of messages in order of time, part by part; the blocks become empty.
+    """Yield the numbers of messages in order of time, part by part. The blocks become empty.
 
     Parameters
     ----------
     blocks : sequence of _IndexBlock
         In file order, each sorted by the first of the keys.
     keys : sequence of str
-        Those of ``_KEYS`` in which messages may differ.
+        The keys of ``_KEYS`` in which messages may differ.
     most : int
-        Messages that may be sorted at once.
+        Maximum number of messages sorted at once.
     """
     key, *others = keys
     for edge in _edges(blocks, key, most):
@@ -472,14 +475,14 @@ def _in_order(blocks: Sequence[_IndexBlock], keys: Sequence[str], most: int) -> 
             for block in part:
                 block.sort(others[0])
             yield from _in_order(part, others, most)
-        else:  # of one channel and one time: they keep their place
+        else:  # Messages of one channel and one time keep their order.
             yield from (block.numbers() for block in part)
 
 
 def _edges(blocks: Sequence[_IndexBlock], key: str, most: int) -> list[Edge]:
-    """Edges of parts that have at most about half as many messages as may be sorted at once.
+    """Return the edges of parts, each with at most about half of the messages that can be sorted at once.
 
-    A value of many messages is a part of its own. The last part begins at the greatest value.
+    A value with many messages becomes a separate part. The last part begins at the greatest value.
     """
     count = sum(len(block.entries) for block in blocks)
     step = max(count // _SAMPLE, 1)
@@ -505,7 +508,7 @@ def _raise_publish_times(blocks: Sequence[_IndexBlock]) -> None:
 
 
 def _sorted(blocks: Sequence[_IndexBlock]) -> Numbers:
-    """Numbers of the messages of some blocks, in order of time."""
+    """Return the numbers of the messages of some blocks, in order of time."""
     entries = np.concatenate([block.entries for block in blocks])
     log, channel = entries["log"], entries["channel"]
     order = np.lexsort((channel, published(log, entries["publish"], channel), log))

@@ -1,9 +1,7 @@
-"""Read-ahead: summary, buffers, and chunks that threads decompress.
+"""Read-ahead: file summary, reusable buffers, and decompression in threads.
 
-Memory that is used again once nobody looks at it any more.
-
-Fresh memory for every chunk would have to be handed out by the system page by page, and cleared; and what was
-used a moment ago is nearer to the processor.
+Buffers are reused after their last view is gone. Fresh memory for every chunk would be slower: the system must
+map and clear each page, and recently used memory is in the processor cache.
 """
 
 from __future__ import annotations
@@ -52,19 +50,19 @@ if TYPE_CHECKING:
 
 
 MOST_BUFFERED: Final = 48 << 20
-"""Memory of :class:`Buffers` that is kept to be used again, at most; bytes."""
+"""Maximum memory of :class:`Buffers` for reuse; bytes."""
 MOST_BUFFERS: Final = 128
-"""Pieces of that memory, at most."""
+"""Maximum number of buffers for reuse."""
 
 
 class Buffers:
-    """Memory for the records of chunks. It belongs to one thread, whoever fills it."""
+    """Reusable memory for the records of chunks. One thread owns it; other threads may fill it."""
 
     def __init__(self) -> None:
         self._kept: list[bytearray] = []
 
     def take(self, size: int) -> memoryview:
-        """Memory of ``size`` bytes, whatever is in it; until the last view of it is gone, nobody else's."""
+        """Return memory of ``size`` bytes with undefined contents, reserved until its last view is gone."""
         if not size:
             return memoryview(bytearray())
         for buffer in self._kept:
@@ -73,7 +71,7 @@ class Buffers:
         self._kept = [one for one in self._kept if len(one) >= size or not _is_free(one)]
         grain = max(
             1 << max(size.bit_length() - 3, 0), 4096
-        )  # chunks of a file differ a little in size
+        )  # Chunks of a file differ slightly in size.
         buffer = bytearray(-(-size // grain) * grain)
         if len(self._kept) < MOST_BUFFERS and self.kept + len(buffer) <= MOST_BUFFERED:
             self._kept.append(buffer)
@@ -81,16 +79,16 @@ class Buffers:
 
     @property
     def kept(self) -> int:
-        """Size of all buffers that are kept; bytes."""
+        """Total size of all buffers; bytes."""
         return sum(map(len, self._kept))
 
     def clear(self) -> None:
-        """Keep nothing. What somebody looks at stays as it is."""
+        """Forget all buffers. Memory with existing views stays valid."""
         self._kept.clear()
 
 
 def _is_free(buffer: bytearray) -> bool:
-    """Return whether a buffer has no view: only then can its size be changed."""
+    """True if a buffer has no view. Only then can its size change."""
     try:
         buffer.append(buffer.pop())
     except BufferError:
@@ -98,30 +96,30 @@ def _is_free(buffer: bytearray) -> bool:
     return True
 
 
-# The summary at the end of an MCAP file: a help to its reader, never an authority ---------------
+# Summary at the end of an MCAP file: optional and not trusted.
 # Source: MCAP specification, format version 0 (mcap.dev/spec).
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 FOOTER: Final = struct.Struct("<BQQQI8s")
 """Opcode, length, start of the summary, start of its offsets, CRC-32, magic."""
 MAX_SUMMARY: Final = 64 << 20
-"""Greatest size of a summary that is read; bytes. A larger one is done without."""
+"""Maximum size of a summary; bytes. A larger one is ignored."""
 
 
 @dataclass(slots=True)
 class Summary:
-    """Contents of the summary of a file; empty where there is none.
+    """Contents of the summary of a file; empty without a summary.
 
     Attributes
     ----------
     schemas, channels : dict
         Records by their id.
     counts : dict or None
-        Channel id → number of messages.
+        Number of messages by channel id.
     chunk_offsets : (n,) int64
-        Where chunks begin, ascending.
+        Byte offsets of the chunks, ascending.
     fault : str
-        Why it was not used, or the empty string.
+        Reason why it was not used; empty if it was.
     """
 
     schemas: dict[int, Schema] = field(default_factory=dict[int, Schema])
@@ -132,7 +130,7 @@ class Summary:
 
 
 def read_summary(file: BinaryIO, size: int) -> Summary:
-    """The summary of a file of ``size`` bytes; one that cannot be trusted says so in its ``fault``."""
+    """Return the summary of a file of ``size`` bytes. An invalid summary has a ``fault``."""
     try:
         return _parsed(_content(file, size))
     except READ_ERRORS as error:
@@ -189,24 +187,23 @@ def _parsed(content: bytes) -> Summary:
     return summary
 
 
-# Messages that were decompressed once and will be asked for again -------------------------------
-# A recording is read twice: who is in it must be known before its first frame can be told. Ground truth is a
-# small part of a recording with cameras, but shares its chunks, so that a second reading would decompress all
-# of it again. Instead, the first reading leaves here what the second one asks for: where all messages stand,
-# and the bytes of those that matter. They are kept in memory up to :data:`IN_MEMORY` and then in a file
-# without a name in the system's folder for temporary files; where that is full, or :data:`MOST_SPOOLED` is
-# reached, the chunks that follow are decompressed again. What is kept was verified when it was read first.
+# Cache of decompressed messages for a second reading. A recording is read twice, because its entities must be
+# known before the first frame. Ground truth is a small part of a recording with cameras, but it shares its
+# chunks. Without a cache, the second reading would decompress everything again. The first reading therefore
+# caches the positions of all messages, and the bytes of the needed ones. The cache uses memory up to
+# :data:`IN_MEMORY`, and then an unnamed temporary file. When the disk is full or :data:`MOST_SPOOLED` is
+# reached, later chunks are decompressed again. Cached data were verified by the first reading.
 
 IN_MEMORY: Final = 32 << 20
-"""Bytes that are kept in memory."""
+"""Maximum size of the cache in memory; bytes."""
 MOST_SPOOLED: Final = 1 << 30
-"""Bytes that are kept at all: the ground truth of many hours."""
+"""Maximum size of the cache; bytes. It holds the ground truth of many hours."""
 
 _COLUMNS: Final = 7
 
 
 class Spool:
-    """The messages of chunks, by file and place."""
+    """Cache of the messages of chunks, by file and chunk offset."""
 
     def __init__(self) -> None:
         self._file: SpooledTemporaryFile[bytes] | None = None
@@ -215,9 +212,9 @@ class Spool:
         self._most = MOST_SPOOLED
 
     def put(self, path: Path, messages: Messages, kept: NDArray[np.bool_]) -> None:
-        """Keep where all messages of a chunk stand, and the data of some of them.
+        """Cache the positions of all messages of a chunk, and the data of some.
 
-        Nothing is kept of a chunk that is known already, or for which there is no room.
+        A chunk that is already cached is skipped, as is any chunk when the cache is full.
         """
         key = (path, messages.chunk_offset)
         parts = [messages.data(row) for row in np.flatnonzero(kept).tolist()]
@@ -242,25 +239,25 @@ class Spool:
                 self._file = SpooledTemporaryFile(max_size=IN_MEMORY)  # noqa: SIM115  (see close)
             self._file.seek(self._size)
             self._file.writelines([columns.data, *parts])
-        except OSError:  # no room: what is not here is read from the recording
+        except OSError:  # The disk is full; the data are read from the recording again.
             self._most = 0
             return
         self._places[key] = self._size, len(messages), size
         self._size += total
 
     def has(self, path: Path, chunk_offset: int) -> bool:
-        """Return whether the messages of a chunk are kept."""
+        """True if the messages of a chunk are cached."""
         return (path, chunk_offset) in self._places
 
     def get(self, path: Path, chunk_offset: int, anew: Callable[[], Read]) -> Messages | None:
-        """The messages of a chunk; ``None`` if they are not kept, or cannot be read any more.
+        """Return the cached messages of a chunk. ``None`` means not cached, or no longer readable.
 
         Parameters
         ----------
         path : Path
         chunk_offset : int
         anew : function
-            Reads the chunk from the recording, for the data of a message that was not kept.
+            Reads the chunk from the recording, for messages whose data are not cached.
         """
         place = self._places.get((path, chunk_offset))
         if place is None or self._file is None:
@@ -290,7 +287,7 @@ class Spool:
         )
 
     def close(self) -> None:
-        """Forget everything."""
+        """Clear the cache and delete its file."""
         self._places.clear()
         self._size = 0
         if self._file is not None:
@@ -299,7 +296,7 @@ class Spool:
 
 
 def _reader(starts: dict[int, int], data: memoryview, anew: Callable[[], Read]) -> Read:
-    """Bytes of messages by their place in the chunk. ``starts``: where each record is there → its data here."""
+    """Return a reader of message data by position. ``starts`` maps record offsets to offsets in ``data``."""
     whole: list[Read] = []
 
     def read(position: int, length: int) -> memoryview:
@@ -313,37 +310,36 @@ def _reader(starts: dict[int, int], data: memoryview, anew: Callable[[], Read]) 
     return read
 
 
-# Chunks of a file that are decompressed by threads, before the walk comes to them ---------------
-# Decompressing and checksums leave the interpreter to others, so a recording that is mostly pictures can be
-# read faster than one thread decompresses it. A thread is given some chunks at a time, for it waits whenever it
-# comes back to the interpreter. What is wrong with a chunk is told when its turn comes, in the words that
-# reading it in turn would have found.
+# Decompression of chunks by threads, before the walk needs them.
+# Decompression and checksums release the interpreter lock. Threads therefore speed up recordings with many
+# pictures. A thread gets several chunks at a time, because it waits for the lock after each call. A fault of a
+# chunk is reported at its turn, with the same message as without threads.
 
 THREADS: Final = 2
-"""As many decompress beside the walk. One processor alone would gain nothing."""
+"""Number of threads for decompression. A single processor gains nothing."""
 BATCH: Final = 2 << 20
-"""A thread is given chunks of about this size together; bytes."""
+"""Approximate total size of the chunks of one task; bytes."""
 AHEAD: Final = 8 << 20
-"""Chunks of about this size are begun before they are asked for; bytes."""
+"""Approximate total size of chunks decompressed in advance; bytes."""
 LARGEST: Final = 16 << 20
-"""Chunks that are larger, stored or decompressed, wait for their turn; bytes."""
+"""Maximum size of a chunk, stored or decompressed, for read-ahead; bytes."""
 
 WORTH: Final = 0.9
-"""A chunk waits for its turn that is stored in more than this share of its size: pictures in JPEG."""
+"""Maximum compression ratio for read-ahead. JPEG pictures exceed it."""
 LEAST: Final = 64 << 10
-"""What a chunk counts however small it is; bytes."""
+"""Minimum size that a chunk counts for; bytes."""
 BETWEEN: Final = 1000
-"""Records between two chunks: message indexes, one for each channel, are usual."""
-_TRIED: Final = 256  # places of a batch: there need not be a chunk
+"""Maximum number of records between two chunks. One message index per channel is usual."""
+_TRIED: Final = 256  # offsets tested per batch; some may not be chunks
 
 Found = dict[int, "tuple[ChunkHead, Records | TraceError]"]
-"""Byte offset of a chunk → its head, and its records or what is wrong with it."""
+"""Byte offset of a chunk → its head, and its records or its error."""
 
 
 def chunks_in(file: BufferedReader) -> Iterator[int]:
-    """Byte offsets of the chunks of a file whose summary does not tell, as far as its records lead.
+    """Yield the byte offsets of the chunks of a file without a usable summary.
 
-    It ends where a chunk is followed by more than :data:`BETWEEN` records that are none.
+    The search stops after more than :data:`BETWEEN` other records in a row.
     """
     position, others = len(MAGIC), 0
     while others <= BETWEEN:
@@ -359,16 +355,16 @@ def chunks_in(file: BufferedReader) -> Iterator[int]:
 
 
 class ReadAhead:
-    """The records of chunks, of which some are begun before they are asked for.
+    """Reader of chunk records that decompresses some chunks in advance.
 
     Parameters
     ----------
     file : file
-        Read by the thread that asks, and only while it asks.
+        Read only during calls, on the thread of the caller.
     offsets : iterable of int
-        Byte offsets of the chunks that will be asked for, ascending. None of them need be true.
+        Expected byte offsets of the next chunks, ascending. They may be wrong.
     verified : container of int
-        Byte offsets of chunks whose checksum need not be looked at.
+        Byte offsets of chunks with a verified checksum.
     """
 
     def __init__(
@@ -384,12 +380,12 @@ class ReadAhead:
         self._found: Found = {}
 
     def records(self, head: ChunkHead) -> Records:
-        """The records of a chunk, which may be decompressed already.
+        """Return the records of a chunk, possibly decompressed in advance.
 
         Raises
         ------
         TraceError
-            The chunk is too large, cut, not what it declares, or damaged.
+            The chunk is too large, truncated or damaged, or does not match its head.
         """
         self._asked = head.offset
         self._begin()
@@ -399,7 +395,7 @@ class ReadAhead:
             self._begin()
             self._found = future.result()
         told, found = self._found.pop(head.offset, (None, b""))
-        if told != head:  # not begun, or the file was changed meanwhile
+        if told != head:  # Not started, or the file has changed.
             memory = self._buffers.take if _cost(head) <= LARGEST else None
             return read_records(self._file, head, verify=self._verifies(head), memory=memory)
         if isinstance(found, TraceError):
@@ -407,7 +403,7 @@ class ReadAhead:
         return found
 
     def close(self) -> None:
-        """End the threads."""
+        """Stop the threads and free the buffers."""
         self._offsets = iter(())
         self._begun.clear()
         self._found = {}
@@ -417,7 +413,7 @@ class ReadAhead:
         self._buffers.clear()
 
     def _begin(self) -> None:
-        """Begin as many chunks as may be ahead."""
+        """Start the decompression of the next chunks, up to the limit."""
         while self._size + BATCH <= AHEAD and (chunks := self._batch()):
             if self._threads is None:
                 self._threads = ThreadPoolExecutor(THREADS, "sgstore-chunks")
@@ -425,21 +421,21 @@ class ReadAhead:
             first = chunks[0].head.offset
             try:
                 future = self._threads.submit(_decompressed, chunks)
-            except RuntimeError:  # the system gives no more threads: all are read in turn
+            except RuntimeError:  # No thread is available; chunks are read at their turn.
                 self._offsets = iter(())
                 return
             self._begun.append((first, size, future))
             self._size += size
 
     def _batch(self) -> list[_Chunk]:
-        """The next chunks, as they are stored."""
+        """Return the next chunks, still compressed."""
         chunks: list[_Chunk] = []
         size = 0
         try:
             for offset in islice(self._offsets, _TRIED):
                 if offset < self._asked:
                     continue
-                with suppress(TraceError):  # it is told when its turn comes
+                with suppress(TraceError):  # The error is reported at its turn.
                     head = read_chunk_head(self._file, offset)
                     if not _is_apt(head):
                         break
@@ -449,7 +445,7 @@ class ReadAhead:
                     size += _cost(head)
                     if size >= BATCH:
                         break
-        except (OSError, OverflowError, ValueError):  # likewise, and nothing more is begun
+        except (OSError, OverflowError, ValueError):  # The same; the read-ahead stops.
             self._offsets = iter(())
         return chunks
 
@@ -458,7 +454,7 @@ class ReadAhead:
 
 
 class _Chunk(NamedTuple):
-    """A chunk as it is stored, memory for what it becomes, and whether its checksum is looked at."""
+    """Compressed chunk, with memory for the result and a flag for the checksum test."""
 
     head: ChunkHead
     stored: Records
@@ -481,11 +477,11 @@ def _cost(head: ChunkHead) -> int:
 
 
 def _is_apt(head: ChunkHead) -> bool:
-    """Return whether it is worth while to decompress a chunk ahead of its turn."""
+    """True if decompression of a chunk in advance is worthwhile."""
     compressed = bool(head.compression) and head.data_length < WORTH * head.size
     return compressed and _cost(head) <= LARGEST
 
 
 def _processors() -> int:
-    """Number of processors that this process may use."""
+    """Return the number of processors available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

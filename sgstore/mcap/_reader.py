@@ -1,22 +1,19 @@
-"""The guarded reader of MCAP files: everything that can be had, and the name of what cannot.
+"""Guarded reader of MCAP files, which reads every usable part and reports the rest.
 
-A file is walked record by record in the order in which it was written, one chunk in memory at a
-time. Where messages are asked for in order of time and are not, an index of them is sorted
-(:mod:`sgstore.mcap._order`). The summary at its end, where there is one, is a help and not an
-authority: it gives the definitions of channels early, and the places of chunks, so that the walk
-finds its way again behind a record that is damaged. Without a summary the walk is all there is, and
-enough.
+A file is read record by record in file order, with one chunk in memory at a time. If messages are requested in
+order of time, but are not in this order, an index is sorted (:mod:`sgstore.mcap._order`). The summary at the
+end of the file is optional and not trusted. It provides the channel definitions early, and the offsets of
+chunks. The reader can then continue at the next chunk after a damaged record.
 
-What can be wrong, and what comes of it:
+Possible faults and their treatment:
 
-* A chunk is damaged, lies about its size, or is too large: it is passed over and reported as a
-  :class:`~sgstore.mcap.Loss` (bytes, time span, messages where message indexes tell), and the walk
-  goes on behind it.
-* The file ends early: every whole record is kept, and of a chunk that is cut the whole messages.
-* A record's length leads astray: the walk goes on at the next chunk that the summary names.
-* It is no MCAP file at all: a :class:`TraceError`.
+* A chunk is damaged, has a wrong size, or is too large: it is skipped and reported as a
+  :class:`~sgstore.mcap.Loss` (bytes, time span, and the number of messages if message indexes contain it).
+* The file ends early: every complete record is used, and the complete messages of a truncated chunk.
+* The length of a record is wrong: reading continues at the next chunk of the summary.
+* The file is not an MCAP file: a :class:`TraceError`.
 
-Nothing else escapes: whatever the parsers below raise becomes one or the other.
+All other errors of the parsers are converted into one of these.
 
 Source: MCAP specification, format version 0 (mcap.dev/spec).
 """
@@ -77,17 +74,17 @@ if TYPE_CHECKING:
 
 
 CLIP: Final = "sgstore.clip"
-"""Name of the metadata record that makes a file a clip of another: ``start_ns``, ``end_ns`` of its interval."""
+"""Name of the metadata record of a clip, with ``start_ns`` and ``end_ns`` of its interval."""
 MAX_DEFINITION: Final = 16 << 20
-"""Greatest size of a schema, channel or metadata record; bytes."""
+"""Maximum size of a schema, channel or metadata record; bytes."""
 MAX_DEFINITIONS: Final = 64 << 20
-"""Greatest size of all schemas, channels and metadata of a file together; bytes."""
+"""Maximum total size of all schemas, channels and metadata of a file; bytes."""
 SMALL: Final = 4 << 20
 """Files up to this size are read chunk by chunk, without threads; bytes."""
 RUN_MESSAGES: Final = 1024
-"""Messages outside chunks that are handed on together."""
+"""Maximum number of messages outside chunks in one run."""
 MOST_OPEN: Final = 32
-"""Files of a bag that are open at once."""
+"""Maximum number of open files of a bag."""
 
 _PIECE: Final = 1 << 20
 _HOLDS_CONTENT: Final = frozenset(
@@ -106,7 +103,7 @@ _HOLDS_CONTENT: Final = frozenset(
 class _FileWalk:
     """Position of a walk through a file, and its findings.
 
-    ``pending`` is a chunk that was lost: the message indexes behind it tell what was in it.
+    ``pending`` is a lost chunk. The message indexes after it contain its number of messages.
     """
 
     report: Findings
@@ -123,7 +120,7 @@ class _FileWalk:
 
 
 class McapFile:
-    """An MCAP file that is read once or more often, from its beginning.
+    """MCAP file for one or more readings from the start.
 
     Parameters
     ----------
@@ -131,37 +128,37 @@ class McapFile:
         The file. The folder of a bag, or its ``metadata.yaml``, opens all files of it as one
         (:class:`McapBag`).
     spool : Spool, optional
-        Where messages are kept between readings; of several files one, which somebody else closes.
+        Cache of messages between readings. If several files share it, the caller closes it.
 
     Attributes
     ----------
     path, size, mtime_ns
-        The file, its size in bytes, its time of change.
+        The file, its size in bytes, its modification time.
     profile, library : str
-        As the header has them.
+        Values of the header.
     schemas, channels : dict
-        Records by their id. Filled from the summary, and while the file is walked.
+        Records by id, filled from the summary and during the walk.
     metadata : dict
-        Metadata records by their place; filled while the file is walked.
+        Metadata records by position, filled during the walk.
     attachments : list of RecordPlace
-        Attachments are not read; filled while the file is walked.
+        Positions of the attachments, which are not read; filled during the walk.
     counts : dict or None
-        Channel id → messages as the file's statistics say.
+        Number of messages by channel id, from the statistics of the file.
     compression : str
-        That of the first chunk; ``zstd`` before a chunk was met.
+        Compression of the first chunk; ``zstd`` before the first chunk.
     chunk_offsets : (n,) int64
-        Where chunks begin as the summary has it, ascending.
+        Byte offsets of the chunks in the summary, ascending.
 
     Raises
     ------
     TraceError
-        The file cannot be opened or is no MCAP file.
+        The file cannot be opened or is not an MCAP file.
     """
 
     has_log_times = True
 
     def __new__(cls, path: Path, spool: Spool | None = None) -> Self:
-        """A file, or all files of a bag."""
+        """Create a reader of a file, or of all files of a bag."""
         del spool
         if cls is McapFile and bag_folder(path) is not None:
             return object.__new__(cast("type[Self]", McapBag))
@@ -218,16 +215,16 @@ class McapFile:
         Raises
         ------
         TraceError
-            It cannot be opened any more.
+            The file can no longer be opened.
         """
         if self._file.closed:
             self._file = open_regular(self.path)
 
     @property
     def window(self) -> tuple[int, int]:
-        """Log times, both included, that a clip is of; of any other file all there are.
+        """First and last log time of a clip, both included; for other files, the full range; ns.
 
-        What a clip holds from outside them was carried in because later messages depend on it.
+        A clip also contains earlier or later messages that its own messages depend on.
         """
         window = (0, LAST_NS)
         for place in sorted(self.metadata, key=lambda place: place.offset):
@@ -244,26 +241,26 @@ class McapFile:
         keep: Callable[[int], bool] | None = None,
         rank: Callable[[int], int] | None = None,
     ) -> Iterator[Messages]:
-        """All messages, chunk by chunk; what cannot be read goes to ``report``.
+        """Yield all messages, chunk by chunk. Unreadable parts are added to ``report``.
 
         Parameters
         ----------
         report : Findings
         wanted : callable, optional
-            Whether the chunk at an offset is wanted; others are passed over.
+            True for the offset of a chunk to read; other chunks are skipped.
         keep : callable, optional
-            Whether the messages of the channel with an id will be asked for again: then a later walk need not
-            decompress them. It is asked after the messages were handed out.
+            True for the id of a channel whose messages a later walk needs, which saves a second decompression.
+            It is called after the messages were returned.
         rank : callable, optional
-            Rank of the channel with an id among channels at one time. With it messages come in order of time,
-            else in that of the file.
+            Rank of a channel id for messages of equal time. With it, messages come in order of time; without
+            it, in file order.
 
         Raises
         ------
         OutOfOrder
-            The messages that were handed out are not in order of time. The next walk sorts them.
+            The messages so far are not in order of time. The next walk sorts them.
         TraceError
-            The definitions of channels exceed all measure, or the file cannot be read any more.
+            The channel definitions are too large, or the file is no longer readable.
         """
         if rank is None or self._in_order:
             yield from self._in_file_order(report, wanted, keep)
@@ -283,14 +280,14 @@ class McapFile:
         yield from self._order.walk(report, wanted)
 
     def settle_order(self, rank: Callable[[int], int]) -> None:
-        """Find out whether messages are in order of time, so that a walk will not raise :class:`OutOfOrder`."""
+        """Check once whether messages are in order of time. Later walks do not raise :class:`OutOfOrder`."""
         if not self._in_order and not self._unordered:
             with suppress(OutOfOrder):
                 for _ in self.walk(Findings(), rank=rank):
                     pass
 
     def _time_order(self, ranks: ChannelRanks, keep: Callable[[int], bool] | None) -> TimeOrder:
-        """Sort an index of all messages; once more if channels became known behind their messages."""
+        """Return a sorted index of all messages. Repeat if a channel definition came after its messages."""
         while True:
             findings, known = Findings(), len(self.channels)
             runs = self._in_file_order(findings, None, keep)
@@ -299,7 +296,7 @@ class McapFile:
                 return found
 
     def _again(self, place: int, count: int) -> Messages:
-        """Read once more a run of messages, from the chunk or record at a place on."""
+        """Read a run of messages again, from the chunk or record at ``place``."""
         runs = self._in_file_order(Findings(), _all, None, place)
         for run in runs:
             runs.close()
@@ -313,7 +310,7 @@ class McapFile:
         keep: Callable[[int], bool] | None,
         start: int = len(MAGIC),
     ) -> Generator[Messages]:
-        """All messages in file order, from the record at ``start`` on."""
+        """Yield all messages in file order, from the record at ``start``."""
         walk = _FileWalk(report, self._read_ahead(wanted), wanted, keep, start)
         self._aheads.append(walk.ahead)
         try:
@@ -334,7 +331,7 @@ class McapFile:
         self._closing_words(walk)
 
     def pieces(self, place: RecordPlace) -> Iterator[memoryview]:
-        """The bytes of a record, with its head, piece by piece.
+        """Yield the bytes of a record, with its head, in pieces.
 
         Raises
         ------
@@ -362,23 +359,21 @@ class McapFile:
         return header.profile, header.library
 
     def _read_ahead(self, wanted: Callable[[int], bool] | None) -> ReadAhead:
-        """Start to read the chunks of a walk before their turn, if they are many and all wanted."""
+        """Start the read-ahead for a walk over all chunks of a large file."""
         if wanted is not None or self.size <= SMALL:
             return ReadAhead(self._file, verified=self._verified)
         offsets = self._chunk_starts or chunks_in(self._file)
         offsets = (at for at in offsets if not self._spool.has(self.path, at))
         return ReadAhead(self._file, offsets, self._verified)
 
-    # The walk ------------------------------------------------------------------------------------------------
-
     def _head(self, position: int) -> tuple[int, int] | None:
-        """Opcode and length of the record at a position; ``None`` where no whole head is left."""
+        """Return the opcode and length of the record at a position. ``None`` means an incomplete head."""
         self._file.seek(position)
         head = self._file.read(HEAD.size)
         return HEAD.unpack(head) if len(head) == HEAD.size else None
 
     def _passes(self, walk: _FileWalk, length: int) -> bool:
-        """Pass over a record that tells nothing, the most frequent one; whether it is as it should be."""
+        """Skip a record without useful content, the most frequent type. Return True if it is valid."""
         stop = walk.position + HEAD.size + length
         sound = walk.pending is None and stop <= self.size
         sound = sound and self._chunk_behind(walk.position, stop) is None
@@ -387,7 +382,7 @@ class McapFile:
         return sound
 
     def _step(self, walk: _FileWalk, opcode: int, length: int) -> Iterator[Messages]:
-        """Messages of one record; the walk stands behind the record afterwards."""
+        """Yield the messages of one record, and move the walk behind the record."""
         start = walk.position
         stop = start + HEAD.size + length
         if opcode != Opcode.MESSAGE_INDEX:
@@ -421,7 +416,7 @@ class McapFile:
             yield from self._flush(walk)
 
     def _flush(self, walk: _FileWalk) -> Iterator[Messages]:
-        """The messages outside chunks that were met since the last time."""
+        """Yield the collected messages outside chunks."""
         if not walk.run:
             return
         offsets = np.frombuffer(walk.run, np.int64)
@@ -436,12 +431,12 @@ class McapFile:
         yield from self._known(walk, messages)
 
     def _outside(self, offsets: Ints) -> Messages:
-        """The messages outside chunks at some offsets."""
+        """Return the messages outside chunks at the given offsets."""
         heads = b"".join(self._at(int(at), MESSAGE_HEAD.itemsize) for at in offsets)
         return message_columns(np.frombuffer(heads, MESSAGE_HEAD), offsets, -1, self._at)
 
     def _end(self, walk: _FileWalk, start: int) -> Iterator[Messages]:
-        """The end of the data; not believed where the summary names chunks behind it."""
+        """Handle the end of the data. If the summary lists chunks behind it, continue there."""
         yield from self._flush(walk)
         resume = self._chunk_behind(start, self.size)
         walk.closed = resume is None
@@ -451,7 +446,7 @@ class McapFile:
             walk.position = resume
 
     def _chunk(self, walk: _FileWalk, place: RecordPlace, astray: int | None) -> Iterator[Messages]:
-        """The messages of a chunk. ``astray``: a chunk that the summary says begins within it."""
+        """Yield the messages of a chunk. ``astray`` is the offset of another listed chunk inside it."""
         if walk.wanted is not None and not walk.wanted(place.offset):
             return
         walk.chunks += 1
@@ -481,7 +476,7 @@ class McapFile:
     def _records(
         self, walk: _FileWalk, head: ChunkHead
     ) -> tuple[Messages, list[tuple[int, memoryview]]]:
-        """Messages and definitions of a chunk, kept ones or from the file."""
+        """Return the messages and definitions of a chunk, from the cache or the file."""
 
         def read() -> tuple[Messages, list[tuple[int, memoryview]]]:
             return parse_records(walk.ahead.records(head), head.offset)
@@ -494,7 +489,7 @@ class McapFile:
         return found
 
     def _known(self, walk: _FileWalk, messages: Messages) -> Iterator[Messages]:
-        """The messages, without those of channels that were never defined."""
+        """Yield the messages without those of undefined channels."""
         lost = ~self._known_channels[messages.channel]
         if lost.any():
             unknown: list[int] = np.unique(messages.channel[lost]).tolist()
@@ -512,12 +507,10 @@ class McapFile:
         if len(messages):
             yield messages
 
-    # What went wrong -----------------------------------------------------------------------------------------
-
     def _chunk_behind(self, start: int, stop: int) -> int | None:
-        """Offset of the first chunk that begins behind ``start`` and before ``stop``, as the summary has it.
+        """Return the offset of the first listed chunk after ``start`` and before ``stop``, or ``None``.
 
-        The summary is believed where there is the head of a chunk indeed.
+        An offset of the summary counts only if a valid chunk head is at this place.
         """
         starts = self._chunk_starts
         for at in range(bisect_right(starts, start), len(starts)):
@@ -528,7 +521,7 @@ class McapFile:
         return None
 
     def _broken(self, walk: _FileWalk, opcode: int, length: int) -> Iterator[Messages]:
-        """A record whose length cannot be: go on behind it where the summary says, or end here."""
+        """Handle a record with an impossible length: continue at the next listed chunk, or end."""
         resume = self._chunk_behind(walk.position, self.size)
         start = walk.position
         stop = self.size if resume is None else resume
@@ -550,7 +543,7 @@ class McapFile:
             walk.report.lose(Loss(reason, bytes=stop - start, offset=start))
 
     def _cut_chunk(self, walk: _FileWalk, start: int) -> Iterator[Messages]:
-        """The whole messages of a chunk whose end is missing."""
+        """Yield the complete messages of a truncated chunk."""
         head, kept, definitions = self._of_cut(start)
         for opcode, content in definitions:
             self._define(walk, opcode, content, start)
@@ -564,7 +557,7 @@ class McapFile:
     def _of_cut(
         self, start: int
     ) -> tuple[ChunkHead | None, Messages | None, list[tuple[int, memoryview]]]:
-        """Head, whole messages and definitions of a chunk whose end is missing."""
+        """Return the head, complete messages and definitions of a truncated chunk."""
         found = head_of_cut_chunk(bytes(self._at(start, min(self.size - start, MAX_CHUNK))), start)
         if found is None:
             return None, None, []
@@ -576,20 +569,20 @@ class McapFile:
             return head, None, []
 
     def _count(self, walk: _FileWalk, length: int) -> None:
-        """Add the messages that a message index names to those that were lost with its chunk."""
+        """Add the entries of a message index to the loss of its chunk."""
         if walk.pending is None:
             return
         entries = max(length - 6, 0) // 16
         walk.pending = replace(walk.pending, messages=max(walk.pending.messages, 0) + entries)
 
     def _settle(self, walk: _FileWalk) -> None:
-        """Report a chunk that was lost, now that its message indexes are read."""
+        """Report a lost chunk after its message indexes are read."""
         if walk.pending is not None:
             walk.report.lose(walk.pending)
             walk.pending = None
 
     def _closing_words(self, walk: _FileWalk) -> None:
-        """Report what is odd about the file as a whole but lost nothing."""
+        """Add warnings about the whole file, for oddities without loss of data."""
         warn = walk.report.warnings.append
         left = self.size - walk.position
         if not walk.closed:
@@ -605,12 +598,10 @@ class McapFile:
         if walk.chunks and walk.unverified == walk.chunks:
             warn("no chunk has a checksum: damage that leaves a chunk readable cannot be noticed")
 
-    # Definitions -----------------------------------------------------------------------------
-
     def _define_at(self, walk: _FileWalk, opcode: int, place: RecordPlace) -> None:
         if opcode == Opcode.ATTACHMENT:
             known = self.attachments[-1].offset if self.attachments else -1
-            if place.offset > known:  # a later walk meets it again
+            if place.offset > known:  # A later walk reads the same record again.
                 self.attachments.append(place)
         elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA}:
             if place.length > MAX_DEFINITION:
@@ -628,7 +619,7 @@ class McapFile:
         offset: int,
         place: RecordPlace | None = None,
     ) -> None:
-        """Take up a schema, a channel or a metadata record; the first one of an id stands."""
+        """Add a schema, channel or metadata record, and report a malformed one."""
         try:
             odd = self._take_up(opcode, content, place)
         except READ_ERRORS as error:
@@ -639,7 +630,7 @@ class McapFile:
             walk.report.warnings.append(odd)
 
     def _take_up(self, opcode: int, content: memoryview, place: RecordPlace | None = None) -> str:
-        """Take up a definition; returns what is odd about it, or an empty text."""
+        """Add a definition; the first one of an id counts. Return a warning or an empty text."""
         stream = StrictStream(content)
         if opcode == Opcode.METADATA and place is not None:
             if place not in self.metadata:
@@ -666,7 +657,7 @@ class McapFile:
             raise TraceError(reason, path=self.path)
 
     def _at(self, position: int, length: int) -> memoryview:
-        """Bytes of the file.
+        """Return bytes of the file.
 
         Raises
         ------
@@ -680,11 +671,11 @@ class McapFile:
         return memoryview(data)
 
 
-# Several MCAP files as one: the files that rosbag2 split a recording into -------------------------
+# Bag: several MCAP files of one recording, split by rosbag2.
 
 
 class McapBag(McapFile):
-    """The MCAP files of a bag, read one after another; places count from the beginning of the first.
+    """MCAP files of a bag, read one after another. Positions count from the start of the first file.
 
     Parameters
     ----------
@@ -694,17 +685,17 @@ class McapBag(McapFile):
     Attributes
     ----------
     path, size, mtime_ns
-        The folder; the size of all files together, and the latest time of change among them.
+        The folder; the total size of its files, and their latest modification time.
     others
-        As :class:`McapFile` has them, of all files together. A channel is the same in two files if its topic,
-        its encodings and its definition are. Several such channels of a file have the same order in all
-        files, or the same ids. Ids are those of the first file that has the channel, or new ones if another
-        channel has these.
+        As in :class:`McapFile`, for all files together. Channels of two files are the same if their topics,
+        encodings and definitions are equal. Several such channels of a file have the same order in all files,
+        or the same ids. A channel has the id of the first file that contains it, or a new id if that one
+        belongs to another channel.
 
     Raises
     ------
     TraceError
-        The metadata cannot be read, or no file is there and is an MCAP file.
+        The metadata are unreadable, or no listed file is an MCAP file.
     """
 
     def __init__(self, path: Path, spool: Spool | None = None) -> None:
@@ -734,7 +725,7 @@ class McapBag(McapFile):
         self.profile, self.library = first.profile, first.library
 
     def _open(self, part: BagPart) -> None:
-        """Learn what a file says of itself; it is open only while it is read."""
+        """Read the definitions and summary of a file. The file is open only during the reading."""
         name = part.path.name
         if part.size < 0:
             self._faults.append(Loss(f"{name}: {METADATA} lists it, but there is no such file"))
@@ -763,7 +754,7 @@ class McapBag(McapFile):
 
     @property
     def compression(self) -> str:
-        """That of the first chunk; ``zstd`` before a chunk was met."""
+        """Compression of the first chunk; ``zstd`` before the first chunk."""
         return next(iter(self._files.values())).compression
 
     def _in_file_order(
@@ -773,8 +764,8 @@ class McapBag(McapFile):
         keep: Callable[[int], bool] | None,
         start: int = 0,
     ) -> Generator[Messages]:
-        """All messages, file by file."""
-        del start  # several files are read from their beginning, always
+        """Yield all messages, file by file."""
+        del start  # A bag is always read from the start.
         report.losses += self._faults
         for base, file in self._files.items():
             found = Findings()
@@ -791,7 +782,7 @@ class McapBag(McapFile):
                 _take_up(found, report, file.path.name, base)
 
     def _again(self, place: int, count: int) -> Messages:
-        """Read once more a run of messages of one file."""
+        """Read a run of messages of one file again."""
         part = part_at(self._parts, place)
         if part is None or part.base not in self._files:
             raise TraceError("no file of the bag is there", path=self.path, offset=place)
@@ -806,7 +797,7 @@ class McapBag(McapFile):
         return replace(messages, read=read)
 
     def _use(self, file: McapFile) -> None:
-        """Open a file, and close those that were not used for long."""
+        """Open a file, and close the files that were not used recently."""
         if file in self._open_files:
             self._open_files.remove(file)
         self._open_files.append(file)
@@ -816,7 +807,7 @@ class McapBag(McapFile):
         del self._open_files[:-MOST_OPEN]
 
     def pieces(self, place: RecordPlace) -> Iterator[memoryview]:
-        """The bytes of a record, with its head, piece by piece."""
+        """Yield the bytes of a record, with its head, in pieces."""
         part = part_at(self._parts, place.offset)
         if part is None or part.base not in self._files:
             raise TraceError("no file of the bag is there", path=self.path, offset=place.offset)
@@ -828,7 +819,7 @@ class McapBag(McapFile):
             file.close()
 
     def _learn(self, file: McapFile) -> None:
-        """Take up the channels of a file, and its other records, that were not known yet."""
+        """Add the new channels and other new records of a file."""
         told = len(file.channels), len(file.metadata), len(file.attachments)
         if self._told.get(file.path) == told:
             return
@@ -848,7 +839,7 @@ class McapBag(McapFile):
         self.attachments += [place for place in moved if place not in known]
 
     def _take(self, number: int, file: McapFile, key: tuple[Any, ...], alike: list[int]) -> int:
-        """The id of a channel of a file in the bag. ``alike``: the channels of the file with its key."""
+        """Return the id in the bag for a channel of a file. ``alike``: the file's channels with this key."""
         known = self._channel_ids.setdefault(key, [])
         if {*alike} <= {*known}:
             return number
@@ -868,18 +859,18 @@ class McapBag(McapFile):
         return number
 
     def _free(self, number: int, taken: dict[int, Any]) -> int:
-        """The id, or the next one that is free."""
+        """Return the id, or the next free one."""
         free = number if number not in taken else max(taken) + 1
-        if free >= IDS:  # of all files together
+        if free >= IDS:  # The limit applies to all files together.
             raise TraceError(f"more than {IDS} channels or schemas", path=self.path)
         return free
 
     def _meant(self, keep: Callable[[int], bool], file: McapFile) -> Callable[[int], bool]:
-        """The same question about the ids that a file has."""
+        """Return ``keep`` as a function of the channel ids of one file."""
         return lambda number: keep(self._own[file.path, number])
 
     def _placed(self, file: McapFile, run: Messages, base: int) -> Messages:
-        """The messages of a file under the ids and the places of the bag."""
+        """Return the messages of a file with the channel ids and positions of the bag."""
         ids, index = np.unique(run.channel, return_inverse=True)
         own = np.array([self._own[file.path, number] for number in ids.tolist()], np.int64)
         if run.chunk_offset >= 0:
@@ -896,7 +887,7 @@ def _all(_channel: int) -> bool:
 
 
 def _key_of(channel: Channel, file: McapFile) -> tuple[Any, ...]:
-    """Properties in which channels of two files are the same channel of a bag."""
+    """Return the key of a channel. Channels of two files with equal keys become one channel of the bag."""
     schema = file.schemas.get(channel.schema_id)
     definition = (schema.name, schema.encoding, schema.data) if schema else ()
     return channel.topic, channel.message_encoding, *definition
@@ -907,7 +898,7 @@ def _moved(wanted: Callable[[int], bool], base: int) -> Callable[[int], bool]:
 
 
 def _take_up(found: Findings, report: Findings, name: str, base: int) -> None:
-    """Say in a report of the bag what reading a file brought to light."""
+    """Add the findings of one file to the report of the bag."""
     report.warnings += [f"{name}: {warning}" for warning in found.warnings]
     for loss in found.losses[: max(MAX_LOSSES - len(report.losses), 1)]:
         place = loss.offset + base if loss.offset >= 0 else -1

@@ -1,8 +1,8 @@
-"""Recordings in object stores and on web servers, by obstore: read by ranges, or copied for a while.
+"""Recordings in object stores and on web servers, read with obstore.
 
-A recording is called by its URL: ``s3://bucket/day1/a.mcap``, ``https://host/a.mcap``. Of one that is asked for
-single messages only these ranges travel. One that is read from end to end, and more than once, is copied first
-(:func:`copied`): whoever opens it meanwhile reads the copy, and everything else goes on calling it by its URL.
+A recording is named by its URL: ``s3://bucket/day1/a.mcap``, ``https://host/a.mcap``. For single messages, only
+their byte ranges are transferred. For a complete reading, the file is copied first (:func:`copied`). Readers
+then use the copy, and all other code uses the URL.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 TRIES: Final = 4
-"""How often is asked for what an object store did not give whole."""
+"""Number of tries for an incomplete response of an object store."""
 
 PIECE: Final = 1 << 20
-"""Bytes that are asked for at a time where single messages are read."""
+"""Size of a request for single messages; bytes."""
 
 COPIED: Final = 16 << 20
-"""Bytes that are asked for at a time where all are read."""
+"""Size of a request for a complete copy; bytes."""
 
 _copies: Final[dict[str, Path]] = {}
-"""URL → its copy on this machine, as long as there is one."""
+"""URL → path of its current local copy."""
 
 
 @cache
 def object_stores() -> Any:
-    """Import obstore.
+    """Import obstore and return it.
 
     Raises
     ------
@@ -58,12 +58,12 @@ def object_stores() -> Any:
 
 
 def object_store_at(url: str) -> Any:
-    """Open an object store at a URL; it asks again where that is worth it, a while later."""
+    """Open the object store at a URL, with retries after temporary errors."""
     return object_stores().store.from_url(url, **_options(url))
 
 
 def _options(url: str) -> dict[str, Any]:
-    """Settings of the client: an S3 of one's own may be reached by plain HTTP (AWS_ENDPOINT_URL)."""
+    """Return the settings of the client. An own S3 server (AWS_ENDPOINT_URL) may use plain HTTP."""
     retry = {
         "max_retries": TRIES,
         "backoff": {"init_backoff": timedelta(seconds=0.1), "max_backoff": timedelta(seconds=5)},
@@ -75,7 +75,7 @@ def _options(url: str) -> dict[str, Any]:
 
 
 def reason_of_object_store(error: BaseException) -> tuple[str, bool]:
-    """Describe in one line why an object store refused; and tell whether it has no such object."""
+    """Return a one-line reason for an error of an object store, and True if the object is missing."""
     wrong = object_stores().exceptions
     if isinstance(error, FileNotFoundError | wrong.NotFoundError):
         return "no such object, or no such bucket", True
@@ -87,14 +87,14 @@ def reason_of_object_store(error: BaseException) -> tuple[str, bool]:
 
 
 def fetch_object(store: Any, name: str, file: IO[bytes]) -> None:
-    """Write an object into a file that is open for writing; one that ends early is asked for again.
+    """Write an object into an open file, and try again after an early end.
 
     Raises
     ------
     OSError
-        It always ends early, or the file cannot be written.
+        Every try ends early, or the file cannot be written.
     obstore.exceptions.BaseError
-        The object store does not give it.
+        The object store refuses the object.
     """
     objects, size = object_stores(), -1
     for left in reversed(range(TRIES)):
@@ -115,17 +115,14 @@ def fetch_object(store: Any, name: str, file: IO[bytes]) -> None:
     raise OSError(EIO, f"ends before its {size} bytes do")
 
 
-# One object -----------------------------------------------------------------------------------------
-
-
 @lru_cache(maxsize=64)
 def _opened(root: str, endpoint: str) -> Any:
-    del endpoint  # another one is another store
+    del endpoint  # part of the cache key
     return object_store_at(root)
 
 
 def _at(url: str) -> tuple[Any, str]:
-    """The object store of a URL, and the name of the object in it."""
+    """Return the object store of a URL, and the name of the object in it."""
     scheme, _, rest = url.partition("://")
     host, _, name = rest.partition("/")
     root = f"{scheme}://{host}"
@@ -148,10 +145,10 @@ def _told(url: str) -> Generator[None]:
 
 
 def _mark(about: Any) -> tuple[int, int]:
-    """Size and time of change of an object; bytes, ns.
+    """Return the size and modification time of an object; bytes, ns.
 
-    Object stores tell the second. What was written within it is told apart by its tag, which stands where the
-    nanoseconds would.
+    Object stores report whole seconds. The digits below one second are a hash of the object's tag, so that they
+    differ between two versions within a second.
     """
     changed, tag = about["last_modified"], about["e_tag"]
     within = crc32(tag.encode()) % 1_000_000_000 if tag else changed.microsecond * 1000
@@ -159,14 +156,14 @@ def _mark(about: Any) -> tuple[int, int]:
 
 
 def mark_of_url(url: str) -> tuple[int, int]:
-    """Size and time of change of an object; bytes, ns.
+    """Return the size and modification time of an object; bytes, ns.
 
     Raises
     ------
     FileNotFoundError
-        There is none.
+        The object does not exist.
     TraceError
-        The object store does not tell.
+        The object store refuses the request.
     """
     copy = _copies.get(url)
     if copy is not None:
@@ -178,12 +175,12 @@ def mark_of_url(url: str) -> tuple[int, int]:
 
 
 def names_below(url: str) -> Iterator[str]:
-    """The URLs of all objects below a URL, in no order.
+    """Yield the URLs of all objects below a URL, in any order.
 
     Raises
     ------
     TraceError
-        The object store does not tell.
+        The object store refuses the request.
     """
     scheme, _, rest = url.partition("://")
     host = rest.partition("/")[0]
@@ -195,30 +192,30 @@ def names_below(url: str) -> Iterator[str]:
 
 
 def open_url(url: str) -> io.BufferedReader:
-    """An object, opened for reading; a copy of it where there is one.
+    """Open an object, or its local copy, for reading.
 
     Raises
     ------
     FileNotFoundError
-        There is none.
+        The object does not exist.
     TraceError
-        The object store does not give it.
+        The object store refuses the object.
     """
     copy = _copies.get(url)
     return copy.open("rb") if copy is not None else io.BufferedReader(RemoteFile(url), PIECE)
 
 
 class NoRangesError(TraceError):
-    """A server gives its files as a whole only."""
+    """A server does not support byte ranges."""
 
 
 class RemoteFile(io.RawIOBase):
-    """An object as a file: what is read of it is asked for by its range.
+    """File object for a remote object, which reads only the needed byte ranges.
 
     Attributes
     ----------
     mark : (int, int)
-        Its size and its time of change; bytes, ns.
+        Size and modification time of the object; bytes, ns.
     """
 
     def __init__(self, url: str) -> None:
@@ -253,7 +250,7 @@ class RemoteFile(io.RawIOBase):
         return self._position
 
     def readinto(self, buffer: Any, /) -> int:
-        """Read so many bytes as there is room for, or as there are."""
+        """Read bytes into a buffer until it is full or the object ends."""
         view = memoryview(buffer).cast("B")
         stop = min(self._position + len(view), self.mark[0])
         if stop <= self._position:
@@ -270,14 +267,14 @@ class RemoteFile(io.RawIOBase):
         super().close()
 
     def piece(self, start: int, stop: int) -> memoryview:
-        """Return the bytes from one place to another; of a server that knows no ranges all come, once.
+        """Return a byte range. Without range support on the server, the whole object is fetched once.
 
         Raises
         ------
         FileNotFoundError
-            The object is gone.
+            The object no longer exists.
         TraceError
-            It was replaced, or does not come.
+            The object was replaced or is not available.
         """
         if self._whole is None:
             try:
@@ -305,22 +302,22 @@ class RemoteFile(io.RawIOBase):
         return whole(self.name, stop - start, ask)
 
     def _fetched(self) -> IO[bytes]:
-        """Fetch all of the object, to a file without a name."""
-        file = TemporaryFile()  # noqa: SIM115  closed with this one
+        """Fetch the whole object into an unnamed temporary file."""
+        file = TemporaryFile()  # noqa: SIM115  closed in close()
         with _told(self.name):
             fetch_object(self._store, self._key, file)
         return file
 
 
 def whole(url: str, size: int, ask: Callable[[], memoryview]) -> memoryview:
-    """Ask for bytes until they come as a whole, a few times.
+    """Repeat a request, a few times, until all bytes arrive.
 
     Raises
     ------
     FileNotFoundError
-        There is no such object.
+        The object does not exist.
     TraceError
-        They do not come; it says why.
+        The bytes do not arrive; the message contains the reason.
     """
     wrong, reason = object_stores().exceptions, ""
     final = wrong.NotFoundError, wrong.PermissionDeniedError, wrong.UnauthenticatedError
@@ -341,19 +338,16 @@ def whole(url: str, size: int, ask: Callable[[], memoryview]) -> memoryview:
     raise TraceError(f"not read in {TRIES} tries: {reason}", path=url)
 
 
-# Copies ---------------------------------------------------------------------------------------------
-
-
 @contextmanager
 def copied(urls: list[str], folder: Path) -> Generator[None]:
-    """Read objects from copies of them in a folder of this machine, for as long as the block lasts.
+    """Context manager that reads remote objects from local copies in a folder.
 
     Raises
     ------
     FileNotFoundError
-        There is no such object.
+        The object does not exist.
     TraceError
-        It does not come as a whole, or there is no room for it.
+        The object is incomplete, or the disk is full.
     """
     made: dict[str, Path] = {}
     try:
