@@ -1,11 +1,11 @@
-"""Frames and maps as pictures, PNG or SVG by the ending of the file's name.
+"""Pictures of frames and maps, as PNG or SVG by the file ending.
 
-A frame is seen from above with the ego in the middle, heading up. A picture is made for a person who
-has never seen this project: whatever occurs in it is explained beside it, and nothing else is. A file
-that is there already is replaced. The same input gives the same bytes.
+A frame is seen from above, with the ego in the middle and its heading up. The legend explains every
+sign in a picture, and only these, for readers who do not know this project. An existing file is
+replaced. The same input gives the same bytes.
 
-Texts that come from traces are cut and shown as they stand; no markup in them is interpreted. In an
-SVG, texts are texts, and the groups of nodes have the ids ``node-17``, ``halo-17``, ``label-17``.
+Texts from traces are cut and shown literally; markup in them is not interpreted. In an SVG, texts
+are texts, and the groups of nodes have the ids ``node-17``, ``halo-17``, ``label-17``.
 """
 
 import lazy_loader

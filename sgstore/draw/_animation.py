@@ -1,4 +1,4 @@
-"""Animations: every picture at its time, written one by one, so that memory does not grow with their length."""
+"""Animations: each picture is written at its time, so that memory does not grow with the length."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ if TYPE_CHECKING:
 
 
 LEAST_DELAY: Final = 2
-"""Hundredths of a second that a frame is shown at least: players take less for a tenth of a second."""
+"""Shortest display time of a frame in hundredths of a second: many players show shorter frames for
+a tenth of a second."""
 MOST_DELAY: Final = 65535
 CODECS: Final[dict[str, tuple[tuple[str, ...], dict[str, str]]]] = {
     ".mp4": (("libx264", "libopenh264"), {"preset": "veryfast", "crf": "20", "rc-lookahead": "8"}),
@@ -47,33 +48,33 @@ CODECS: Final[dict[str, tuple[tuple[str, ...], dict[str, str]]]] = {
         {"crf": "30", "deadline": "good", "cpu-used": "6", "lag-in-frames": "8"},
     ),
 }
-"""Encoders of each kind of video, the best first, and how they are set."""
+"""Encoders of each kind of video, best first, with their settings."""
 _AREA: Final = 250
-"""Pixels of one colour that are an area."""
+"""Least number of pixels of one colour that make an area."""
 _CLOSE: Final = 10.0
-"""Distance in RGB that a mixture of colours is moved, if there are places enough."""
+"""Greatest change of a mixed colour in RGB, if the palette has enough places."""
 _MOST_NEW: Final = 16_000
-"""Colours of a picture that are looked up in the palette of the one before."""
+"""Greatest number of colours of a picture that are looked up in the previous palette."""
 _KEPT_FREE: Final = 32
 """Places of a palette for colours of later pictures."""
 
 
 class Animation(ABC):
-    """Writes pictures that follow one another; to be used in a ``with``.
+    """Writer of consecutive pictures; a context manager.
 
     Parameters
     ----------
     to : Path
-        Gets its name when all is written; a file that is there is replaced.
+        Receives its name when all is written; an existing file is replaced.
     """
 
     TICKS: ClassVar[int]
-    """Units of its time in a second."""
+    """Ticks of its clock per second."""
 
     def __init__(self, to: Path) -> None:
         self._output = OutputFile(to)
         self._waiting: tuple[Pixels, int] | None = None
-        self._shown = self.TICKS  # the last frame is shown as long as the one before
+        self._shown = self.TICKS  # the last frame is shown as long as the previous one
         self.frames = 0
 
     def __enter__(self) -> Self:
@@ -91,7 +92,7 @@ class Animation(ABC):
             self._output.discard()
 
     def add(self, pixels: Pixels, time_s: float) -> None:
-        """Show a picture, (height, width, 3), from a time on; s. All are of one size, and times ascend."""
+        """Show a picture (height, width, 3) from a time on; s. All have one size; times ascend."""
         start = round(time_s * self.TICKS)
         if self._waiting is not None:
             before, since = self._waiting
@@ -101,24 +102,24 @@ class Animation(ABC):
 
     @abstractmethod
     def _write(self, pixels: Pixels, delay: int) -> None:
-        """Write a frame that is shown for so long."""
+        """Write a frame with its display time."""
 
     @abstractmethod
     def _end(self) -> None:
-        """Write what comes after the last frame."""
+        """Write the end of the file after the last frame."""
 
     @abstractmethod
     def _drop(self) -> None:
-        """Let go of all but the file itself."""
+        """Release all resources except the file itself."""
 
 
 def animation(to: Path) -> Animation:
-    """Writer of an animation, by the ending of its file.
+    """Return the writer of an animation for this file ending.
 
     Raises
     ------
     ExportError
-        The ending is another, or the file cannot be written.
+        The ending is unknown, or the file cannot be written.
     MissingExtraError
         The package that writes videos is not installed.
     """
@@ -131,7 +132,7 @@ def animation(to: Path) -> Animation:
 
 
 class Gif(Animation):
-    """Writes an animation that repeats for ever."""
+    """Writer of an endlessly repeating GIF."""
 
     TICKS = 100
 
@@ -148,10 +149,10 @@ class Gif(Animation):
         """The output closes its stream itself."""
 
     def _write(self, pixels: Pixels, delay: int) -> None:
-        """Write a frame that is shown for so many hundredths of a second."""
+        """Write a frame with its display time in hundredths of a second."""
         if self._last is None:
             height, width, _ = pixels.shape
-            # The frames bring their palettes: the file's own one has no colour of use.
+            # The frames have their own palettes: the palette of the file is not used.
             head, _ = getheader(Image.new("P", (width, height)), info={"loop": 0})
             self._stream.write(b"".join(head))
         left, top, right, bottom = changed(self._last, pixels)
@@ -163,14 +164,14 @@ class Gif(Animation):
             include_color_table=True,
         )
         self._stream.write(b"".join(pieces))
-        pieces.clear()  # they hang in a cycle of Pillow's
+        pieces.clear()  # Pillow keeps them in a reference cycle
         gc.collect(0)
         self._last = pixels
         self.frames += 1
 
 
 class Video(Animation):
-    """Writes a video: H.264 in MP4, VP9 in WebM. Each picture is encoded when the next one comes."""
+    """Writer of a video: H.264 in MP4, VP9 in WebM; a picture is encoded when the next one arrives."""
 
     TICKS = 1000
 
@@ -186,7 +187,8 @@ class Video(Animation):
     def _write(self, pixels: Pixels, delay: int) -> None:
         from av import VideoFrame
 
-        # Colours are sampled for two pixels at once, across and down: a side of an odd length gets one more.
+        # Two neighbouring pixels share a colour sample in both directions: an odd side gets one
+        # more pixel.
         height, width, _ = pixels.shape
         even = np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         with self._told():
@@ -216,7 +218,7 @@ class Video(Animation):
         context = stream.codec_context
         context.time_base = stream.time_base = Fraction(1, self.TICKS)
         context.bit_rate = 0
-        context.max_b_frames = 0  # so packets come in the order of the pictures
+        context.max_b_frames = 0  # so that packets have the order of the pictures
         context.colorspace, context.color_range = 1, 1  # BT.709, of 16 to 235
         context.color_primaries, context.color_trc = 1, 1
         return container, stream
@@ -224,7 +226,7 @@ class Video(Animation):
     def _mux(
         self, container: OutputContainer, stream: VideoStream, frame: VideoFrame | None
     ) -> None:
-        """Encode a picture, or what is left, and write what is ready."""
+        """Encode a picture, or flush with ``None``, and write the finished packets."""
         for packet in stream.encode(frame):
             packet.duration = self._delays.popleft()
             container.mux(packet)
@@ -243,7 +245,7 @@ class Video(Animation):
 
     @contextmanager
     def _told(self) -> Generator[None]:
-        """Tell errors of the encoder as ours."""
+        """Convert errors of the encoder to :class:`ExportError`."""
         from av.error import FFmpegError
 
         try:
@@ -253,7 +255,7 @@ class Video(Animation):
 
 
 def changed(before: Pixels | None, now: Pixels) -> tuple[int, int, int, int]:
-    """Left, top, right and bottom of the part of a picture that is other than before; a pixel at least."""
+    """Return left, top, right and bottom of the changed part of a picture; at least one pixel."""
     height, width, _ = now.shape
     if before is None:
         return 0, 0, width, height
@@ -265,18 +267,18 @@ def changed(before: Pixels | None, now: Pixels) -> tuple[int, int, int, int]:
 
 
 class LastingPalette:
-    """A palette of 256 colours for pictures that follow one another; it grows, and begins anew when it is full.
+    """Palette of 256 colours for consecutive pictures; it grows, and starts again when it is full.
 
-    Areas keep their colours as far as there are places for them, and no mixture of colours is moved further
-    than in :func:`sgstore.draw._page.indexed`.
+    Areas keep their colours if there are enough places. A mixed colour changes at most as much as
+    in :func:`sgstore.draw._page.indexed`.
     """
 
     def __init__(self) -> None:
         self._colours = np.zeros((0, 3), np.float32)
-        self._places = np.full(1 << 24, -1, np.int16)  # of all colours that have been met
+        self._places = np.full(1 << 24, -1, np.int16)  # index of each known colour
 
     def indexed(self, picture: Pixels) -> Image.Image:
-        """An RGB picture, (height, width, 3), with a palette."""
+        """Convert an RGB picture (height, width, 3) to an indexed one."""
         whole = packed(picture)
         places = self._places.take(whole)
         unknown = places < 0
@@ -290,7 +292,7 @@ class LastingPalette:
         return with_palette(places.astype(np.uint8), self._colours)
 
     def _begins(self, whole: NDArray[np.int32]) -> bool:
-        """Make a palette of a picture; False if it has too many colours."""
+        """Make a palette of a picture; return False for too many colours."""
         found, many = np.unique(whole, return_counts=True)
         if len(found) > MOST_COLOURS:
             return False
@@ -307,7 +309,7 @@ class LastingPalette:
         return True
 
     def _grows(self, unknown: NDArray[np.int32]) -> bool:
-        """Give places to pixels of new colours; False if there are not enough."""
+        """Add new colours to the palette; return False without enough places."""
         found, many = np.unique(unknown, return_counts=True)
         areas = np.flatnonzero(many > _AREA)
         if len(found) > _MOST_NEW or len(self._colours) + len(areas) > PLACES:

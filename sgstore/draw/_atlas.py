@@ -1,6 +1,6 @@
-"""A road map on one page, with a side panel.
+"""Page with a road map and a side panel.
 
-The right side of the page: the camera picture, what was matched, the ego's surroundings in words.
+The right side of the page: camera picture, matches, and the ego's surroundings as text.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ HEAD: Final = 20.0
 _SMALL: Final = 6.6
 _SWATCH: Final = 20.0
 _NEIGHBOURS: Final = 18
-"""Rows of the ego's surroundings at most: beyond these a list is not read."""
+"""Greatest number of rows for the ego's surroundings."""
 _LEFT_OUT: Final = "… and {} more"
 
 
 @dataclass(slots=True)
 class Panel:
-    """A column of the page that is filled from its top; points.
+    """Column of the page that is filled from its top; points.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class Panel:
     left, right, bottom : float
         Its borders on the page.
     y : float
-        Down to where it is filled.
+        Upper end of the free part.
     """
 
     page: Page
@@ -71,11 +71,11 @@ class Panel:
     y: float
 
     def room(self) -> float:
-        """Height that is left."""
+        """Return the height of the free part."""
         return self.y - self.bottom
 
     def head(self, text: str) -> None:
-        """A small heading with a rule under it."""
+        """Write a small heading with a rule under it."""
         self.y -= HEAD - 3
         self.page.text(self.left, self.y + 4, text, fontsize=7.5, weight="bold")
         rule = Line2D((self.left, self.right), (self.y, self.y), color=palette.RULE, linewidth=0.7)
@@ -83,7 +83,7 @@ class Panel:
         self.y -= 3
 
     def row(self, *cells: tuple[float, str], **look: Any) -> None:
-        """A line of cells, each at its distance from the left border, cut where the next one begins."""
+        """Write a line of cells, each at its distance from the left border, cut at the next one."""
         self.y -= ROW
         ends = [x for x, _ in cells[1:]] + [self.right - self.left + 4]
         style = {"fontsize": _SMALL, **look}
@@ -91,7 +91,7 @@ class Panel:
             self.page.text(self.left + x, self.y + 2, self._cut(text, end - x - 4), **style)
 
     def _cut(self, text: str, width: float) -> str:
-        """A text shortened to a width; names of traces may be as long as they like."""
+        """Shorten a text to a width, because names of traces can be long."""
         if self.page.text_size(text, _SMALL)[0] <= width:
             return text
         while len(text) > 1 and self.page.text_size(text + "…", _SMALL)[0] > width:
@@ -100,7 +100,7 @@ class Panel:
 
 
 def paint_picture(panel: Panel, picture: bytes) -> None:
-    """The camera picture, as wide as the panel, but not higher than three fifths of its width."""
+    """Paint the camera picture over the panel's width, at most three fifths of it high."""
     width = panel.right - panel.left
     panel.y -= panel.page.picture(picture, panel.left, panel.y, width, 0.6 * width)
 
@@ -122,7 +122,7 @@ def paint_matches(panel: Panel, scene: DrawnFrame) -> None:
 
 
 def paint_surroundings(panel: Panel, scene: DrawnFrame, bottom: float) -> None:
-    """The ego's neighbours, the nearest first, down to ``bottom`` at the most."""
+    """Write the ego's neighbours, nearest first, down to ``bottom``."""
     graph = scene.graph
     if graph.ego is None or graph.ego not in graph.nodes:
         return
@@ -157,7 +157,7 @@ def paint_surroundings(panel: Panel, scene: DrawnFrame, bottom: float) -> None:
 
 
 def legend_height(entries: Sequence[Entry]) -> float:
-    """Height of a legend with these entries; points."""
+    """Return the height of a legend with these entries; points."""
     return HEAD + ROW * _legend_rows(entries)
 
 
@@ -181,12 +181,12 @@ _KEY_COLUMNS: Final = 9
 
 
 def key_height(entries: int) -> float:
-    """Height of a legend that lies under a picture; points."""
+    """Return the height of a legend under a picture; points."""
     return ROW * math.ceil(entries / _KEY_COLUMNS)
 
 
 def paint_key(page: Page, entries: Sequence[Entry], box: Rect) -> None:
-    """A legend under a picture: entries in columns, without a heading."""
+    """Paint a legend under a picture: entries in columns, without a heading."""
     left, _, right, top = box
     step, down = (right - left) / _KEY_COLUMNS, math.ceil(len(entries) / _KEY_COLUMNS)
     panel = Panel(page, left, right, 0.0, top)
@@ -213,16 +213,16 @@ _SIGNAL: Final = 3.4
 
 
 _TOLD: Final = 11
-"""Kinds of parts of a map that have room in one line."""
+"""Greatest number of kinds of map parts in one line."""
 
 
 def paint_atlas(page: Page, road_map: RoadMap, window: Rect, side: Rect) -> str:
-    """Draw a map in a window, and its figures and legend beside it; returns a line that sums it up.
+    """Draw a map in a window with its figures and legend; return a one-line summary.
 
     Raises
     ------
     ExportError
-        If nothing of the map has an outline.
+        The map has no outlines.
     """
     ground = _whole(road_map)
     stage = page.stage(window, ground.view)
@@ -242,7 +242,7 @@ def paint_atlas(page: Page, road_map: RoadMap, window: Rect, side: Rect) -> str:
 
 
 def _whole(road_map: RoadMap) -> GroundView:
-    """All of a map, in a view that shows it."""
+    """Return a view of the complete map."""
     outlines = list(road_map.outlines())
     bounds = [o.bounds for o in outlines if o is not None and not o.is_empty]
     if not bounds:
@@ -264,7 +264,7 @@ def _travelled(ground: GroundView) -> list[int]:
 
 
 def _paint_signals(stage: Stage, ground: GroundView) -> list[str]:
-    """A dot for each signal of the map; returns the kinds that occur."""
+    """Paint a dot for each signal of the map; return the kinds that occur."""
     nodes = ground.nodes
     found: list[str] = []
     for kind in SIGNALS:
@@ -292,7 +292,7 @@ def _paint_signals(stage: Stage, ground: GroundView) -> list[str]:
 
 
 def _paint_names(stage: Stage, ground: GroundView, reserved: Iterable[Rect]) -> None:
-    """Ids of junctions, and of roads where they are not too many, each where its lanes are."""
+    """Paint ids of junctions, and of roads if they are few, at their lanes."""
     placer = Placer(stage.rect(*stage.half, (0.0, 0.0)))
     for rect in reserved:
         placer.block(rect)
@@ -314,7 +314,7 @@ def _paint_names(stage: Stage, ground: GroundView, reserved: Iterable[Rect]) -> 
 
 
 def _middles(ground: GroundView, rows: list[int], names: tuple[str, ...]) -> dict[str, Floats]:
-    """For each road or junction the middle of its lanes' own middles; picture axes."""
+    """Return for each road or junction the mean position of its lanes; picture axes."""
     grouped: dict[str, list[int]] = {}
     for row in rows:
         grouped.setdefault(names[row], []).append(row)

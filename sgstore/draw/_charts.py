@@ -1,6 +1,6 @@
-"""Charts of coverage and selection: sizes of classes by rank, growth, pairs of features, curves of selections.
+"""Charts of coverage and selection: class sizes by rank, growth, pairs of features, selection curves.
 
-PNG or SVG by the ending of the file's name; the same numbers give the same bytes.
+The file ending selects PNG or SVG; the same numbers give the same bytes.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ _RIGHT: Final = 24.0
 _BELOW: Final = 46.0
 _ABOVE: Final = 72.0
 _LETTER: Final = 3.9
-"""Width of a letter of 7 points, about."""
+"""Approximate width of a letter of 7 points."""
 
 CHOSEN: Final[Mapping[str, Any]] = {"color": ROAD_EDGE, "linewidth": 1.8}
-"""Look of the line that a chart is about."""
+"""Look of the main line of a chart."""
 AT_RANDOM: Final[Mapping[str, Any]] = {
     "color": FAINT_INK,
     "linewidth": 1.2,
     "linestyle": (0, (4, 3)),
 }
-"""Look of the line that it is compared with."""
+"""Look of the line for comparison."""
 
 
 @contextmanager
 def _page(
     to: Path, title: str, below: str, width: float = _WIDTH, height: float = _HEIGHT
 ) -> Generator[Page]:
-    """Give a page with a title and a sentence, of at most two lines, under it; write it when all is drawn.
+    """Yield a page with a title and a subtitle of at most two lines; write it at the end.
 
     Raises
     ------
     ExportError
-        The ending of ``to`` is none of a picture, or the file cannot be written.
+        The ending of ``to`` is not a picture format, or the file cannot be written.
     MissingExtraError
         The packages for drawing are not installed.
     """
@@ -72,7 +72,7 @@ def _page(
 def _chart(
     to: Path, title: str, below: str, names: tuple[str, str], right: float = _RIGHT
 ) -> Generator[Axes]:
-    """Give the axes of a chart that fills a page, with the names of its axes; see :func:`_page`."""
+    """Yield the axes of a chart that fills a page, with axis titles; see :func:`_page`."""
     with _page(to, title, below) as page:
         axes = page.plot(_LEFT, _BELOW, page.width - right, page.height - _ABOVE)
         axes.set_xlabel(names[0], fontsize=8, color=INK, parse_math=False)
@@ -81,7 +81,7 @@ def _chart(
 
 
 def _number_axes(axes: Axes) -> None:
-    """Write the numbers of both axes short (``25 k``), at round values, from 0 on."""
+    """Write the numbers of both axes in short form (``25 k``), at round values, from 0 on."""
     from matplotlib.ticker import EngFormatter, MaxNLocator
 
     for axis in (axes.xaxis, axes.yaxis):
@@ -92,7 +92,7 @@ def _number_axes(axes: Axes) -> None:
 
 
 def _key(axes: Axes) -> None:
-    """Explain the lines above the chart, where none of them passes."""
+    """Paint the legend of lines above the chart, outside the lines."""
     axes.legend(
         loc="lower right", bbox_to_anchor=(1, 1), ncols=4, fontsize=7, labelcolor=INK, frameon=False
     )
@@ -102,30 +102,30 @@ _GAP: Final = "#f5b877"
 _CANNOT: Final = "#dcdcdc"
 _CELL: Final = 11.0
 MOST_FEATURES: Final = 120
-"""Features that a matrix shows; of more, those with the most gaps."""
+"""Greatest number of features in a matrix; those with the most gaps are chosen."""
 
 
 def draw_rank_sizes(
     sizes: Sequence[int], cumulative: Sequence[float], to: Path, *, unit: str, title: str
 ) -> None:
-    """Draw how large classes are by rank, both in powers of ten, and the share that they have together.
+    """Draw class sizes by rank on logarithmic axes, and their cumulative share.
 
     Parameters
     ----------
     sizes : sequence of int
-        The largest first; at least one.
+        Largest first; at least one.
     cumulative : sequence of float
-        Share of all units that so many classes have, 0 … 1; empty: it is not drawn.
+        Share of all units in the classes up to this rank, 0 … 1; empty for no line.
     to : Path
-        ``….png`` or ``….svg``; a file that is there is replaced.
+        ``….png`` or ``….svg``; an existing file is replaced.
     unit : str
-        What is counted: ``frame``.
+        The counted unit: ``frame``.
     title : str
 
     Raises
     ------
     ExportError
-        The ending is another, or the file cannot be written.
+        The ending is unknown, or the file cannot be written.
     MissingExtraError
         The packages for drawing are not installed.
     """
@@ -168,7 +168,7 @@ def draw_growth(
     title: str,
     below: str = "",
 ) -> None:
-    """Draw how many classes the first n units have, beside n units at random.
+    """Draw the number of classes in the first n units, compared with n random units.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def draw_growth(
         As in :func:`draw_rank_sizes`.
     unit, title : str
     below : str
-        A sentence under the title.
+        Subtitle.
 
     Raises
     ------
@@ -206,7 +206,7 @@ def draw_matrix(
     groups: Sequence[str] = (),
     most: int = MOST_FEATURES,
 ) -> None:
-    """Draw which pairs of features occur together, and mark the gaps: pairs that are wanted and do not.
+    """Draw the common frames of pairs of features, and mark wanted pairs without any (gaps).
 
     Each pair has one place, below the diagonal.
 
@@ -215,17 +215,18 @@ def draw_matrix(
     names : sequence of str
         F features, or values of slots.
     frames : (F, F) int64
-        Frames with both, symmetric; on the diagonal, with the feature.
+        Frames with both features, symmetric; on the diagonal, frames with the feature.
     wanted : (F, F) bool
-        Which pairs should occur.
+        Mask of the pairs that should occur.
     to : Path
         As in :func:`draw_rank_sizes`.
     title : str
     groups : sequence of str, optional
-        Slot of each value, those of one slot together: lines part the slots, and pairs that cannot be are grey.
+        Slot of each value; the values of a slot are contiguous. Lines separate the slots, and
+        impossible pairs are grey.
 
     most : int
-        Features that are shown at most.
+        Greatest number of features shown.
 
     Raises
     ------
@@ -234,9 +235,10 @@ def draw_matrix(
 
     Notes
     -----
-    Of features that are in the very same frames, as both directions of an edge, one is shown, the ego's if it
-    is among them. Of more than ``most`` those with the most gaps are, where a gap of two counts as much as the
-    frames of one by the frames of the other: that they never meet surprises the more. The picture says so.
+    Features with exactly the same frames, such as both directions of an edge, are shown once, with
+    preference for the ego's. Above ``most``, the features with the most gaps are shown. A gap
+    counts as the product of both frame counts: a missing pair of frequent features is more
+    surprising. The picture mentions the omission.
     """
     from matplotlib.colors import to_rgb
 
@@ -268,7 +270,7 @@ def draw_matrix(
     names = [printable(names[i]) for i in shown.tolist()]
     side = len(names) * _CELL
     label = 12 + 3.7 * max((len(name) for name in names), default=0)
-    least = max(480 if groups else 420, 7.4 * len(title))  # for the words above and below
+    least = max(480 if groups else 420, 7.4 * len(title))  # for the texts above and below
     with _page(to, title, below, max(label + side + 30, least), side + label + 90) as page:
         axes = page.plot(label, 30.0 + label, label + side, 30.0 + label + side)
         axes.imshow(image, interpolation="nearest", aspect="auto")
@@ -287,7 +289,7 @@ def draw_matrix(
 def _one_direction(
     names: Sequence[str], frames: NDArray[np.int64], wanted: NDArray[np.bool_]
 ) -> NDArray[np.intp]:
-    """Features but for those that are in the same frames as one before, those of the ego being before all."""
+    """Return one feature of each group with equal frames, with preference for the ego's."""
     order = np.array(
         sorted(range(len(names)), key=lambda i: not names[i].startswith("ego ")), np.intp
     )
@@ -297,7 +299,7 @@ def _one_direction(
 
 
 def _colours(frames: NDArray[np.int64], gaps: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """(F, F, 3): the darker the more frames, orange where there is a gap."""
+    """Return colours (F, F, 3): darker for more frames, orange for a gap."""
     from matplotlib.colors import to_rgb
 
     weight = np.log1p(frames) / max(float(np.log1p(frames).max(initial=0)), 1e-12)
@@ -337,28 +339,28 @@ def draw_curve(
     below: str,
     words: tuple[str, str] = ("kept", "selected"),
 ) -> None:
-    """Draw a curve of coverage, or of failures that are found, against size.
+    """Draw coverage, or the number of found failures, against selection size.
 
     Parameters
     ----------
     rows : sequence of tuple
-        Units; how many elements are kept by so many, ``None`` beyond the selection; the share of that; how many
-        as many units keep in random order.
+        Number of units; number of covered elements, ``None`` beyond the selection; its share;
+        covered elements for as many units in random order.
     total : int
-        How many elements there are.
+        Number of elements.
     to : Path
-        ``….png`` or ``….svg``; a file that is there is replaced.
+        ``….png`` or ``….svg``; an existing file is replaced.
     unit : str
-        What units are: ``clip``.
+        Kind of the units: ``clip``.
     title, below : str
-        Two sentences above it.
+        Title and subtitle.
     words : tuple of str
-        What becomes of the elements, and what is said of the units: ``failures found``, ``in order``.
+        Labels of the elements and of the units: ``failures found``, ``in order``.
 
     Raises
     ------
     ExportError
-        The ending is another, or the file cannot be written.
+        The ending is unknown, or the file cannot be written.
     MissingExtraError
         The packages for drawing are not installed.
     """

@@ -1,10 +1,10 @@
-"""The node-link diagram of a scene graph: what is shown, where, and how.
+"""Node-link diagram of a scene graph: content, layout and look.
 
-Which nodes and edges of a graph are shown as a diagram, and which go together in one line.
+The first part selects the nodes and edges of a diagram, and the edges that share a line.
 
-A frame of forty entities has thousands of edges; a diagram of a few dozen is what a person can read. Shown is
-the ego with its neighbours, the lanes that they are in, the roads and junctions of these, and the signals that
-control them. Pure functions; no drawing package is met here.
+A frame of forty entities has thousands of edges; people can read a diagram of a few dozen. The
+diagram shows the ego with its neighbours, their lanes, the roads and junctions of these, and the
+signals that control them. The functions are pure and need no drawing package.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ Tier = Literal["entity", "lane", "road", "junction"]
 Family = Literal["ego", "matched", "entity", "light", "isIn", "map", "part"]
 
 NEIGHBOURS: Final = 12
-"""Entities around the ego that are shown, the nearest first."""
+"""Greatest number of entities around the ego, nearest first."""
 MOST: Final = 60
-"""Entities that are shown at most, if every edge is asked for."""
+"""Greatest number of entities with ``relations="all"``."""
 
 MOST_WORDS: Final = 2
-"""Relations that are written on a line, each way; the most telling come first."""
+"""Greatest number of relations on a line in each direction; the most informative first."""
 
 _TIERS: Final[dict[str, Tier]] = {"road": "road", "junction": "junction", "roundabout": "junction"}
 
@@ -64,11 +64,11 @@ class DiagramLine:
     a, b : int
         Node ids.
     relations, back : tuple of str
-        From a to b, and, where they are shown in the same line, from b to a.
+        Relations from a to b, and those from b to a in the same line.
     family : str
-        ``ego``: an entity seen from the ego; ``matched``: among matched nodes; ``entity``: others among
-        entities; ``light``: a signal and a lane; ``isIn``: an entity in a lane; ``map``: lane to lane;
-        ``part``: a lane in its road, a road in its junction or roundabout.
+        ``ego``: an entity relative to the ego; ``matched``: among matched nodes; ``entity``: other
+        entities; ``light``: a signal and a lane; ``isIn``: an entity in a lane; ``map``: lane to
+        lane; ``part``: a lane in its road, a road in its junction or roundabout.
     """
 
     a: int
@@ -79,7 +79,7 @@ class DiagramLine:
 
     @property
     def text(self) -> str:
-        """Text on the line; empty where its look says it."""
+        """Return the text on the line; empty if its look is enough."""
         if self.family in {"isIn", "part", "light"}:
             return ""
         there, back = (", ".join(words[:MOST_WORDS]) for words in (self.relations, self.back))
@@ -89,23 +89,23 @@ class DiagramLine:
 def excerpt_of(
     graph: SceneGraph, matched: frozenset[int], relations: Relations
 ) -> tuple[dict[int, Tier], list[DiagramLine]]:
-    """Choose what of a graph is shown.
+    """Select the nodes and lines of a diagram.
 
     Parameters
     ----------
     graph : SceneGraph
     matched : frozenset of int
-        They are shown whatever else is.
+        Matched nodes, which are always shown.
     relations : {"ego", "all", "none"}
-        ``ego``: of entities those that the ego is related to by distance, and only their relations to it;
-        ``all``: all entities and all their relations; ``none``: no relations among entities.
+        ``ego``: only entities with a proximity relation to the ego, and their relations to it;
+        ``all``: all entities and relations; ``none``: no relations among entities.
 
     Returns
     -------
     nodes : dict
-        Node id → tier; the ego first, then those nearest to it.
+        Node id → tier; the ego first, then the nearest.
     lines : list of DiagramLine
-        Those that matter most at the end.
+        Most important last.
     """
     entities = _entities(graph, matched, relations)
     lanes, inside = _lanes(graph, entities, matched)
@@ -117,13 +117,13 @@ def excerpt_of(
 
 
 def tier_of(graph: SceneGraph, node: int) -> Tier:
-    """Tier of a diagram that a node belongs to."""
+    """Return the tier of a node in the diagram."""
     kind = str(graph.nodes[node].get("kind"))
     return "entity" if kind in ENTITY_KINDS else _TIERS.get(kind, "lane")
 
 
 def _entities(graph: SceneGraph, matched: frozenset[int], relations: Relations) -> list[int]:
-    """The ego, the matched entities, and the nearest others."""
+    """Return the ego, the matched entities, and the nearest others."""
     ego = graph.ego if graph.ego in graph.nodes else None
     first = [n for n in ([] if ego is None else [ego]) + sorted(matched) if n in graph.nodes]
     first = [n for n in dict.fromkeys(first) if tier_of(graph, n) == "entity"]
@@ -145,7 +145,7 @@ def _entities(graph: SceneGraph, matched: frozenset[int], relations: Relations) 
 
 
 def _close(graph: SceneGraph) -> set[int]:
-    """Entities that the ego is related to by distance; by anything, where the graph has no distances."""
+    """Return entities with a proximity relation to the ego, or with any relation without proximity."""
     near: set[int] = set()
     any_way: set[int] = set()
     for src, relation, dst, _ in graph.edges:
@@ -159,7 +159,7 @@ def _close(graph: SceneGraph) -> set[int]:
 def _lanes(
     graph: SceneGraph, entities: list[int], matched: frozenset[int]
 ) -> tuple[list[int], list[int]]:
-    """Lanes that entities are in above all, and what else of the map they are in: crosswalks, off the road."""
+    """Return primary lanes of entities, and their other map parts, such as crosswalks."""
     within: dict[int, list[tuple[bool, int]]] = {}
     other: list[int] = []
     wanted = set(entities)
@@ -178,7 +178,7 @@ def _lanes(
 
 
 def _lights(graph: SceneGraph, lanes: list[int], matched: frozenset[int]) -> list[int]:
-    """Signals that control the ego's lane, or a matched one."""
+    """Return the signals that control the ego's lane, or a matched lane."""
     asked = {n for n in lanes if n in matched} | {ego_lane(graph)}
     return sorted(
         {
@@ -190,7 +190,7 @@ def _lights(graph: SceneGraph, lanes: list[int], matched: frozenset[int]) -> lis
 
 
 def _parts(graph: SceneGraph, lanes: list[int]) -> list[int]:
-    """Roads and junctions that lanes belong to."""
+    """Return the roads and junctions of lanes."""
     inside: dict[int, list[int]] = {}
     for src, relation, dst, _ in graph.edges:
         if relation == "isIn" and src < 0 and dst in graph.nodes:
@@ -221,7 +221,7 @@ def _lines(
 
 
 def _together(a: Tier, b: Tier, matched: bool) -> Family | None:  # noqa: FBT001
-    """The family of two nodes whose relations there and back go in one line."""
+    """Return the family of two nodes whose relations in both directions share a line, or None."""
     if a == b == "lane":
         return "map"
     return "matched" if a == b == "entity" and matched else None
@@ -246,33 +246,33 @@ def _is_asked(family: Family, src: int, dst: int, graph: SceneGraph, relations: 
     return relations == "all" if family == "entity" else True
 
 
-# Where the nodes of a diagram go: entities where the ego sees them, the parts of the map in rows below ----
-# The same graph gives the same layout, and a small change of the scene a small change of the layout: places
-# come from geometry and from nothing else. Distances are compressed, so that what is near has room and what is
-# far is still there; then nodes that overlap push one another apart. All measures are points.
+# Layout of a diagram: entities in the upper part, relative to the ego; map parts in rows below. The
+# same graph gives the same layout, and a small change of the scene a small change of the layout:
+# positions depend only on geometry. Distances are compressed, so that near nodes have room and far
+# nodes stay visible. Then overlapping nodes push each other apart. All measures are points.
 
 GAP: Final = (26.0, 11.0)
-"""Room between two nodes, to the sides and up and down, so that lines between them can be seen."""
+"""Least gap between two nodes, horizontal and vertical, so that lines between them are visible."""
 ROUNDS: Final = 200
 ROW: Final = 17.0
-"""Height of a row of parts of the map."""
+"""Height of a row of map parts."""
 _PULL: Final = 0.06
-"""Share of the way back to its own place that a node makes in each round."""
+"""Share of the way to its wanted place that a node returns in each round."""
 
 
 def scattered(places: Floats, sizes: Floats, box: Rect, *, pinned: int = 1) -> Floats:
-    """Middles of nodes that lie as their places do, and do not overlap if there is room.
+    """Place nodes by their positions, without overlaps if there is room.
 
     Parameters
     ----------
     places : (N, 2) float64
-        Where things are, in any measure, from the first one; NaN: nowhere, these are put at the border.
+        Positions in any unit, relative to the first one; a node with NaN is placed at the border.
     sizes : (N, 2) float64
         Width and height of the nodes.
     box : Rect
-        They stay in it.
+        Bounds of all nodes.
     pinned : int
-        The first nodes that do not move.
+        Number of leading nodes with fixed places.
 
     Returns
     -------
@@ -285,10 +285,10 @@ def scattered(places: Floats, sizes: Floats, box: Rect, *, pinned: int = 1) -> F
     away = np.nan_to_num(places - places[0])
     nowhere = np.isnan(places).any(axis=1)
     away[nowhere, 1] = np.nanmax(np.abs(away), initial=1.0)
-    # Roads are longer than wide: what is narrow is drawn wider, up to a half.
+    # Roads are longer than wide: a narrow layout is stretched, up to a half.
     reach = np.maximum(np.abs(away).max(axis=0), np.abs(away).max() / 2)
     away /= np.maximum(reach, 1e-9)
-    # The root compresses: a thing at a quarter of the way is drawn in the middle.
+    # The root compresses: a quarter of the distance becomes a half.
     share = np.abs(away).max(axis=1)
     scale = np.divide(1.0, np.sqrt(share), out=np.zeros_like(share), where=share > 0)
     room = half - sizes.max(axis=0) / 2
@@ -297,11 +297,11 @@ def scattered(places: Floats, sizes: Floats, box: Rect, *, pinned: int = 1) -> F
 
 
 def _apart(wanted: Floats, sizes: Floats, box: Rect, pinned: int) -> Floats:
-    """Push nodes apart that overlap, each pair along the shorter way, and pull all back to their places."""
+    """Push overlapping nodes apart along the shorter way, and pull all back to their places."""
     count = len(wanted)
     low = np.array(box[:2]) + sizes / 2
     high = np.array(box[2:]) - sizes / 2
-    # Those at one place fan out: else nobody would know which way to push.
+    # Nodes at one place fan out, because otherwise the push has no direction.
     number = np.arange(count)
     loose = number >= pinned
     spots = wanted + 0.01 * np.stack([np.cos(number), np.sin(number)], axis=1) * loose[:, None]
@@ -325,7 +325,7 @@ def _apart(wanted: Floats, sizes: Floats, box: Rect, pinned: int) -> Floats:
 
 
 def _freed(spots: Floats, sizes: Floats, box: Rect, pinned: int) -> Floats:
-    """Put each node that still lies on an earlier one into the nearest free place, if there is any."""
+    """Move each node that still overlaps an earlier one to the nearest free place, if there is one."""
     low, high = np.array(box[:2]), np.array(box[2:])
     spots = spots.copy()
     for node in range(pinned, len(spots)):
@@ -345,15 +345,15 @@ def _freed(spots: Floats, sizes: Floats, box: Rect, pinned: int) -> Floats:
 
 
 def rows(order: Floats, widths: Floats, box: Rect) -> tuple[Floats, int]:
-    """Middles of nodes side by side, in as many rows as they need, in an order from left to right.
+    """Place nodes side by side in rows, ordered from left to right.
 
     Parameters
     ----------
     order : (N,) float64
-        What is smaller is further to the left.
+        Smaller values are further left.
     widths : (N,) float64
     box : Rect
-        Left and right bound the rows; the first row lies at the top.
+        Left and right bound the rows; the first row is at the top.
 
     Returns
     -------
@@ -369,7 +369,7 @@ def rows(order: Floats, widths: Floats, box: Rect) -> tuple[Floats, int]:
     count = _rows_needed(widths, right - left)
     for row in range(
         count
-    ):  # dealt out, so that neighbours stand in different rows and have room for arrows
+    ):  # distributed, so that neighbours are in different rows with room for arrows
         inside = sequence[row::count]
         free = (right - left - widths[inside].sum()) / (len(inside) + 1)
         ends = np.cumsum(widths[inside] + free)
@@ -389,20 +389,20 @@ def _rows_needed(widths: NDArray[np.float64], room: float) -> int:
         count += 1
 
 
-# A scene graph as nodes and edges, beside the view from above, in the colours of the paper's figures ----
-# Above: entities, where the ego sees them. Below: the lanes that they are in, from left to right as the ego
-# sees them, then roads, then junctions.
+# A scene graph as nodes and edges, next to the view from above, in the colours of the paper's
+# figures. Top: entities, relative to the ego. Below: their lanes, from left to right relative to
+# the ego, then roads, then junctions.
 
 _SIZE: Final = 6.6
 _PAD: Final = (9.0, 6.0)
-"""Room that a node has around its text, in all; points."""
+"""Total margin of a node around its text; points."""
 _WORDS: Final = 5.4
 _ARCS: Final = 46.0
 """Height of the arcs between lanes."""
 _GAP: Final = 16.0
 _LINES, _SLIPS, _NODES = 2.0, 3.0, 4.0
 _SPOTS: Final = 0.5 + 0.03 * np.array([step * sign for step in range(13) for sign in (-1, 1)][1:])
-"""Where on a line words may stand, as shares of its way, half way first."""
+"""Candidate places of words on a line, as shares of its length, the middle first."""
 _WHOLE: Final = np.linspace(0.0, 1.0, 41)
 _QUIET: Final[dict[str, tuple[str, float, dict[str, Any]]]] = {
     "entity": (palette.ENTITY_EDGE, 0.5, {"alpha": 0.35}),
@@ -413,7 +413,7 @@ _QUIET: Final[dict[str, tuple[str, float, dict[str, Any]]]] = {
 
 
 def paint_diagram(page: Page, box: Rect, scene: DrawnFrame, relations: Relations) -> str:
-    """Draw a scene's graph in a window of a page; returns what of it is shown, in words.
+    """Draw a scene's graph in a window of a page; return a summary of the shown part.
 
     Parameters
     ----------
@@ -422,7 +422,7 @@ def paint_diagram(page: Page, box: Rect, scene: DrawnFrame, relations: Relations
         Left, bottom, right and top of the window; points.
     scene : DrawnFrame
     relations : {"ego", "all", "none"}
-        Which edges among entities are shown.
+        Edges among entities to show.
     """
     left, bottom, right, top = box
     ground = Rectangle(
@@ -441,7 +441,7 @@ def paint_diagram(page: Page, box: Rect, scene: DrawnFrame, relations: Relations
 
 
 def diagram_entries() -> list[Entry]:
-    """Entries of the legend for what occurs in diagrams only."""
+    """Return the legend entries of diagrams."""
     lane, road = palette.DIAGRAM_TINTS["lane"], palette.DIAGRAM_TINTS["road"]
     return [
         Entry("area", "lane, crosswalk", lane),
@@ -451,7 +451,7 @@ def diagram_entries() -> list[Entry]:
 
 
 class _Diagram:
-    """A window with its nodes in their places."""
+    """Window with its nodes in their places."""
 
     def __init__(
         self,
@@ -477,10 +477,10 @@ class _Diagram:
             self._placer.block((left - 2, bottom - 2, right + 2, top + 2))
 
     def paint(self) -> int:
-        """Draw nodes, lines and words; returns the number of lines whose words found no room."""
+        """Draw nodes, lines and words; return the number of lines without room for words."""
         for line in self._lines:
             self._paint_line(line)
-        # What matters most is written first.
+        # The most important line is written first.
         written = [self._paint_words(line) for line in reversed(self._lines)]
         for node in self._texts:
             self._paint_node(node)
@@ -489,7 +489,7 @@ class _Diagram:
     # Places ---------------------------------------------------------------------------------------
 
     def _placed(self, tiers: dict[int, Tier]) -> dict[int, Point]:
-        """Places from the bottom up: junctions, roads, lanes with their arcs, and entities in the rest."""
+        """Return places from the bottom up: junctions, roads, lanes with their arcs, then entities."""
         left, bottom, right, top = self._box
         floor = bottom + 6
         spots: dict[int, Point] = {}
@@ -513,7 +513,7 @@ class _Diagram:
         return spots | {n: (x, y) for n, (x, y) in zip(nodes, found.tolist(), strict=True)}
 
     def _aside(self, node: int) -> float:
-        """Position to the right of a part of the map, at its point nearest to the ego."""
+        """Return the right offset of a map part, at its point nearest to the ego."""
         ground = self._scene.ground
         if ground is not None:
             near = ground.nearest(node, (0.0, 4.0))
@@ -527,7 +527,7 @@ class _Diagram:
         return (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
 
     def _border(self, node: int, towards: Point) -> Point:
-        """Point at which the line from a node's middle to another point leaves the node."""
+        """Return the point where the line from a node to another point leaves the node."""
         (x, y), half = self._spots[node], self._sizes[node] / 2
         dx, dy = towards[0] - x, towards[1] - y
         steps = [h / abs(d) for h, d in zip(half.tolist(), (dx, dy), strict=True) if abs(d) > 1e-9]
@@ -542,7 +542,7 @@ class _Diagram:
         return self._scene.name(node) + ("" if light is None else f": {clean(light, 12)}")
 
     def _course(self, line: DiagramLine) -> Floats:
-        """(3, 2): start, control point and end of a line's curve."""
+        """Return start, control point and end of a line's curve, (3, 2)."""
         a, b = self._spots[line.a], self._spots[line.b]
         if line.family != "map":
             start, end = self._border(line.a, b), self._border(line.b, a)
@@ -581,13 +581,13 @@ class _Diagram:
         self._page.add(self._page.sheet, arrow)
 
     def _along(self, line: DiagramLine, shares: Floats) -> Floats:
-        """(N, 2): points of a line's curve."""
+        """Return points of a line's curve, (N, 2)."""
         start, control, end = self._course(line)
         t = shares[:, None]
         return (1 - t) ** 2 * start + 2 * t * (1 - t) * control + t**2 * end
 
     def _paint_words(self, line: DiagramLine) -> bool:
-        """Write on a line what it stands for, where the fewest other lines pass; False if there is no room."""
+        """Write the text of a line where the fewest other lines pass; return False without room."""
         text = line.text
         if not text or line.family == "entity":
             return True
@@ -648,7 +648,7 @@ class _Diagram:
 
 
 def _pen(line: DiagramLine, scene: DrawnFrame) -> tuple[str, float, dict[str, Any]]:
-    """Colour, width in points, and what else of its look."""
+    """Return colour, width in points, and other attributes of a line."""
     if line.family in {"ego", "matched"}:
         close = min((r for r in line.relations if r in RANK), key=RANK.__getitem__, default=None)
         colour, width = palette.CLOSENESS[close] if close else (palette.FAR_EDGE, 0.9)

@@ -1,8 +1,9 @@
-"""A page that is drawn again and again, in pixels: for pictures that follow one another.
+"""Reusable page in pixels, for consecutive pictures.
 
-The drawing package makes an object of everything that is drawn, and these objects take most of the time.
-Here shapes and texts go to its renderer as they are, the legend is drawn once, and texts are kept as they
-were drawn. The pixels are those of :class:`sgstore.draw._page.Page`, but that texts are set on whole pixels.
+matplotlib makes an object for everything that is drawn; these objects take most of the time. This
+page sends shapes and texts directly to the renderer. The legend is drawn once, and drawn texts are
+cached. The pixels equal those of :class:`sgstore.draw._page.Page`, except that texts are placed on
+whole pixels.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
 
 Sprite = tuple["Pixels", int, int]
-"""A text as drawn, (height, width, 4) from below, and how far its corner lies from its place; pixels."""
+"""A drawn text, (height, width, 4) from below, and the offset of its corner; pixels."""
 
 _NOWHERE = IdentityTransform()
 _AT_ONE_PLACE = np.zeros((1, 2))
@@ -41,7 +42,7 @@ _AS_THEY_ARE = np.empty((0, 3, 3))
 
 
 class FilmPage(Page):
-    """A sheet of paper for one picture after another; :meth:`clear` goes before each."""
+    """Page for consecutive pictures; call :meth:`clear` before each."""
 
     def __init__(self, width: float, height: float, dpi: float) -> None:
         self._windows: dict[Rect, Axes] = {}
@@ -56,7 +57,7 @@ class FilmPage(Page):
         self._texts = TextSprites(dpi)
 
     def clear(self) -> None:
-        """Take all from the page that was drawn."""
+        """Remove all content of the page."""
         for axes in self._shown:
             for image in (*axes.images,):
                 image.remove()
@@ -64,7 +65,7 @@ class FilmPage(Page):
         self._scales = {}
 
     def pixels(self) -> Pixels:
-        """(height, width, 3) uint8: the page as it is seen."""
+        """Return the rendered page, (height, width, 3) uint8."""
         self._renderer.clear()
         self._figure.patch.draw(self._renderer)
         for axes, drawn in self._shown.items():
@@ -79,12 +80,12 @@ class FilmPage(Page):
             self._blocks[key] = np.array(part[::-1]), left, below
         self._new_blocks = {}
         pixels = np.empty((*seen.shape[:2], 3), np.uint8)
-        for colour in range(3):  # a plane at a time: five times as fast as all three at once
+        for colour in range(3):  # one plane at a time: five times as fast as all three at once
             pixels[..., colour] = seen[..., colour]
         return pixels
 
     def add(self, axes: Axes, artist: Artist) -> None:
-        """Draw an artist of the drawing package on the sheet or in a window, in its own measure."""
+        """Draw a matplotlib artist on the sheet or in a window, in its own units."""
         artist.set_figure(self._figure)
         artist.axes = axes
         if not artist.is_transform_set():
@@ -93,7 +94,7 @@ class FilmPage(Page):
         self._draw(axes, artist.zorder, partial(artist.draw, self._renderer))
 
     def once(self, key: Hashable, box: Rect, paint: Callable[[], None]) -> None:
-        """Paint in a box of the sheet where nothing else is; what has a key is always the same."""
+        """Paint in a reserved box; the result is cached by key."""
         if key in self._blocks:
             pixels, left, below = self._blocks[key]
             pen = self._renderer.new_gc()
@@ -112,7 +113,7 @@ class FilmPage(Page):
         )
 
     def write(self, axes: Axes, x: float, y: float, text: str, **look: Any) -> None:
-        """Write on a sheet or in a window, in its own measure."""
+        """Write on a sheet or in a window, in its own units."""
         style = TEXT | look
         style.pop("gid", None)
         text = printable(text)
@@ -132,7 +133,7 @@ class FilmPage(Page):
     def fill(
         self, axes: Axes, outline: Outline, z: float, look: dict[str, Any], gid: str | None = None
     ) -> None:
-        """Fill an outline; ``look`` as of a patch of the drawing package."""
+        """Fill an outline; ``look`` has the attributes of a matplotlib patch."""
         del gid
         alpha = look.get("alpha")
         face = to_rgba(look["facecolor"], alpha)
@@ -152,7 +153,7 @@ class FilmPage(Page):
     def fill_all(
         self, axes: Axes, outlines: Sequence[Outline], z: float, look: dict[str, Any]
     ) -> None:
-        """Draw outlines in one look, as of a patch of the drawing package."""
+        """Draw outlines in one look, with the attributes of a matplotlib patch."""
         alpha = look.get("alpha")
         face, edge = to_rgba(look["facecolor"], alpha), to_rgba(look["edgecolor"], alpha)
         width, scale = look["linewidth"], self.scale(axes)
@@ -170,7 +171,7 @@ class FilmPage(Page):
         self._draw(axes, z, partial(self._renderer.draw_path_collection, pen, *shapes))
 
     def scale(self, axes: Axes) -> Affine2D:
-        """From the measure of the sheet or a window to pixels."""
+        """Return the transform from the units of the sheet or a window to pixels."""
         if axes not in self._scales:
             self._scales[axes] = cast("Affine2D", axes.transData.frozen())
         return self._scales[axes]
@@ -186,7 +187,7 @@ class FilmPage(Page):
         capstyle: str | None = None,
         joinstyle: str | None = None,
     ) -> Any:
-        """The state of the renderer for a look, cut at the borders of a window."""
+        """Return the renderer state for a look, clipped to a window."""
         key = (axes, edge, width, alpha, linestyle, capstyle, joinstyle)
         if key not in self._pens:
             made = self._pens[key] = self._renderer.new_gc()
@@ -202,7 +203,7 @@ class FilmPage(Page):
         return self._pens[key]
 
     def _has_room(self, outline: Outline, scale: Affine2D) -> bool:
-        """Return True for what the drawing package draws as a marker: what is smaller than the page."""
+        """True if an outline is smaller than the page; matplotlib draws these as markers."""
         extents, page = outline.get_extents(scale), self._figure.bbox
         return extents.width < page.width and extents.height < page.height
 
@@ -218,7 +219,7 @@ class FilmPage(Page):
 
 
 class TextSprites:
-    """Texts drawn alone, each on a sheet that is used again: the renderer keeps what it knows of fonts."""
+    """Cache of drawn texts, with one reused sheet."""
 
     def __init__(self, dpi: float) -> None:
         self._dpi = dpi
@@ -226,7 +227,7 @@ class TextSprites:
         self._renderer: Any = RendererAgg(1, 1, dpi)
 
     def drawn(self, text: str, width: float, style: dict[str, Any]) -> Sprite:
-        """A text, and what is under it; ``width`` in pixels, ``style`` as of a text of the drawing package."""
+        """Return a drawn text with its background; ``width`` in pixels, ``style`` of a matplotlib text."""
         around = 3 * style["fontsize"] * self._dpi / 72
         x, y = math.ceil(width + around), math.ceil(around)
         if 2 * x > self._renderer.width or 2 * y > self._renderer.height:
@@ -238,7 +239,7 @@ class TextSprites:
         written.set_transform(IdentityTransform())
         written.draw(sheet)
         pixels = np.asarray(sheet.buffer_rgba())[-2 * y :, : 2 * x]
-        pixels = pixels[::-1]  # as images are drawn, from below
+        pixels = pixels[::-1]  # images are drawn from below
         inked = pixels[..., 3] != 0
         lines, columns = (np.flatnonzero(inked.any(axis=axis)) for axis in (1, 0))
         if not len(lines):
@@ -249,7 +250,7 @@ class TextSprites:
 
 
 def _dashes(linestyle: Any, width: float) -> tuple[float, list[float] | None]:
-    """Start of a dashed line, and its dashes and gaps; pixels of a point each. ``None``: solid."""
+    """Return start, dashes and gaps of a dashed line; pixels. ``None`` means solid."""
     if linestyle is None or isinstance(linestyle, str):
         return 0.0, None
     start, dashes = linestyle

@@ -1,4 +1,4 @@
-"""The ground that a frame stands on: lanes, their markings, crosswalks, scenery; rings, scale and compass."""
+"""Ground of a frame: lanes, markings, crosswalks, scenery; rings, scale and compass."""
 
 from __future__ import annotations
 
@@ -27,20 +27,21 @@ if TYPE_CHECKING:
 
 
 ARROW_SPACING: Final = 14.0
-"""Way between two arrows on a lane; m."""
+"""Distance between two arrows on a lane; m."""
 STOREY_HEIGHT: Final = 4.0
-"""Difference of heights at which one lane is drawn over the other; m. Roads cross above this clearance."""
+"""Least difference of height for drawing one lane above another; m. Clearance between crossing
+roads is larger."""
 MOST_STOREYS: Final = 12
 
 _SHAPES: Final[WeakKeyDictionary[RoadMap, dict[int, tuple[Any, Outline | None]]]] = (
     WeakKeyDictionary()
 )
-"""For each map its outlines in map axes, by row, beside the geometry that they were made of."""
+"""Cached outlines of each map in map axes, by row, with their source geometry."""
 
 
 @dataclass(frozen=True, slots=True)
 class GroundView:
-    """Part of a map that lies in a view.
+    """Part of a map in a view.
 
     Attributes
     ----------
@@ -59,7 +60,7 @@ class GroundView:
 
     @classmethod
     def of(cls, road_map: RoadMap, view: MapWindow) -> GroundView:
-        """The parts of a map that a view, with its corners, can show."""
+        """Return the parts of a map in a view, including its corners."""
         reach = view.radius * math.sqrt(2)
         _, near = road_map.near(np.array([view.x]), np.array([view.y]), reach)
         rows = sorted(set((-1 - near).tolist()))
@@ -67,11 +68,11 @@ class GroundView:
 
     @property
     def nodes(self) -> MapNodes:
-        """All nodes of the map."""
+        """Return all nodes of the map."""
         return self.road_map.nodes
 
     def of_kind(self, *kinds: str) -> list[int]:
-        """Rows in view that are of one of these kinds and have an outline."""
+        """Return rows in view of these kinds with an outline."""
         return [
             r
             for r in self.rows
@@ -79,7 +80,7 @@ class GroundView:
         ]
 
     def storeys(self) -> dict[int, int]:
-        """Rows of the lanes in view → storey, counted from the lowest: what lies above is drawn above."""
+        """Map rows of lanes in view to storeys, counted from the lowest."""
         rows = self.of_kind("lane")
         z = self.nodes.z[rows]
         low, high = np.nanmin(z, initial=np.inf), np.nanmax(z, initial=-np.inf)
@@ -88,9 +89,9 @@ class GroundView:
         return dict(zip(rows, levels.tolist(), strict=True))
 
     def cover(self, places: Floats, z: Floats) -> Floats:
-        """Height of the highest lane above (N, 2) places of the map at heights z; m. -inf: there is none.
+        """Return the height of the highest lane above places (N, 2) at heights z; m. -inf without a lane.
 
-        The height of a lane is that of its cross section that is nearest.
+        The height of a lane is that of its nearest cross section.
         """
         found = np.full(len(places), -np.inf)
         ribbons = self.road_map.ribbons
@@ -111,7 +112,7 @@ class GroundView:
         return found
 
     def outline(self, row: int) -> Outline | None:
-        """A node's outline in picture axes; ``None`` where it encloses nothing."""
+        """Return a node's outline in picture axes, or ``None`` without an area."""
         known = _SHAPES.setdefault(self.road_map, {})
         shape = self.outlines[row]
         if row not in known or known[row][0] is not shape:
@@ -126,16 +127,16 @@ class GroundView:
         )
 
     def open_lines(self, rows: Iterable[int]) -> list[Floats]:
-        """Lines of several nodes that enclose nothing, a barrier's for example; picture axes."""
+        """Return the open lines of several nodes, such as barriers; picture axes."""
         rings = [ring for row in rows for ring in rings_of(self.outlines[row])]
         return [self.view.place(ring) for ring in rings if not _is_closed(ring)]
 
     def outlines_of(self, rows: Iterable[int]) -> list[Outline]:
-        """Outlines of several nodes in picture axes."""
+        """Return the outlines of several nodes in picture axes."""
         return [o for row in rows if (o := self.outline(row)) is not None]
 
     def parts(self, node: int) -> list[int]:
-        """Rows whose outlines a node is made of: its own, or the lanes of a road, junction or roundabout."""
+        """Return the rows with the outlines of a node: its own, or its lanes."""
         row = -1 - node
         if not 0 <= row < len(self.outlines):
             return []
@@ -150,9 +151,9 @@ class GroundView:
         return [row] if self.outlines[row] is not None else []
 
     def sides(self, row: int) -> tuple[Floats, Floats] | None:
-        """Left and right border of a lane in its direction of travel, as (N, 2) picture coordinates.
+        """Return left and right border of a lane in its direction of travel, each (N, 2) in picture axes.
 
-        ``None`` for what is no lane.
+        ``None`` for other nodes.
         """
         ribbons = self.road_map.ribbons
         if not 1 <= row < len(ribbons.offsets):
@@ -163,7 +164,7 @@ class GroundView:
         return self.view.place(left), self.view.place(right)
 
     def middles(self, node: int) -> Floats:
-        """(N, 2) points along the middle of a part of the map, in picture axes; some of them in view."""
+        """Return points (N, 2) along the middle of a map part in view; picture axes."""
         points: list[Floats] = []
         for row in self.parts(node):
             sides = self.sides(row)
@@ -177,9 +178,9 @@ class GroundView:
         return np.concatenate(points) if points else np.empty((0, 2))
 
     def spot(self, node: int) -> tuple[float, float] | None:
-        """A point on a part of the map, well in view, where a name can be written; picture axes.
+        """Return a point on a map part, well inside the view, for its name; picture axes.
 
-        On a lane it lies on the middle line, if possible 8 m or more from the middle of the picture.
+        On a lane it is on the middle line, if possible at least 8 m from the middle of the picture.
         """
         points = self.middles(node)
         points = points[np.abs(points).max(axis=1, initial=0.0) <= 0.88 * self.view.radius]
@@ -187,13 +188,13 @@ class GroundView:
         return _point(points, np.where(away >= 8.0, away, 1e6 - away))
 
     def nearest(self, node: int, to: tuple[float, float]) -> tuple[float, float] | None:
-        """The point along the middle of a part of the map that is nearest to a place; picture axes."""
+        """Return the point along the middle of a map part nearest to a place; picture axes."""
         points = self.middles(node)
         return _point(points, np.hypot(*(points - to).T))
 
 
 def paint_ground(stage: Stage, ground: GroundView, *, arrows: bool = True) -> None:
-    """Lanes by type, borders, arrows in the direction of travel, crosswalks and the scenery of the map."""
+    """Paint lanes by type, borders, direction arrows, crosswalks and the scenery of the map."""
     nodes = ground.nodes
     storeys = ground.storeys()
     for level in range(max(storeys.values(), default=-1) + 1):
@@ -203,7 +204,8 @@ def paint_ground(stage: Stage, ground: GroundView, *, arrows: bool = True) -> No
         stage.fill_all(_stripes(ground, row), palette.CROSSWALK, z=layers.MARKS, edge=0.0)
     for row in ground.of_kind(*SCENERY, "unknown"):
         colour = palette.entity_tint(KINDS[int(nodes.kind[row])])
-        # Props of a map are mostly areas, traffic islands for example: what stands there must show.
+        # Props of a map are often areas, such as traffic islands: objects on them must stay
+        # visible.
         thin = 0.18 if KINDS[nodes.kind[row]] == "prop" else 1.0
         stage.fill_all(ground.outlines_of([row]), colour, z=layers.SCENERY, edge=0.8, alpha=thin)
         stage.lines(ground.open_lines([row]), colour, z=layers.SCENERY, width=1.2)
@@ -223,7 +225,7 @@ def _paint_lanes(
     sides = [side for row in marked if (side := ground.sides(row)) is not None]
     borders = [border for pair in sides for border in pair]
     z += 0.8 * layers.STOREY
-    # Parking spaces lie on lanes or beside them; they have no number among these.
+    # Parking spaces are on lanes or next to them; they have no lane number.
     spaces = [r for r in lanes if types[r] == "parking" and not ground.nodes.lane[r]]
     outlines = ground.outlines_of(spaces)
     stage.fill_all(outlines, palette.lane_tint("parking"), z=z - 0.4 * layers.STOREY)
@@ -235,7 +237,7 @@ def _paint_lanes(
 
 
 def tint(stage: Stage, ground: GroundView, node: int, colour: str, alpha: float) -> None:
-    """Lay a transparent colour over a part of the map; its id in an SVG is that of the node."""
+    """Paint a transparent colour over a map part; its id in an SVG is that of the node."""
     parts = ground.parts(node)
     outlines, gid = ground.outlines_of(parts), f"node-{node}"
     if outlines:
@@ -248,7 +250,7 @@ def tint(stage: Stage, ground: GroundView, node: int, colour: str, alpha: float)
 
 
 def rings_of(geometry: Any) -> list[Floats]:
-    """Rings and lines of a shapely geometry, each (N, 2) float64; points have none."""
+    """Return rings and lines of a shapely geometry, each (N, 2) float64; empty for points."""
     if geometry is None or geometry.is_empty:
         return []
     match geometry.geom_type:
@@ -269,11 +271,11 @@ def _is_closed(ring: Floats) -> bool:
 
 
 def _chevrons(line: Floats) -> list[Floats]:
-    """Arrow heads along a line, evenly spaced; none on what is shorter than half a spacing."""
+    """Return evenly spaced arrow heads along a line; empty for a short line."""
     steps = np.hypot(*np.diff(line, axis=0).T)
     along = np.concatenate(((0.0,), np.cumsum(steps)))
     count = round(along[-1] / ARROW_SPACING)
-    # A lane that is broken into slivers has no room for arrows, one of absurd length needs no more.
+    # A lane in tiny pieces has no room for arrows; a lane of absurd length needs no more.
     if not 1 <= count <= 2000:
         return []
     at = (np.arange(count) + 0.5) * along[-1] / count
@@ -289,7 +291,7 @@ def _chevron(place: Floats, angle: float) -> Floats:
 
 
 def _stripes(ground: GroundView, row: int) -> list[Outline]:
-    """Zebra stripes across the longer axis of a crosswalk: that is the way people walk."""
+    """Return zebra stripes across the longer axis of a crosswalk, the direction of walking."""
     rings = rings_of(ground.outlines[row].minimum_rotated_rectangle)
     if not rings or len(rings[0]) != 5:
         return ground.outlines_of([row])
@@ -307,7 +309,7 @@ def _stripes(ground: GroundView, row: int) -> list[Outline]:
 
 
 def _point(points: Floats, cost: Floats) -> tuple[float, float] | None:
-    """The cheapest of some points."""
+    """Return the point with the least cost."""
     if not len(points):
         return None
     x, y = points[cost.argmin()].tolist()
@@ -315,7 +317,7 @@ def _point(points: Floats, cost: Floats) -> tuple[float, float] | None:
 
 
 def _dense(line: Floats) -> Floats:
-    """A line with a point every few metres, so that some of a long lane's lie in view."""
+    """Add points to a line every few metres, so that some points of a long lane are in view."""
     steps = np.hypot(*np.diff(line, axis=0).T)
     along = np.concatenate(((0.0,), np.cumsum(steps)))
     at = np.linspace(0.0, along[-1], int(np.clip(along[-1] / 2.0, 2, 1000)))
@@ -329,7 +331,7 @@ _SMALL: Final = {"fontsize": 6.5, "ha": "center"}
 
 
 def paint_rings(stage: Stage) -> list[Rect]:
-    """Faint circles about the middle, for the eye to measure by; returns the room of their figures."""
+    """Paint faint distance circles around the middle; return the space of their labels."""
     taken: list[Rect] = []
     for metres in (10, 25, 50, 100, 200):
         if metres > stage.view.radius * 1.05:
@@ -352,7 +354,7 @@ def paint_rings(stage: Stage) -> list[Rect]:
 
 
 def paint_scale(stage: Stage) -> Rect:
-    """A bar of a round length in the lower left corner; returns the room it takes."""
+    """Paint a scale bar of a round length in the lower left corner; return its space."""
     half_x, half_y = stage.half
     metres = max(m for m in _LENGTHS if m <= max(1.0, min(half_x, half_y) / 2.2))
     margin, tick = 12 * stage.metre, 3 * stage.metre
@@ -364,7 +366,7 @@ def paint_scale(stage: Stage) -> Rect:
 
 
 def paint_compass(stage: Stage) -> Rect:
-    """A needle to the north in the upper right corner; returns the room it takes."""
+    """Paint a north arrow in the upper right corner; return its space."""
     reach = min(11 * stage.metre, 0.05 * min(stage.half))
     middle = np.array(stage.half) - 1.8 * reach
     angle = stage.view.angle(math.pi / 2)

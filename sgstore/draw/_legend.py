@@ -1,4 +1,4 @@
-"""The legend: an entry for each sign that occurs in a picture, and for no other."""
+"""Legend: one entry for each sign in a picture."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ Sign = Literal[
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A sign and what it means.
+    """Sign with its meaning.
 
     Attributes
     ----------
     sign : str
-        Shape of the sign; ``word`` has none.
+        Shape of the sign; empty for ``word``.
     text : str
-        What it means.
+        Its meaning.
     colour : str
-        Of the sign; of a lamp: what it shows.
+        Colour of the sign; for a lamp, its state.
     width : float
-        Of a line; points.
+        Line width; points.
     is_long : bool
-        Whether the text needs the width of the panel.
+        True if the text needs the full width of the panel.
     """
 
     sign: Sign
@@ -56,7 +56,7 @@ class Entry:
 
 
 def entries_of(scene: DrawnFrame, half: tuple[float, float]) -> list[Entry]:
-    """Entries for a frame, in a window of ``half`` its width and height; m."""
+    """Return entries for a frame, in a window of ``half`` its width and height; m."""
     bodies = [b for b in scene.bodies.values() if abs(b.x) <= half[0] and abs(b.y) <= half[1]]
     kinds = {b.kind for b in bodies if not b.is_ego}
     entries = [Entry("box", "ego", palette.EGO)] if any(b.is_ego for b in bodies) else []
@@ -79,7 +79,7 @@ def entries_of(scene: DrawnFrame, half: tuple[float, float]) -> list[Entry]:
 
 
 def ground_entries(ground: GroundView) -> list[Entry]:
-    """Entries for the lane types, crosswalks and scenery of a map that lie in view."""
+    """Return entries for lane types, crosswalks and scenery in view."""
     by_tint: dict[str, list[str]] = {}
     types = {ground.nodes.lane_type[row] for row in ground.of_kind("lane")}
     for lane_type in sorted(types, key=lambda t: (t not in palette.TRAVELLED, t)):
@@ -92,7 +92,7 @@ def ground_entries(ground: GroundView) -> list[Entry]:
 
 
 def paint_swatch(page: Page, entry: Entry, at: tuple[float, float]) -> None:
-    """Draw an entry's sign about a point of the sheet; points."""
+    """Draw an entry's sign at a point of the sheet; points."""
     for artist in _swatch(entry, *at):
         page.add(page.sheet, artist)
 

@@ -1,4 +1,4 @@
-"""The page: drawing primitives, drawing order, and PNG and SVG output."""
+"""Page: drawing primitives, drawing order, and PNG and SVG output."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ Rect = tuple[float, float, float, float]
 WINDOW: Final = 0.0
 LANES: Final = 1.0
 STOREY: Final = 0.03
-"""Between one storey of roads and the next; the highest is below the tints."""
+"""Distance between two storeys of roads in drawing order; the highest is below the tints."""
 TINTS: Final = 1.4
 MARKS: Final = 1.6
 SCENERY: Final = 1.8
@@ -61,23 +61,24 @@ CAPTIONS: Final = 7.0
 FURNITURE: Final = 9.0
 
 
-# Pictures with 256 colours where that is enough: a third of the bytes, and the eye sees no difference ----
-# A drawing has few colours on its areas and thousands of mixtures along its edges. The commonest keep their
-# own place in the palette, so that areas stay exactly as they were drawn; the other places go to those colours
-# that are furthest from all chosen so far, so that no mixture is moved far. Photographs stay as they are.
-# No quantiser of Pillow does both: each of them changes the colours of areas (10 to 60 of the 64 commonest).
+# Pictures use 256 colours if that is enough: a third of the bytes, without a visible difference. A
+# drawing has few colours on its areas, and thousands of mixed colours along its edges. The most
+# frequent colours keep their places in the palette, so that areas do not change. The other places
+# go to the colours furthest from all chosen ones, so that mixed colours change little. Photographs
+# stay as they are. Pillow's quantisers do not have both properties: each changes the colours of
+# areas (10 to 60 of the 64 most frequent).
 
 PLACES: Final = 256
 COMMONEST: Final = 64
-"""Places of the palette that go to the commonest colours."""
+"""Places of the palette for the most frequent colours."""
 MOST_COLOURS: Final = 50_000
-"""A picture with more colours than this is a photograph."""
+"""A picture with more colours is a photograph."""
 FURTHEST: Final = 24.0
-"""Greatest distance in RGB, of 0 … 255 each, that a mixture may be moved."""
+"""Greatest change of a mixed colour; distance in RGB, 0 … 255 each."""
 
 
 def indexed(picture: Image.Image) -> Image.Image:
-    """An RGB picture with a palette, or the picture itself where 256 colours are not enough."""
+    """Convert an RGB picture to an indexed one, or return it if 256 colours are not enough."""
     counted = picture.getcolors(MOST_COLOURS)
     if counted is None:
         return picture
@@ -92,7 +93,7 @@ def indexed(picture: Image.Image) -> Image.Image:
 
 
 def with_palette(places: Pixels, colours: Colours) -> Image.Image:
-    """A picture of places in a palette."""
+    """Return an indexed picture with this palette."""
     made = Image.fromarray(places)
     made.putpalette(colours.astype(np.uint8).tobytes())
     return made
@@ -101,27 +102,27 @@ def with_palette(places: Pixels, colours: Colours) -> Image.Image:
 def grown(
     palette: Colours, colours: Colours, most: int = PLACES, enough: float = 0.0
 ) -> tuple[Colours, NDArray[np.intp], float]:
-    """A palette with more of some colours, each time the one that is furthest from all that are in it.
+    """Add colours to a palette, each time the one furthest from all of its colours.
 
     Parameters
     ----------
     palette, colours : (N, 3) float32
-        Whole numbers up to 255: squares of their distances are exact.
+        Integers up to 255: squares of their distances are exact.
     most : int
-        Places of the palette.
+        Size of the palette.
     enough : float
-        Distance from which on a colour needs no place of its own.
+        Distance up to which a colour needs no own place.
 
     Returns
     -------
     palette : (N, 3) float32
     nearest : (N,) intp
-        Place of each colour's nearest one.
+        Nearest place of each colour.
     furthest : float
-        Greatest distance of a colour from its nearest one.
+        Greatest distance of a colour from its nearest place.
     """
     squares = (colours * colours).sum(axis=1)
-    # Of each colour's distances what is the same for all of them is added to the least one alone.
+    # The common term of a colour's distances is added only to the least one.
     away = colours @ (-2 * palette.T)
     away += (palette * palette).sum(axis=1)
     nearest = away.argmin(axis=1)
@@ -137,25 +138,24 @@ def grown(
 
 
 def packed(colours: NDArray[np.generic]) -> NDArray[np.int32]:
-    """Each colour, red, green and blue, as one number."""
+    """Pack each colour (red, green, blue) into one integer."""
     red, green, blue = (colours[..., axis].astype(np.int32) for axis in range(3))
     return 65536 * red + 256 * green + blue
 
 
 # The sheet of paper: the only room that knows how pictures are written --------------------------
-# A page is measured in points (1/72 inch) from its lower left corner; a stage is a window on the map
-# upon it, measured in metres. Drawing goes through figures of their own, never through global state;
-# what a user's configuration of the drawing package says does not reach the picture, so that the same
-# frame gives the same bytes.
+# A page is measured in points (1/72 inch) from its lower left corner. A stage is a window of the
+# map on the page, measured in metres. Each drawing has its own figure, without global state. The
+# user's matplotlib configuration has no effect, so that the same frame gives the same bytes.
 
 DPI: Final = 130
 FORMATS: Final = (".png", ".svg")
 TEXT: Final[dict[str, Any]] = {"fontsize": 7.0, "color": INK, "va": "baseline"}
-"""How texts look if nothing else is said."""
+"""Default look of texts."""
 PICTURE_PIXELS: Final = 64_000_000
-"""Most pixels of a camera picture that is opened."""
+"""Greatest number of pixels of a camera picture."""
 PICTURE_SIDE: Final = 640
-"""Longest side to which a camera picture is reduced; pixels."""
+"""Longest side of a reduced camera picture; pixels."""
 
 _STYLE: Final = (
     "font.",
@@ -180,18 +180,18 @@ _ONE_AT_A_TIME: Final = threading.RLock()
 
 @contextmanager
 def own_style() -> Generator[None]:
-    """Draw in the style of this house, whatever the user's configuration says; restores it afterwards."""
-    # The package keeps its settings for the whole process: two pictures at once would mix them.
+    """Use the fixed style of this package, then restore the user's configuration."""
+    # matplotlib has one configuration per process: two pictures at once would mix them.
     with _ONE_AT_A_TIME, mpl.rc_context():
-        dict.update(mpl.rcParams, _style())  # they were looked at before
+        dict.update(mpl.rcParams, _style())  # the values are already validated
         yield
 
 
 @cache
 def _style() -> dict[Any, Any]:
-    """The settings of the drawing package for pictures of this house, as it keeps them."""
+    """Return the matplotlib settings of this package's pictures, validated."""
     style: dict[Any, Any] = {k: v for k, v in mpl.rcParamsDefault.items() if k.startswith(_STYLE)}
-    # At this size letters look better unhinted, and are faster.
+    # At this size unhinted letters look better and are faster.
     style |= {"svg.fonttype": "none", "svg.hashsalt": "sgstore", "text.hinting": "none"}
     with mpl.rc_context(style):
         return {name: mpl.rcParams[name] for name in style}
@@ -199,7 +199,7 @@ def _style() -> dict[Any, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """A window on the map upon a page.
+    """Window of the map on a page.
 
     Attributes
     ----------
@@ -209,7 +209,7 @@ class Stage:
     half : (float, float)
         Half its width and height; m.
     points : float
-        Points of the page in a metre.
+        Points of the page per metre.
     page : Page
     """
 
@@ -221,11 +221,11 @@ class Stage:
 
     @property
     def metre(self) -> float:
-        """Metres in one point: sizes that are meant for the eye are given in points."""
+        """Return the metres per point, for sizes in points."""
         return 1.0 / self.points
 
     def rect(self, half_x: float, half_y: float, middle: tuple[float, float]) -> Rect:
-        """A rectangle of the window, given in metres, in points of the page from the window's middle."""
+        """Convert a rectangle of the window from metres to points from the window's middle."""
         (x, y), scale = middle, self.points
         return (
             (x - half_x) * scale,
@@ -235,13 +235,13 @@ class Stage:
         )
 
     def shows(self, x: float, y: float) -> bool:
-        """Return True for a point in the window."""
+        """True for a point in the window."""
         return abs(x) <= self.half[0] and abs(y) <= self.half[1]
 
     def fill(
         self, outline: Outline, colour: str, *, z: float, gid: str | None = None, **look: Any
     ) -> None:
-        """Fill an outline; ``look`` goes to the patch."""
+        """Fill an outline; ``look`` is for the patch."""
         look = {"facecolor": colour, "linewidth": 0.0, **look}
         self.page.fill(self.axes, outline, z, look, gid)
 
@@ -254,7 +254,7 @@ class Stage:
         edge: float = 0.4,
         alpha: float = 1.0,
     ) -> None:
-        """Fill many outlines with one colour, with a hairline of the same that closes the seams."""
+        """Fill many outlines with one colour, and a hairline of this colour to close seams."""
         if outlines:
             look = {"facecolor": colour, "edgecolor": colour, "linewidth": edge, "alpha": alpha}
             self.page.fill_all(self.axes, list(outlines), z, look)
@@ -262,7 +262,7 @@ class Stage:
     def lines(
         self, lines: Sequence[Floats], colour: str, *, z: float, width: float, **look: Any
     ) -> None:
-        """Draw many lines of (N, 2) picture coordinates in one look."""
+        """Draw many lines (N, 2) in picture axes in one look."""
         if lines:
             look |= {"facecolor": "none", "edgecolor": colour, "linewidth": width}
             self.page.fill_all(self.axes, [Outline(line) for line in lines], z, look)
@@ -273,14 +273,14 @@ class Stage:
 
 
 class Page:
-    """A sheet of paper.
+    """Sheet of paper.
 
     Parameters
     ----------
     width, height : float
-        In points.
+        Size in points.
     dpi : float
-        Pixels of an inch, where it is drawn in pixels.
+        Pixels per inch, for pixel output.
     """
 
     def __init__(self, width: float, height: float, dpi: float = DPI) -> None:
@@ -294,7 +294,7 @@ class Page:
         self.sheet.set_ylim(0, height)
 
     def stage(self, box: Rect, view: MapWindow) -> Stage:
-        """A window upon the page; ``view.radius`` is half its shorter side.
+        """Return a window on the page; ``view.radius`` is half its shorter side.
 
         Parameters
         ----------
@@ -315,13 +315,13 @@ class Page:
         return stage
 
     def add(self, axes: Axes, artist: Artist) -> None:
-        """Draw an artist of the drawing package on the sheet or in a window, in its own measure."""
+        """Draw a matplotlib artist on the sheet or in a window, in its own units."""
         axes.add_artist(artist)
 
     def fill(
         self, axes: Axes, outline: Outline, z: float, look: dict[str, Any], gid: str | None = None
     ) -> None:
-        """Fill an outline; ``look`` as of a patch of the drawing package."""
+        """Fill an outline; ``look`` has the attributes of a matplotlib patch."""
         patch = PathPatch(outline, zorder=z, **look)
         patch.set_gid(gid)
         self.add(axes, patch)
@@ -329,15 +329,15 @@ class Page:
     def fill_all(
         self, axes: Axes, outlines: Sequence[Outline], z: float, look: dict[str, Any]
     ) -> None:
-        """Draw outlines in one look, as of a patch of the drawing package."""
+        """Draw outlines in one look, with the attributes of a matplotlib patch."""
         each = {f"{name}s": [look[name]] for name in ("facecolor", "edgecolor", "linewidth")}
         rest = {name: value for name, value in look.items() if f"{name}s" not in each}
         self.add(axes, PathCollection(outlines, zorder=z, **each, **rest))
 
     def once(self, key: Hashable, box: Rect, paint: Callable[[], None]) -> None:
-        """Paint in a box of the sheet where nothing else is; what has a key is always the same.
+        """Paint in a reserved box; content with the same key is the same.
 
-        A page that is drawn again and again paints it only once.
+        A reusable page paints it only once.
         """
         del key, box
         paint()
@@ -345,22 +345,22 @@ class Page:
     def text(self, x: float, y: float, text: str, **look: Any) -> None:
         """Write on the sheet.
 
-        The text is taken as it stands: no markup is interpreted, whatever it holds.
+        Markup in the text is not interpreted.
         """
         self.write(self.sheet, x, y, text, **look)
 
     def write(self, axes: Axes, x: float, y: float, text: str, **look: Any) -> None:
-        """Write on a sheet or in a window, in its own measure."""
+        """Write on a sheet or in a window, in its own units."""
         gid = look.pop("gid", None)
         axes.text(x, y, printable(text), parse_math=False, **(TEXT | look)).set_gid(gid)
 
     def text_size(self, text: str, size: float, weight: str = "normal") -> tuple[float, float]:
-        """Width and height of a text; points."""
+        """Return width and height of a text; points."""
         width, height = _text_size(printable(text), size, weight, self._dpi)
         return width * 72 / self._dpi, height * 72 / self._dpi
 
     def plot(self, left: float, bottom: float, right: float, top: float) -> Axes:
-        """Axes of a chart upon the page; its sides in points of the page, without numbers and names."""
+        """Return the axes of a chart on the page; the box in points, without axis labels."""
         box = (left, bottom, right - left, top - bottom)
         axes = self._figure.add_axes(self._share(*box))
         axes.spines[["top", "right"]].set_visible(False)
@@ -371,7 +371,7 @@ class Page:
         return axes
 
     def legend(self, handles: list[Any], at: tuple[float, float], loc: str, **look: Any) -> None:
-        """Explain some artists on the sheet; ``at`` is where the corner ``loc`` of the legend lies."""
+        """Paint a legend for artists on the sheet; its corner ``loc`` is at ``at``."""
         style: dict[str, Any] = {
             "ncols": 3,
             "labelcolor": INK,
@@ -385,12 +385,12 @@ class Page:
     def picture(
         self, picture: bytes, left: float, top: float, width: float, height: float
     ) -> float:
-        """Lay a camera picture on the sheet, in a width and height at most; returns its height in points.
+        """Paint a camera picture within a width and height; return its height in points.
 
         Raises
         ------
         ExportError
-            If it is neither JPEG nor PNG, is damaged, or has too many pixels.
+            The picture is neither JPEG nor PNG, is damaged, or has too many pixels.
         """
         pixels = _decoded(picture)
         scale = min(width / pixels.shape[1], height / pixels.shape[0])
@@ -401,12 +401,12 @@ class Page:
         return height
 
     def save(self, to: str | Path) -> None:
-        """Write the page as PNG or SVG, as the ending says; a picture that is there is replaced.
+        """Write the page as PNG or SVG, by the file ending; an existing file is replaced.
 
         Raises
         ------
         ExportError
-            If the ending is another, or the file cannot be written.
+            The ending is unknown, or the file cannot be written.
         """
         drawn = self._svg() if check_format(to) == "svg" else self._png()
         write_bytes(to, drawn)
@@ -417,7 +417,7 @@ class Page:
         return written.getvalue()
 
     def pixels(self) -> NDArray[np.uint8]:
-        """(height, width, 3) uint8: the page as it is seen."""
+        """Return the rendered page, (height, width, 3) uint8."""
         self._canvas.draw()
         return np.ascontiguousarray(np.asarray(self._canvas.buffer_rgba())[..., :3])
 
@@ -430,7 +430,7 @@ class Page:
         axes = self._figure.add_axes(self._share(left, bottom, width, height))
         axes.set_axis_off()
         axes.set_autoscale_on(False)
-        # Each artist that is clipped asks for it, and would have it made anew; it follows the axes by itself.
+        # Each clipped artist would make its own transform; this one follows the axes.
         transform = axes.patch.get_transform()
         axes.patch.get_transform = lambda: transform
         return axes
@@ -441,13 +441,13 @@ class Page:
 
 @cache
 def _ruler(dpi: float) -> RendererAgg:
-    """A renderer that measures texts and draws nothing."""
+    """Return a renderer that only measures texts."""
     return RendererAgg(1, 1, dpi)
 
 
 @lru_cache(maxsize=4096)
 def _text_size(text: str, size: float, weight: str, dpi: float) -> tuple[float, float]:
-    """Width and height; pixels."""
+    """Return width and height; pixels."""
     font = FontProperties(size=size, weight=weight)
     ismath = False
     width, height, _ = _ruler(dpi).get_text_width_height_descent(text, font, ismath)
@@ -455,7 +455,7 @@ def _text_size(text: str, size: float, weight: str, dpi: float) -> tuple[float, 
 
 
 def check_format(to: str | Path) -> str:
-    """``png`` or ``svg``, by the ending of a file's name."""
+    """Return ``png`` or ``svg``, by the file ending."""
     to = Path(to)
     if to.suffix.lower() not in FORMATS:
         raise ExportError(
@@ -465,7 +465,7 @@ def check_format(to: str | Path) -> str:
 
 
 def printable(text: str) -> str:
-    """A text in characters that the font has; ``□`` for others."""
+    """Replace characters that the font lacks by ``□``."""
     known = _characters()
     return "".join(c if ord(c) in known else "□" for c in clean(text, 200))
 
@@ -485,30 +485,30 @@ def _decoded(picture: bytes) -> np.ndarray[Any, np.dtype[np.uint8]]:
             image.draft("RGB", (PICTURE_SIDE, PICTURE_SIDE))
             image.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
             return np.asarray(image.convert("RGB"))
-    # Decoders of untrusted bytes fail in many ways: each of them means an unusable picture.
+    # Decoders of untrusted bytes fail in many ways: each error means an unusable picture.
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise ExportError(f"the camera picture is not a readable JPEG or PNG: {error}") from error
 
 
 # Placement of texts: beside what they name, on top of nothing that matters ----------------------
-# Greedy: texts come in the order of their weight, each takes the first free place around its anchor,
-# and one that finds none is left out. All measures are points of the page.
+# Greedy placement: texts come in order of importance, each takes the first free place around its
+# anchor, and a text without a free place is left out. All measures are points of the page.
 
 _ROUND: Final = tuple(
     math.radians(a) for a in (0, 180, 30, -30, 150, -150, 90, -90, 60, 120, -60, -120)
 )
 _STEPS: Final = (2.0, 8.0, 16.0, 26.0)
 _CLEAR: Final = 4.0
-"""By how much a name is nearer to its own thing than to any other, where there is room; points."""
+"""Least distance by which a name must be nearer to its own object than to others; points."""
 
 
 class Placer:
-    """Free and taken room in a window.
+    """Free and taken space in a window.
 
     Parameters
     ----------
     bounds : Rect
-        The window; no text leaves it.
+        The window; texts stay inside it.
     """
 
     def __init__(self, bounds: Rect) -> None:
@@ -517,7 +517,7 @@ class Placer:
         self._things: list[Rect] = []
 
     def stand(self, x: float, y: float, reach: tuple[float, float]) -> None:
-        """Take note of a thing that has a name, or could: names of others are not put nearer to it."""
+        """Register an object with a possible name, so that other names keep a distance."""
         self._things.append(_around(x, y, reach))
 
     def block(self, rect: Rect) -> None:
@@ -527,30 +527,30 @@ class Placer:
     def beside(
         self, x: float, y: float, reach: tuple[float, float], size: tuple[float, float]
     ) -> tuple[float, float] | None:
-        """The middle of a free place for a text beside a thing, near first; taken at once.
+        """Reserve the nearest free place for a text at an object; return its middle.
 
         Parameters
         ----------
         x, y : float
-            Middle of the thing.
+            Middle of the object.
         reach : (float, float)
-            How far the thing extends from there, to its sides and up and down.
+            Extent of the object, horizontal and vertical.
         size : (float, float)
             Width and height of the text.
 
         Returns
         -------
         (float, float) or None
-            ``None`` if there is no room.
+            ``None`` means no room.
         """
         return self.first_free(_spots(x, y, reach, size), size)
 
     def named(
         self, x: float, y: float, reach: tuple[float, float], size: tuple[float, float]
     ) -> tuple[tuple[float, float], bool] | None:
-        """The same for the name of a thing, and whether the name is clearly its own.
+        """Reserve a place for a name; the flag is True if no other object is as near.
 
-        It is if nothing else is about as near to it; such a place comes before all others.
+        Places with a clear owner have priority.
         """
         spots = _spots(x, y, reach, size)
         own = _around(x, y, reach)
@@ -568,7 +568,7 @@ class Placer:
     def along(
         self, a: tuple[float, float], b: tuple[float, float], size: tuple[float, float]
     ) -> tuple[float, float] | None:
-        """The middle of a free place for a text on the line from ``a`` to ``b``; taken at once."""
+        """Reserve a place for a text on the line from ``a`` to ``b``; return its middle."""
         spots = [
             (a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1]))
             for t in (0.55, 0.65, 0.45, 0.75, 0.35)
@@ -578,7 +578,7 @@ class Placer:
     def first_free(
         self, spots: list[tuple[float, float]], size: tuple[float, float]
     ) -> tuple[float, float] | None:
-        """The first of some spots that is free for a text of a size; taken at once."""
+        """Reserve the first free place for a text of this size, or return None."""
         middles = np.array(spots)
         half = np.array(size) / 2
         low, high = middles - half, middles + half
@@ -598,7 +598,7 @@ class Placer:
 def _spots(
     x: float, y: float, reach: tuple[float, float], size: tuple[float, float]
 ) -> list[tuple[float, float]]:
-    """Middles of texts around a thing, near first."""
+    """Return middles of texts around an object, nearest first."""
     half_w, half_h = size[0] / 2, size[1] / 2
     return [
         (
@@ -615,7 +615,7 @@ def _around(x: float, y: float, reach: tuple[float, float]) -> Rect:
 
 
 def _gaps(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances (n, m) of rectangles (n, 4) and (m, 4); 0 where they meet."""
+    """Return distances (n, m) of rectangles (n, 4) and (m, 4); 0 for overlaps."""
     apart = np.maximum(one[:, None, :2] - other[:, 2:], other[:, :2] - one[:, None, 2:])
     return np.hypot(*np.moveaxis(np.maximum(apart, 0.0), -1, 0))
 

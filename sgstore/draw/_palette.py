@@ -1,8 +1,8 @@
-"""Colours and short explanations: what a person sees for each kind, lane type, light and relation.
+"""Colours and captions of kinds, lane types, lights and relations.
 
-The families are those of the paper's figures: roads blue-grey, entities magenta, the ego orange.
-Nothing is told by hue alone: kinds also differ in lightness, shape and caption, a traffic light by
-which of its three lamps is lit, closeness by the width of the line.
+The colour families are those of the paper's figures: roads blue-grey, entities magenta, the ego
+orange. Hue is never the only difference: kinds also differ in lightness, shape and caption, traffic
+lights by the position of the lit lamp, closeness by line width.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ DIAGRAM_TINTS: Final[Mapping[str, str]] = {
     "junction": "#1d3a66",
     "roundabout": "#1d3a66",
 }
-"""Nodes of a diagram that are parts of the map; entities have their own colours."""
+"""Diagram nodes of map parts; entities have their own colours."""
 
 TRAVELLED: Final = frozenset(
     (
@@ -54,7 +54,7 @@ TRAVELLED: Final = frozenset(
         *("slipLane", "bus", "taxi", "HOV"),
     )
 )
-"""Lane types that motor traffic travels on: these have markings, and arrows along their centre lines."""
+"""Lane types for motor traffic: they have markings, and arrows along their centre lines."""
 
 LANE_TINTS: Final[Mapping[str, str]] = {
     **dict.fromkeys(TRAVELLED, "#c9d2df"),
@@ -70,9 +70,9 @@ LANE_TINTS: Final[Mapping[str, str]] = {
     "restricted": "#ebd0c6",
     "none": "#e7eae9",
 }
-"""Tint of each OpenDRIVE lane type; :func:`lane_tint` knows what to do with any other.
+"""Tint of each OpenDRIVE lane type; :func:`lane_tint` handles unknown types.
 
-All are so light that dark texts can be read on them, and any two can be told apart (a test measures it).
+All tints are light enough for dark text, and any two are distinguishable (tested).
 """
 
 ENTITY_TINTS: Final[Mapping[str, str]] = {
@@ -99,7 +99,7 @@ LIGHT_TINTS: Final[Mapping[str, tuple[str, str, str]]] = {
     "off": ("#5a626f", "#5a626f", "#5a626f"),
     "unknown": ("#8d95a3", "#8d95a3", "#8d95a3"),
 }
-"""The three lamps of a traffic light, from the top, by what it shows."""
+"""The three lamps of a traffic light, from the top, by state."""
 
 SIGNAL_TINTS: Final[Mapping[str, str]] = {
     "traffic_light": INK,
@@ -108,7 +108,7 @@ SIGNAL_TINTS: Final[Mapping[str, str]] = {
     "speed_limit": "#2f6fb0",
     "sign": "#8d95a3",
 }
-"""Dots of signals on a whole map, where there is no room for their shapes."""
+"""Dots of signals on a complete map, without room for their shapes."""
 
 LIGHT_EDGES: Final[Mapping[str, str]] = {
     "red": "#e5383b",
@@ -132,14 +132,14 @@ CLOSENESS: Final[Mapping[str, tuple[str, float]]] = dict(
         strict=True,
     )
 )
-"""Colour and width (points) of the line for each proximity relation, the closest first."""
+"""Colour and width (points) of the line for each proximity relation, closest first."""
 
 
 def lane_tint(lane_type: str) -> str:
-    """Tint of a lane type; that of ``none`` for one that OpenDRIVE does not list."""
+    """Return the tint of a lane type; an unknown type has the tint of ``none``."""
     return LANE_TINTS.get(lane_type, LANE_TINTS["none"])
 
 
 def entity_tint(kind: str, *, ego: bool = False) -> str:
-    """Colour of an entity; the ego's whatever its kind."""
+    """Return the colour of an entity; the ego has its own colour."""
     return EGO if ego else ENTITY_TINTS.get(kind, ENTITY_TINTS["unknown"])

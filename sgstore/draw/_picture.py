@@ -1,11 +1,11 @@
-"""Frames and maps as pictures, PNG or SVG by the ending of the file's name.
+"""Pictures of frames and maps, as PNG or SVG by the file ending.
 
-A frame is seen from above with the ego in the middle, heading up. A picture is made for a person who
-has never seen this project: whatever occurs in it is explained beside it, and nothing else is. A file
-that is there already is replaced. The same input gives the same bytes.
+A frame is seen from above, with the ego in the middle and its heading up. The legend explains every
+sign in a picture, and only these, for readers who do not know this project. An existing file is
+replaced. The same input gives the same bytes.
 
-Texts that come from traces are cut and shown as they stand; no markup in them is interpreted. In an
-SVG, texts are texts, and the groups of nodes have the ids ``node-17``, ``halo-17``, ``label-17``.
+Texts from traces are cut and shown literally; markup in them is not interpreted. In an SVG, texts
+are texts, and the groups of nodes have the ids ``node-17``, ``halo-17``, ``label-17``.
 """
 
 from __future__ import annotations
@@ -60,31 +60,31 @@ def draw_frame(  # noqa: PLR0913  one option for each thing that people ask of a
     ----------
     graph : SceneGraph
     road_map : RoadMap or None
-        The ground; without one there are entities only.
+        The ground; without a map only entities are drawn.
     to : str or Path
-        ``….png`` or ``….svg``; a file that is there is replaced.
+        ``….png`` or ``….svg``; an existing file is replaced.
     highlight : mapping of str to int, or sequence of int
-        Matched nodes, by the variables they are bound to or alone. Ids that are not in the graph are
-        named beside the picture as not in it.
+        Matched nodes, by variable or as a list. The panel names ids outside the graph as missing.
     picture : bytes, optional
-        A camera picture, JPEG or PNG, to put beside it.
+        Camera picture for the panel, JPEG or PNG.
     radius : float, optional
-        Half the side of the window; m. By default what shows the entities, 30 to 60 m.
+        Half the side of the window; m. By default it fits the entities, 30 to 60 m.
     title : str, optional
         By default trace, frame and time.
     relations : {"ego", "all", "none"}
-        ``ego``: what is near the ego, and all that holds among matched nodes.
+        ``ego``: proximity to the ego, and all relations among matched nodes; ``all``: every
+        relation.
     north_up : bool
-        Otherwise the ego's heading is up.
+        True for north up; by default the ego's heading is up.
     diagram : bool
-        Beside it the graph as nodes and edges; then there is no camera picture.
+        True for the graph as nodes and edges in the panel, without the camera picture.
 
     Raises
     ------
     ExportError
-        If the ending is another, the file cannot be written, or the camera picture cannot be read.
+        The ending is unknown, the file cannot be written, or the camera picture cannot be read.
     MissingExtraError
-        If the drawing packages are not installed.
+        The drawing packages are not installed.
     """
     with drawing(to):
         from sgstore.draw._scene import DrawnFrame
@@ -106,9 +106,10 @@ def frame_page(
     entries: Sequence[Entry] | None = None,
     blank: Callable[[float, float], Page] | None = None,
 ) -> Page:
-    """The view from above, and beside it what a camera saw, what was matched, what is around, the legend.
+    """Return a page with the view from above, and a panel of camera picture, matches, surroundings, legend.
 
-    ``entries``: the legend, by default of what occurs; ``blank``: gives a page of a width and a height.
+    ``entries``: the legend, by default of the occurring signs; ``blank``: function that makes a
+    page of a width and height.
     """
     from sgstore.draw._page import Page
     from sgstore.draw._scene import paint_scene
@@ -128,7 +129,7 @@ def diagram_page(
     entries: Sequence[Entry] | None = None,
     blank: Callable[[float, float], Page] | None = None,
 ) -> Page:
-    """The view from above, beside it the graph as nodes and edges, the legend below; see :func:`frame_page`."""
+    """Return a page with the view from above, the node-link diagram and the legend; see :func:`frame_page`."""
     from sgstore.draw._atlas import key_height, paint_key
     from sgstore.draw._diagram import diagram_entries, paint_diagram
     from sgstore.draw._legend import entries_of
@@ -153,7 +154,7 @@ def diagram_page(
 
 
 def draw_map(road_map: RoadMap, to: str | Path, *, title: str | None = None) -> None:
-    """Draw a whole map, north up: lanes by type, junctions, crosswalks and signals.
+    """Draw a complete map, north up: lanes by type, junctions, crosswalks and signals.
 
     Parameters
     ----------
@@ -166,9 +167,9 @@ def draw_map(road_map: RoadMap, to: str | Path, *, title: str | None = None) -> 
     Raises
     ------
     ExportError
-        If the ending is another, the file cannot be written, or the map has no lanes.
+        The ending is unknown, the file cannot be written, or the map has no lanes.
     MissingExtraError
-        If the drawing packages are not installed.
+        The drawing packages are not installed.
     """
     with drawing(to):
         from sgstore.draw._atlas import paint_atlas
@@ -182,9 +183,10 @@ def draw_map(road_map: RoadMap, to: str | Path, *, title: str | None = None) -> 
 
 
 def title_of(graph: SceneGraph, start_ns: int | None = None) -> str:
-    """Trace, number of the frame, and its time.
+    """Return the trace, the frame number, and the frame's time.
 
-    The time is ``t``, if the start of the trace is known. A time that is a date is shown as such, too.
+    The time is relative (``t``) if the start of the trace is known. An absolute date is shown as
+    well.
     """
     dated = graph.time_ns > _NS_OF_A_YEAR
     parts = [clean(graph.trace), f"frame {graph.seq}"]
@@ -197,7 +199,7 @@ def title_of(graph: SceneGraph, start_ns: int | None = None) -> str:
 
 
 def check_installed() -> None:
-    """Refuse to go on without the drawing packages.
+    """Raise an error if the drawing packages are not installed.
 
     Raises
     ------
@@ -214,12 +216,12 @@ def check_installed() -> None:
 
 @contextmanager
 def drawing(to: str | Path) -> Generator[None]:
-    """Draw a picture for a file in the style of this house; refuse at once what could not be written.
+    """Set up the style for drawing a file; raise errors before the drawing starts.
 
     Raises
     ------
     ExportError
-        The ending is none of a picture.
+        The ending is not a picture format.
     MissingExtraError
         The drawing packages are not installed.
     """
@@ -232,7 +234,7 @@ def drawing(to: str | Path) -> Generator[None]:
 
 
 def checked(radius: float | None) -> float | None:
-    """A radius that a user gave, if it is one; m.
+    """Validate a radius from the user; m.
 
     Raises
     ------
@@ -245,7 +247,7 @@ def checked(radius: float | None) -> float | None:
 
 
 def matched_nodes(highlight: Mapping[str, int] | Sequence[int]) -> dict[int, str]:
-    """Node id → variables that it is bound to."""
+    """Map node ids to their variables."""
     if not isinstance(highlight, Mapping):
         return dict.fromkeys(map(int, highlight), "")
     matched: dict[int, str] = {}

@@ -1,6 +1,6 @@
-"""One frame drawn in a window: content, and captions.
+"""Drawing of one frame in a window: content and captions.
 
-What is written in a window: names of nodes, and relations on the lines between them.
+The texts in a window are names of nodes, and relations on the lines between them.
 """
 
 from __future__ import annotations
@@ -52,28 +52,28 @@ if TYPE_CHECKING:
 
 
 LABELLED_LINKS: Final = 10
-"""How many of the ego's lines bear their relations, the nearest first: the panel has the others."""
+"""Number of the ego's lines with relations as text, nearest first; the panel has the others."""
 _LEADER: Final = 9.0
-"""A name further away than this from what it names is tied to it by a line; points."""
+"""A name farther from its object is connected to it by a line; points."""
 _PEN: Final = 4.5
 _CLEAR: Final = 15.0
-"""Distance from all entities at which a line between parts of the map stands alone; m."""
+"""Least distance to all entities of a line between map parts; m."""
 
 
 def paint_texts(stage: Stage, scene: DrawnFrame, reserved: Iterable[Rect]) -> int:
-    """Names of what was matched, then the ego's, then relations on the lines, then all other names.
+    """Write names of matched nodes, the ego's name, relations on lines, then other names.
 
     Parameters
     ----------
     stage : Stage
     scene : DrawnFrame
     reserved : iterable of Rect
-        Room that is taken already.
+        Space that is already taken.
 
     Returns
     -------
     int
-        Names that found no room.
+        Number of names without room.
     """
     placer = Placer(stage.rect(*stage.half, (0.0, 0.0)))
     for rect in (*reserved, *(r for b in scene.bodies.values() for r in _room(stage, b))):
@@ -155,7 +155,7 @@ def _write(stage: Stage, spot: tuple[float, float], text: str, **look: Any) -> N
 
 
 def _slip(alpha: float) -> dict[str, Any]:
-    """A slip of paper under a text, so that it can be read on any ground."""
+    """Return the style of a paper background, which makes a text readable on any ground."""
     return {
         "boxstyle": "round,pad=0.15",
         "facecolor": palette.PAPER,
@@ -176,7 +176,7 @@ def _tag() -> dict[str, Any]:
 def _extent(
     stage: Stage, scene: DrawnFrame, body: Body
 ) -> tuple[float, float, tuple[float, float]]:
-    """The middle of a body on the page, and how far it extends from there, its mark included; points."""
+    """Return the middle of a body on the page, and its extent with its mark; points."""
     half_x, half_y = half_extents(stage, body)
     pen = _PEN * (body.node in scene.matched)
     return body.x * stage.points, body.y * stage.points, (half_x + pen, half_y + pen)
@@ -187,7 +187,7 @@ def _is_named(body: Body) -> bool:
 
 
 def _room(stage: Stage, body: Body) -> list[Rect]:
-    """Room that a body takes, and its arrow, in small squares."""
+    """Return the space of a body and its arrow, as small squares."""
     half_x, half_y = half_extents(stage, body)
     taken = [stage.rect(half_x * stage.metre, half_y * stage.metre, (body.x, body.y))]
     way = velocity_arrow(body)
@@ -204,7 +204,7 @@ def _room(stage: Stage, body: Body) -> list[Rect]:
 Point = tuple[float, float]
 
 _SLOPE: Final = 0.1
-"""Roads are no steeper than this, mostly: metres down for each metre away."""
+"""Typical greatest slope of roads: height per distance."""
 
 _QUIET: Final[dict[Family, str]] = {
     "entity": palette.ENTITY_EDGE,
@@ -215,18 +215,18 @@ _QUIET: Final[dict[Family, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class DrawnFrame:
-    """A frame, ready to be drawn.
+    """Prepared content of a frame.
 
     Attributes
     ----------
     graph : SceneGraph
     matched : dict
-        Node id → name of the variable that it is bound to, or the empty string.
+        Node id → name of its variable, or empty.
     view : MapWindow
     bodies : dict
-        Node id → body, for what can be drawn.
+        Node id → body, for drawable entities.
     lost : int
-        Entities that the graph has no place for.
+        Number of entities without a position.
     links : list of DrawnLink
     ground : GroundView or None
     """
@@ -248,7 +248,7 @@ class DrawnFrame:
         view: MapWindow,
         relations: Relations,
     ) -> DrawnFrame:
-        """Choose what of a frame is shown in a view."""
+        """Select the shown content of a frame in a view."""
         bodies, lost = bodies_of(graph, view)
         ground = None if road_map is None else GroundView.of(road_map, view)
         bodies = _with_storeys(graph, bodies, ground)
@@ -256,7 +256,7 @@ class DrawnFrame:
         return cls(graph, matched, view, {b.node: b for b in bodies}, lost, links, ground)
 
     def place(self, node: int) -> Point | None:
-        """Place of a node in the picture, or ``None`` where the graph has no place for it."""
+        """Return the place of a node in the picture, or ``None`` without a position."""
         if node in self.bodies:
             return self.bodies[node].x, self.bodies[node].y
         place = place_of(self.graph.nodes.get(node, {}))
@@ -266,15 +266,15 @@ class DrawnFrame:
         return x, y
 
     def anchor(self, node: int) -> Point:
-        """Point that a node's name belongs to. A lane's: the part of it that is in sight and near."""
+        """Return the anchor of a node's name; for a lane, a near and visible point."""
         spot = self.ground.spot(node) if self.ground is not None and node < 0 else None
         return spot or self.place(node) or (0.0, 0.0)
 
     def ends(self, link: DrawnLink) -> tuple[Point, Point] | None:
-        """Ends of a link, or ``None`` where one of its nodes has no place.
+        """Return both ends of a link, or ``None`` if one of its nodes has no place.
 
-        Between an entity and a lane it is the shortest way; between matched parts of the map it lies where no
-        entity is near, so that nobody takes it for one of an entity.
+        Between an entity and a lane it is the shortest line. Between matched map parts it is away
+        from entities, to avoid confusion with their lines.
         """
         apart = self._beside_one_another(link) if link.family == "matched" else None
         if apart is not None:
@@ -287,7 +287,7 @@ class DrawnFrame:
         return None if a is None or b is None else (a, b)
 
     def _beside_one_another(self, link: DrawnLink) -> tuple[Point, Point] | None:
-        """Ends of a link of two parts of the map, away from entities; ``None`` where there are none."""
+        """Return the ends of a link between two map parts, away from entities, or ``None``."""
         ground = self.ground
         if ground is None or link.a in self.bodies or link.b in self.bodies:
             return None
@@ -300,11 +300,11 @@ class DrawnFrame:
         free = np.hypot(away[..., 0], away[..., 1]).min(axis=1, initial=_CLEAR)
         x, y = points[np.argmin(0.05 * np.hypot(*points.T) - free)].tolist()
         other = ground.nearest(link.b, (x, y))
-        # A lane and its road lie at one place.
+        # A lane and its road can be at one place.
         return None if other is None or math.dist((x, y), other) < 0.5 else ((x, y), other)
 
     def name(self, node: int) -> str:
-        """Name of a node, with its variable where it was matched: ``p = person 12``."""
+        """Return the name of a node, with its variable if it is matched: ``p = person 12``."""
         text = caption(node, self.graph.nodes.get(node, {}))
         if node in self.bodies and self.bodies[node].below:
             text += f", {self.bodies[node].below:.0f} m below"
@@ -312,31 +312,31 @@ class DrawnFrame:
         return f"{variable} = {text}" if variable else text
 
     def near_first(self) -> list[Body]:
-        """The bodies, those nearest to the middle first."""
+        """Return the bodies, nearest to the middle first."""
         return sorted(self.bodies.values(), key=lambda b: (math.hypot(b.x, b.y), b.node))
 
     def named_first(self) -> list[int]:
-        """Nodes that are always named: the matched ones, and the ego."""
+        """Return the nodes that are always named: matched ones, and the ego."""
         ego = self.graph.ego
         also = [ego] if ego in self.bodies and ego not in self.matched else []
         return [node for node in self.matched if self.is_shown(node)] + also
 
     def is_shown(self, node: int) -> bool:
-        """Return True for a node that has a place in the picture."""
+        """True for a node with a place in the picture."""
         place = (
             self.ground.spot(node) if self.has_outline(node) and self.ground else self.place(node)
         )
         return place is not None and max(map(abs, place)) <= self.view.radius
 
     def has_outline(self, node: int) -> bool:
-        """Return True for a part of the map that has an outline in view."""
+        """True for a map part with an outline in view."""
         return node < 0 and self.ground is not None and bool(self.ground.parts(node))
 
 
 def _with_storeys(graph: SceneGraph, bodies: list[Body], ground: GroundView | None) -> list[Body]:
-    """The bodies, of which those know it that lie below a road that is drawn over them.
+    """Set the depth of bodies that are below a drawn road.
 
-    Without a map it is the ego that tells: what is a storey deeper than it, and not only down a slope.
+    Without a map the reference is the ego: a body a storey deeper than the ego, beyond a slope.
     """
     nodes = [graph.nodes[body.node] for body in bodies]
     z = np.array([number(node, "z") for node in nodes], np.float64)
@@ -356,7 +356,7 @@ def _with_storeys(graph: SceneGraph, bodies: list[Body], ground: GroundView | No
 
 
 def paint_scene(stage: Stage, scene: DrawnFrame) -> int:
-    """Draw a frame in its window; returns the number of names that found no room."""
+    """Draw a frame in its window; return the number of names without room."""
     if scene.ground is not None:
         _paint_map(stage, scene, scene.ground)
     rings = paint_rings(stage) if scene.graph.ego in scene.bodies else []
@@ -393,7 +393,7 @@ def _paint_link(stage: Stage, scene: DrawnFrame, link: DrawnLink) -> None:
 
 
 def _pen(scene: DrawnFrame, link: DrawnLink) -> tuple[str, float, dict[str, Any]]:
-    """Colour, width in points, and what else of its look."""
+    """Return colour, width in points, and other attributes of a line."""
     if link.family in _QUIET:
         return _QUIET[link.family], 0.5, {"alpha": 0.45}
     if "controlsTrafficOf" in link.there + link.back:
@@ -407,7 +407,7 @@ def _pen(scene: DrawnFrame, link: DrawnLink) -> tuple[str, float, dict[str, Any]
 
 
 def _paint_halo(stage: Stage, scene: DrawnFrame, node: int) -> None:
-    """A mark as of a yellow pen; what has an outline on the ground is tinted instead."""
+    """Paint a yellow mark around a node; nodes with an outline on the ground are tinted instead."""
     place = scene.place(node)
     if place is None or (node not in scene.bodies and scene.has_outline(node)):
         return
@@ -422,11 +422,11 @@ def _paint_halo(stage: Stage, scene: DrawnFrame, node: int) -> None:
 # Symbols of entities: boxes with a windscreen, people as dots, traffic lights as lamps ----------
 
 SMALLEST: Final = 3.6
-"""Least width of an entity's box, for the eye; points."""
+"""Least width of an entity's box; points."""
 LAMP: Final = (5.0, 11.5)
 """Width and height of a traffic light; points."""
 BELOW: Final = 0.3
-"""How opaque is what lies below a road that is drawn over it."""
+"""Opacity of objects below a drawn road."""
 ROUND_KINDS: Final = frozenset({"person", "animal"})
 _DOT: Final = 3.3
 _SIGN: Final = 4.0
@@ -464,13 +464,13 @@ def paint_body(stage: Stage, body: Body) -> None:
 
 
 def halo(stage: Stage, body: Body | None, place: tuple[float, float]) -> tuple[Floats, float]:
-    """Outline of the mark around a matched node, and the width of the pen that draws it in points.
+    """Return the outline of the mark around a matched node, and its pen width in points.
 
     Parameters
     ----------
     stage : Stage
     body : Body or None
-        ``None`` for a node that has no symbol of its own: a circle marks its place.
+        ``None`` for a node without a symbol: a circle marks its place.
     place : (float, float)
         Picture coordinates.
     """
@@ -482,14 +482,14 @@ def halo(stage: Stage, body: Body | None, place: tuple[float, float]) -> tuple[F
 
 
 def velocity_arrow(body: Body) -> Floats | None:
-    """The way from a body's centre to the tip of its arrow, (2,); m. ``None`` where it has no arrow."""
+    """Return the vector from a body's centre to its arrow tip, (2,); m. ``None`` without an arrow."""
     way = np.array((body.vx, body.vy)) * ARROW_SECONDS
-    # What creeps, or is faster than anything on a road, has no arrow that tells something.
+    # Very slow and implausibly fast bodies have no arrow.
     return way if 0.5 <= float(np.hypot(*way)) <= 150.0 else None
 
 
 def half_extents(stage: Stage, body: Body) -> tuple[float, float]:
-    """Half the width and height of a symbol on the page; points."""
+    """Return half the width and height of a symbol on the page; points."""
     if body.kind in SIGNALS:
         return LAMP[0] / 2, LAMP[1] / 2
     corners = outline(body, SMALLEST * stage.metre) - (body.x, body.y)
@@ -500,9 +500,9 @@ def half_extents(stage: Stage, body: Body) -> tuple[float, float]:
 def lamps(
     x: float, y: float, light: str, metre: float, gid: str | None
 ) -> list[Circle | FancyBboxPatch]:
-    """A traffic light, upright as a person would see it, whatever way the picture is turned.
+    """Return the shapes of a traffic light, always upright.
 
-    ``metre``: units of the window in a point of the page.
+    ``metre``: units of the window per point of the page.
     """
     width, height = (size * metre for size in LAMP)
     case = FancyBboxPatch(
@@ -563,7 +563,7 @@ def _paint_velocity(stage: Stage, body: Body, colour: str) -> None:
 
 
 def _windscreen(stage: Stage, body: Body) -> Outline:
-    """A wedge in the front of the box that points ahead."""
+    """Return a wedge in the front of the box that points ahead."""
     corners = outline(body, SMALLEST * stage.metre)
     front, rear = corners[:2].mean(axis=0), corners[2:4].mean(axis=0)
     aside = (corners[0] - corners[1]) * 0.34

@@ -1,6 +1,6 @@
 """Pictures and animations of frames of a store.
 
-A clip as an animation: the pictures of its frames, all to one scale and with one legend.
+A clip becomes an animation: the pictures of its frames, with one scale and one legend.
 """
 
 from __future__ import annotations
@@ -47,16 +47,16 @@ if TYPE_CHECKING:
 
 
 DPI: Final = 85.0
-"""Pixels of an inch: an animation is watched and not studied, and has many pictures."""
+"""Pixels per inch: lower than for single pictures, because animations have many."""
 
 
 Shot = tuple["SceneGraph", "Mapping[str, int]", "bytes | None"]
-"""A frame of a clip: its graph; what is marked, as in :func:`sgstore.draw.draw_frame`; what the camera saw.
+"""Frame of a clip: its graph; marked nodes, as in :func:`sgstore.draw.draw_frame`; the camera picture.
 
-Where it has no picture, the one before stays.
+Without a new camera picture the previous one stays.
 """
 FrameRange = tuple[str, str]
-"""Frames of a trace from one to another, both included; each is named as everywhere: ``town@12s``."""
+"""First and last frame of a range, both included, in the usual notation: ``town@12s``."""
 
 
 def filmed(  # noqa: PLR0913  as many options as the picture has
@@ -71,25 +71,25 @@ def filmed(  # noqa: PLR0913  as many options as the picture has
     diagram: bool = False,
     start_ns: int | None = None,
 ) -> Iterator[Shot]:
-    """Draw shots into an animation, and give each when it is drawn.
+    """Draw shots into an animation; yield each shot after it is drawn.
 
     Parameters
     ----------
     to : Path
-        ``….gif``, ``….mp4`` or ``….webm``; a file that is there is replaced when all is drawn.
+        ``….gif``, ``….mp4`` or ``….webm``; an existing file is replaced at the end.
     road_map : RoadMap or None
     samples : sequence of Shot
-        Some of the shots, from all of the clip: they tell the scale and what the legend explains.
+        Some shots from the whole clip: they define the scale and the legend.
     shots : iterable of Shot
     relations, radius, north_up, diagram
         As in :func:`sgstore.draw.draw_frame`.
     start_ns : int, optional
-        Simulation time at which the trace begins.
+        Simulation time of the start of the trace.
 
     Raises
     ------
     ExportError
-        The ending is another, or the file cannot be written.
+        The ending is unknown, or the file cannot be written.
     MissingExtraError
         The package that writes videos is not installed.
     """
@@ -127,13 +127,13 @@ def filmed(  # noqa: PLR0913  as many options as the picture has
 
 
 def scale_of(samples: Iterable[Shot]) -> float | None:
-    """The radius of a view that shows what matters in each of some shots; ``None`` if there is none."""
+    """Return the radius of a view that fits all of these shots, or ``None`` without shots."""
     radii = (view_of(graph, None, matched_nodes(marked)).radius for graph, marked, _ in samples)
     return max(radii, default=None)
 
 
 def _legend(scenes: Iterable[DrawnFrame]) -> list[Entry]:
-    """Entries of all scenes, each once, in the order of the first that has it."""
+    """Return the distinct legend entries of all scenes, in order of first occurrence."""
     found: dict[Entry, None] = {}
     for scene in scenes:
         half = scene.view.radius
@@ -142,30 +142,30 @@ def _legend(scenes: Iterable[DrawnFrame]) -> list[Entry]:
     return sorted(found, key=lambda entry: signs.index(entry.sign))
 
 
-# Pictures of frames of a store: its graph, its map, what a query matches in it, and what a camera saw ----
+# Pictures of frames of a store: graph, map, matches of a query, and camera picture.
 
 NO_CAMERA: Final = "none"
 
 FPS: Final = 10.0
-"""Pictures a second of an animation."""
+"""Pictures per second of an animation."""
 MOST_FPS: Final = 50.0
-"""Players show no more: see :data:`sgstore.draw._animation.LEAST_DELAY`."""
+"""Limit of players: see :data:`sgstore.draw._animation.LEAST_DELAY`."""
 SAMPLES: Final = 8
-"""Frames of a clip that are looked at before it is drawn."""
+"""Sample frames of a clip for scale and legend."""
 AT_ONCE: Final = 8
-"""Frames that are read together."""
+"""Frames that are read at a time."""
 
 _RANGE: Final = re.compile(r"(.+)([@#])(\d+(?:\.\d+)?s?)\.\.(\d+(?:\.\d+)?s?)")
 
 _PICTURE: Final = re.compile(rb"\xff\xd8\xff|\x89PNG\r\n\x1a\n")
-"""How JPEG and PNG begin. Pictures stand whole in their messages, whatever encodes these."""
+"""First bytes of JPEG and PNG. A message contains the complete picture in any encoding."""
 
 
 class Bindings(Protocol):
-    """Bindings of a query in a frame: :class:`sgstore.matches.Matches`, or what is known of them already."""
+    """Bindings of a query in a frame: :class:`sgstore.matches.Matches` or precomputed bindings."""
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
-        """Node ids of the variables by name, for each match."""
+        """Return node ids by variable name, for each match."""
         ...
 
 
@@ -190,25 +190,27 @@ def draw_stored(  # noqa: PLR0913  as many options as the picture has
     frame : int or str
         ``frame_id``, ``TRACE#SEQ`` or ``TRACE@12.3s``.
     to : str or Path
-        ``….png`` or ``….svg``; a file that is there is replaced.
+        ``….png`` or ``….svg``; an existing file is replaced.
     matches : Matches or other Bindings, optional
-        What they bind in this frame is marked.
+        Their bindings in this frame are marked.
     camera : str, optional
-        Channel of the picture to put beside it; by default the first that carries pictures, ``none`` for none.
+        Channel of the camera picture; by default the first with pictures, ``none`` for no picture.
     relations, radius, north_up, diagram
         See :func:`sgstore.draw.draw_frame`.
     names : str
-        What entities are called: ``number`` (``car 17``), ``ident`` (the simulator's id), ``type`` (its type).
+        Labels of entities: ``number`` (``car 17``), ``ident`` (the simulator's id), ``type`` (its
+        type).
 
     Returns
     -------
     bool
-        Whether the query matches in this frame.
+        True if the query matches in this frame.
 
     Raises
     ------
     StoreError, ExportError, MissingExtraError, TraceError
-        There is no such frame or channel; the picture cannot be made; the recording is gone or was replaced.
+        The frame or channel is missing; the picture cannot be made; the recording is missing or was
+        replaced.
     """
     with store.file.snapshot():
         ref = store.file.frame(frame)
@@ -230,7 +232,7 @@ def draw_stored(  # noqa: PLR0913  as many options as the picture has
 
 
 def range_of(text: str) -> FrameRange | None:
-    """The frames that ``TRACE@12s..18s`` or ``TRACE#120..180`` means; ``None`` if it is a frame.
+    """Parse a frame range such as ``TRACE@12s..18s`` or ``TRACE#120..180``; ``None`` for a single frame.
 
     >>> range_of("town@12.5s..18s")
     ('town@12.5s', 'town@18s')
@@ -261,29 +263,30 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
     fps: float = FPS,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> int:
-    """Draw a clip of a store as an animation that runs as fast as the trace did.
+    """Draw a clip of a store as an animation at the original speed.
 
     Parameters
     ----------
     frames : FrameRange
     to : str or Path
-        ``….gif``, or with the extra ``video`` ``….mp4`` or ``….webm``; a file that is there is replaced.
+        ``….gif``, or with the extra ``video`` ``….mp4`` or ``….webm``; an existing file is
+        replaced.
     fps : float
-        Pictures a second at most; of frames that come faster some are left out.
+        Greatest number of pictures per second; of faster frames some are left out.
     on_frame : function, optional
-        Called with the number of pictures drawn and of all, after each.
+        Called after each picture with the number of drawn pictures and the total.
     store, matches, camera, relations, radius, north_up, diagram, names
         See :func:`draw_stored`.
 
     Returns
     -------
     int
-        Pictures in which the query matches.
+        Number of pictures with matches.
 
     Raises
     ------
     StoreError, ExportError, MissingExtraError, TraceError
-        As of :func:`draw_stored`; or the clip ends before it begins.
+        As in :func:`draw_stored`; or the clip ends before it begins.
     """
     check_installed()
 
@@ -291,7 +294,8 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
         raise ExportError(f"fps is {fps}, expected a number up to {MOST_FPS:g}")
 
     def shots(refs: Sequence[FrameRef], *, seen: bool) -> Iterator[Shot]:
-        # The store is kept open for a few frames at a time, so that others can write while these are drawn.
+        # The store is open for a few frames at a time, so that other processes can write in
+        # between.
         for start in range(0, len(refs), AT_ONCE):
             some = refs[start : start + AT_ONCE]
             with store.file.snapshot():
@@ -327,7 +331,7 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
 
 
 def _chosen(store: Store, frames: FrameRange, fps: float) -> list[FrameRef]:
-    """The frames of a clip that are drawn: the first, and each that comes late enough after the last one."""
+    """Return the frames to draw: the first, and each that follows at least one period later."""
     first, last = (store.file.frame(end) for end in frames)
     if last.seq < first.seq:
         raise ExportError(f"the clip from {' to '.join(frames)} ends before it begins")
@@ -339,7 +343,7 @@ def _chosen(store: Store, frames: FrameRange, fps: float) -> list[FrameRef]:
     )
     for about in store.file.rows(sql, [first.frame_id, last.frame_id]).dicts():
         frame = replace(first, **about)
-        # A little grace: the clock of a trace is not that exact. One that runs back starts anew.
+        # A small tolerance covers inexact clocks. A clock that runs back starts again.
         if due is None or not due - 2e9 / fps <= frame.time_ns < due:
             chosen.append(frame)
             due = frame.time_ns + 0.95e9 / fps
@@ -347,7 +351,7 @@ def _chosen(store: Store, frames: FrameRange, fps: float) -> list[FrameRef]:
 
 
 def map_of(store: Store, trace: str) -> RoadMap | None:
-    """The road map of a trace of a store; ``None`` if it has none."""
+    """Return the road map of a trace of a store, or ``None``."""
     return _map_in(store.file, trace)
 
 
@@ -359,9 +363,9 @@ def _map_in(file: StoreFile, trace: str) -> RoadMap | None:
 def _picture(
     store: Store, frame: FrameRef, camera: str | None, usual: str | None = None
 ) -> bytes | None:
-    """Picture of the camera nearest to the frame, as JPEG or PNG; ``None`` if there is none.
+    """Return the camera picture nearest to the frame, as JPEG or PNG, or ``None``.
 
-    ``usual``: the camera if none is asked for, where it is known already.
+    ``usual``: the known default camera.
     """
     if camera == NO_CAMERA:
         return None
@@ -381,7 +385,7 @@ def _picture(
 
 
 def camera_of(store: Store, trace: str) -> str:
-    """The first channel that carries pictures; empty if none does."""
+    """Return the first channel with pictures, or an empty text."""
     return _camera_in(store.file, trace)
 
 
@@ -396,16 +400,16 @@ _PICTURES: Final = ("jpeg", "png", "webp", "tiff", "bmp")
 
 
 def camera_image(store: Store, frame: int | str, channel: str) -> Image:
-    """The picture in the message of a camera that belongs to a frame.
+    """Return the picture in the camera message of a frame.
 
     Raises
     ------
     StoreError
-        There is no such frame or channel, or no message of the channel belongs to the frame.
+        The frame or channel is missing, or the frame has no message of the channel.
     TraceError
-        The recording is gone, was replaced, or is damaged there.
+        The recording is missing, was replaced, or is damaged at this place.
     ExportError
-        The message holds no picture: it is a frame of a video, or of another sensor.
+        The message has no picture: it has a video frame, or data of another sensor.
     MissingExtraError
         Pillow is not installed.
     """
@@ -420,7 +424,7 @@ def camera_image(store: Store, frame: int | str, channel: str) -> Image:
 
 
 def _opened(data: bytes, channel: str) -> Image:
-    """A picture of a recording, which nobody has looked at: of forms that are meant, and of a bounded size."""
+    """Open an untrusted picture of a recording, with permitted formats and a limited size."""
     from PIL import Image
 
     try:
@@ -436,7 +440,7 @@ def _opened(data: bytes, channel: str) -> Image:
 
 
 def frame_image(store: Store, frame: int | str, matches: Bindings | None, **look: Any) -> Image:
-    """A frame from above; parameters and errors are those of :func:`sgstore.draw.draw_stored`."""
+    """Return a frame from above; parameters and errors as in :func:`sgstore.draw.draw_stored`."""
     check_installed()
     from PIL import Image
 
@@ -449,16 +453,16 @@ def frame_image(store: Store, frame: int | str, matches: Bindings | None, **look
 
 
 THUMBNAIL: Final = 180
-"""Longest side of a small picture; pixels."""
+"""Longest side of a thumbnail; pixels."""
 
 
 def thumbnail(file: StoreFile, frame: FrameRef, side: int = THUMBNAIL) -> bytes:
-    """A small picture of a frame, as JPEG: what a camera saw, or, without one, the frame from above.
+    """Return a thumbnail of a frame as JPEG: the camera picture, or else the view from above.
 
     Raises
     ------
     StoreError, TraceError, ExportError
-        The frame, or its recording, is gone, or the picture cannot be read.
+        The frame or its recording is missing, or the picture cannot be read.
     MissingExtraError
         The packages for drawing are not installed.
     """
@@ -466,9 +470,7 @@ def thumbnail(file: StoreFile, frame: FrameRef, side: int = THUMBNAIL) -> bytes:
     topic = _camera_in(file, frame.trace)
     data = b""
     if topic:
-        with suppress(
-            StoreError
-        ):  # cameras are slower than frames: none of their pictures may belong to it
+        with suppress(StoreError):  # cameras are slower than frames: a frame may have no picture
             media = file.carried(frame.frame_id, topic)
             data = media.data if media.form in _PICTURES else b""
     if not data:
@@ -483,7 +485,7 @@ def thumbnail(file: StoreFile, frame: FrameRef, side: int = THUMBNAIL) -> bytes:
 
 
 def graph_picture(graph: SceneGraph, road_map: RoadMap | None = None, **look: Any) -> bytes:
-    """A graph from above, as PNG; ``**look`` is that of :func:`sgstore.draw.draw_frame`.
+    """Return a graph from above as PNG; ``**look`` as in :func:`sgstore.draw.draw_frame`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Timelines of matches and violations: one lane per entity, as text for a terminal or as a picture."""
+"""Timelines of matches and violations: one lane per entity, as terminal text or as a picture."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ if TYPE_CHECKING:
 
 
 LETTERS: Final = 60
-"""Letters that a trace is long."""
+"""Length of the timeline of a trace in letters."""
 
 FULL, PART, NONE = "█", "▌", "·"
 NAME: Final = 36
-"""Letters of the name of a lane, at most."""
+"""Greatest length of a lane's name in letters."""
 
 
 LaneSpan = tuple[float, float, bool]
-"""From when to when something holds, in s since the trace began; and whether it should not."""
+"""Start and end of a time span, in s since the start of the trace; True for a violation."""
 
 
 @dataclass(slots=True)
 class Lane:
-    """A line of a timeline: a pattern or a check, and the entities of it.
+    """Line of a timeline: a pattern or a check, and its entities.
 
     Attributes
     ----------
     name, who : str
     verdict : str
-        Of a check; ``unknown`` of a trace that cannot answer; else empty.
+        Verdict of a check; ``unknown`` for a trace that cannot answer; else empty.
     spans : list of LaneSpan
-        In order; they may overlap.
+        In order; they can overlap.
     reason : str
-        Why it is unknown; else empty.
+        Reason of an unknown verdict; else empty.
     """
 
     name: str
@@ -53,19 +53,19 @@ class Lane:
 
     @property
     def label(self) -> str:
-        """Text beside the lane."""
+        """Return the label of the lane."""
         return " · ".join(part for part in (self.name, self.who) if part)
 
 
 @dataclass(slots=True)
 class Timeline:
-    """The lanes of a trace.
+    """Lanes of a trace.
 
     Attributes
     ----------
     trace : str
     seconds : float
-        From its first frame to its last.
+        Time from the first frame to the last.
     lanes : list of Lane
     """
 
@@ -75,7 +75,7 @@ class Timeline:
 
     @property
     def hit(self) -> bool:
-        """True if something is found, or violated."""
+        """True if there is a match or a violation."""
         return any(lane.spans for lane in self.lanes)
 
 
@@ -84,27 +84,27 @@ def timelines(
     asked: Mapping[str, tuple[str, Mapping[str, Any]]],
     traces: str | Collection[str] = (),
 ) -> list[Timeline]:
-    """The swim lanes of the traces of a store.
+    """Return the timelines of the traces of a store.
 
     Parameters
     ----------
     store : Store
     asked : mapping of str to (str, mapping)
-        Texts, of ``CHECK`` statements or of one ``MATCH`` each, with the values of their parameters, by what
-        their lanes are called; a check is called by its own name.
+        Texts by lane name, with values of their parameters: ``CHECK`` statements, or one ``MATCH``
+        each. The lane of a check has the name of the check.
     traces : str or collection of str
-        The only one or ones that are told; empty: all.
+        Trace or traces to show; empty means all.
 
     Returns
     -------
     list of Timeline
-        Of every trace that is asked, in the order of the store; a check that holds has a lane without spans,
-        and so has what a trace cannot answer, with the reason.
+        One per trace, in the order of the store. A check that holds has a lane without spans; so
+        has an unknown verdict, with its reason.
 
     Raises
     ------
     QueryError
-        A text has no meaning.
+        A text is invalid.
     """
     wanted = {traces} - {""} if isinstance(traces, str) else {*traces}
     found = {
@@ -124,7 +124,7 @@ def timelines(
 def parts_timeline(
     store: Store, text: str, frame: int | str, values: Mapping[str, Any]
 ) -> Timeline:
-    """The lanes of truth of a match: each part of a pattern over the trace of a frame, then all together.
+    """Return the truth lanes of a match: each part of a pattern over a trace, then the whole pattern.
 
     Parameters
     ----------
@@ -132,16 +132,17 @@ def parts_timeline(
     text : str
         A pattern.
     frame : int or str
-        As :meth:`sgstore.query.Store.graph` takes it: its first match is meant, or what comes nearest to one.
+        As in :meth:`sgstore.query.Store.graph`: its first match is shown, or the nearest approach
+        to a match.
     values : mapping
-        Of the parameters of the pattern.
+        Values of the parameters of the pattern.
 
     Raises
     ------
     QueryError
-        The text is no query.
+        The text is not a query.
     StoreError
-        There is no such frame.
+        The frame is missing.
     """
     with store.file.snapshot():
         found = store.parts(text, frame, **values)
@@ -200,17 +201,17 @@ def _spans(intervals: Iterable[Interval], *, violation: bool) -> list[LaneSpan]:
 
 
 def lines_of(timeline: Timeline, letters: int = LETTERS, longest: float = 0.0) -> list[str]:
-    """A timeline as lines of text; each letter stands for an equal part of the longest trace.
+    """Return a timeline as lines of text; each letter is an equal part of the longest trace.
 
-    ``█``: it holds, or is violated, for most of the part; ``▌``: in some of it; ``·``: nowhere in it.
+    ``█``: true, or violated, for most of the part; ``▌``: for some of it; ``·``: for none of it.
 
     Parameters
     ----------
     timeline : Timeline
     letters : int
-        As many as the longest trace has.
+        Length of the longest trace in letters.
     longest : float
-        The time of that, so that traces have one scale; by default that of this one; s.
+        Duration of the longest trace, for a common scale; by default that of this trace; s.
     """
     head = f"{timeline.trace}  0 … {timeline.seconds:.1f} s"
     if not timeline.lanes:
@@ -242,7 +243,7 @@ def _letters(lane: Lane, seconds: float, letters: int) -> str:
 
 
 def _merged(spans: Sequence[LaneSpan]) -> list[tuple[float, float]]:
-    """Times that spans cover, each once."""
+    """Merge overlapping spans."""
     found: list[tuple[float, float]] = []
     for start, end, _ in sorted(spans, key=lambda one: one[0]):
         if found and start <= found[-1][1]:
@@ -253,7 +254,7 @@ def _merged(spans: Sequence[LaneSpan]) -> list[tuple[float, float]]:
 
 
 def _told(lane: Lane) -> str:
-    """Number of spans, and their time together."""
+    """Return the number of spans, and their total time, as text."""
     if not lane.spans:
         return lane.verdict
     seconds = sum(end - start for start, end in _merged(lane.spans))
@@ -267,12 +268,12 @@ def _cut(text: str, most: int) -> str:
 
 
 MOST_LANES: Final = 400
-"""Lanes that a picture shows; the title says of more."""
+"""Greatest number of lanes in a picture; the legend counts the others."""
 
 _WIDTH: Final = 720.0
 _LEFT: Final = 190.0
 _RIGHT: Final = 130.0
-"""Room for the verdict, or how often something is found, behind a lane."""
+"""Space after a lane for its verdict or count."""
 _LANE: Final = 15.0
 _BAR: Final = 9.0
 _ABOVE: Final = 26.0
@@ -282,23 +283,23 @@ _LEAST: Final = 1.5
 """Width of the shortest bar; points."""
 _LETTERS: Final = 44
 _REASON: Final = 100
-"""Letters of a reason, at most."""
+"""Greatest length of a reason in letters."""
 
 
 def draw_timelines(timelines: list[Timeline], to: Path) -> None:
-    """Draw the swim lanes of traces, one trace under the other, all on one scale, with verdicts behind them.
+    """Draw the timelines of traces below each other, on one scale, with verdicts.
 
     Parameters
     ----------
     timelines : list of Timeline
         At least one.
     to : Path
-        ``….png`` or ``….svg``; a file that is there is replaced.
+        ``….png`` or ``….svg``; an existing file is replaced.
 
     Raises
     ------
     ExportError
-        The ending is another, or the file cannot be written.
+        The ending is unknown, or the file cannot be written.
     MissingExtraError
         The packages for drawing are not installed.
     """
@@ -326,7 +327,7 @@ def draw_timelines(timelines: list[Timeline], to: Path) -> None:
 
 
 def _key(page: Page, kinds: set[bool], more: int) -> None:
-    """Explain the colours that occur above all lanes, and say how many lanes are not shown."""
+    """Paint the legend of colours above all lanes, with the number of lanes not shown."""
     from matplotlib.patches import Patch
 
     known = ((False, ROAD_EDGE, "found"), (True, EGO, "violated"))
@@ -337,7 +338,7 @@ def _key(page: Page, kinds: set[bool], more: int) -> None:
 
 
 def _draw(page: Page, timeline: Timeline, lanes: int, top: float, longest: float) -> None:
-    """Draw the lanes of a trace below a height of the page, where the longest trace takes all the width."""
+    """Draw the lanes of a trace below ``top``; the longest trace takes the full width."""
     from matplotlib.ticker import MaxNLocator
 
     from sgstore.draw._page import printable

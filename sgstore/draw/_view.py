@@ -1,7 +1,7 @@
-"""A frame seen from above, before anything is drawn: places, boxes and links in picture axes.
+"""Geometry of a frame seen from above: places, boxes and links in picture axes.
 
-Picture axes are metres from the middle of the picture, x to the right and y up. The ego stands in the
-middle and heads upwards, unless north is wanted up. Pure functions; no drawing package is met here.
+Picture axes are metres from the middle of the picture, x to the right and y up. The ego is in the
+middle with its heading up, unless north is up. The functions are pure and need no drawing package.
 """
 
 from __future__ import annotations
@@ -31,28 +31,28 @@ if TYPE_CHECKING:
 
 
 SCENERY: Final = frozenset({"building", "pole", "barrier", "vegetation", "prop"})
-"""Kinds that are drawn quietly and are not named: what stands about."""
+"""Kinds of scenery, drawn faintly and without names."""
 
 SMALLEST_RADIUS: Final = 30.0
 GREATEST_RADIUS: Final = 60.0
 SIGHT: Final = 150.0
 ARROW_SECONDS: Final = 1.0
-"""A velocity is drawn as the way that it makes in this time; s."""
+"""A velocity arrow has the length of the way in this time; s."""
 
 TEXT_LENGTH: Final = 48
-"""Longest text, in characters, that is taken over from a trace; the rest is cut."""
+"""Longest text from a trace, in characters; the rest is cut."""
 
 
 @dataclass(frozen=True, slots=True)
 class MapWindow:
-    """A square window on the map.
+    """Square window on the map.
 
     Attributes
     ----------
     x, y : float
         Its middle, in map axes; m.
     up : float
-        The direction of the map that points up in the picture; rad.
+        Map direction that points up in the picture; rad.
     radius : float
         Half its side; m.
     """
@@ -63,7 +63,7 @@ class MapWindow:
     radius: float
 
     def place(self, points: Floats) -> Floats:
-        """(N, 2) picture coordinates of (N, 2) points of the map.
+        """Convert points of the map (N, 2) to picture coordinates (N, 2).
 
         >>> MapWindow(10.0, 0.0, 0.0, 50.0).place(np.array([[13.0, 1.0]]))  # 3 m ahead, 1 m to the left
         array([[-1.,  3.]])
@@ -74,27 +74,27 @@ class MapWindow:
         return np.column_stack((away @ right, away @ forward))
 
     def angle(self, heading: float) -> float:
-        """Direction in the picture, counter-clockwise from its right, of a heading of the map; rad."""
+        """Convert a map heading to an angle in the picture, counter-clockwise from its right; rad."""
         return heading - self.up + math.pi / 2
 
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """An entity as it is drawn: picture axes, metres and radians; NaN where the graph does not say.
+    """Drawn entity in picture axes, metres and radians; NaN for unknown values.
 
     Attributes
     ----------
     node : int
         Node id.
     kind, caption, light : str
-        Its kind, what is written beside it, and what it shows if it is a traffic light.
+        Its kind, its label, and its state if it is a traffic light.
     is_ego : bool
     x, y, angle, length, width : float
         Its box; ``angle`` counter-clockwise from the picture's right.
     vx, vy : float
         Velocity; m/s.
     below : float
-        How far it lies below the road that is drawn over it; m, 0 if there is none.
+        Depth below the road that is drawn over it; m, 0 without such a road.
     """
 
     node: int
@@ -113,7 +113,7 @@ class Body:
 
 
 def clean(text: object, length: int = TEXT_LENGTH) -> str:
-    r"""A text from a trace as it can be shown: one line, nothing that cannot be printed, not too long.
+    r"""Make a text from a trace printable: one line, printable characters, limited length.
 
     >>> clean("a\nb\x00c")
     'a·b·c'
@@ -125,7 +125,7 @@ def clean(text: object, length: int = TEXT_LENGTH) -> str:
 
 
 def counted(number: int, thing: str) -> str:
-    """A number of things, in words.
+    """Return a number of things, in words.
 
     >>> counted(1, "lane"), counted(2000, "lane"), counted(2, "vegetation")
     ('1 lane', '2,000 lanes', '2 vegetation')
@@ -134,14 +134,14 @@ def counted(number: int, thing: str) -> str:
 
 
 CALLED: Final = "called"
-"""Attribute of a node of a drawn graph that says what it is called there."""
+"""Attribute of a node of a drawn graph with its label."""
 
 Names = Literal["number", "ident", "type"]
-"""What entities are called in pictures: ``car 17``; as the simulator calls them; by its name of their type."""
+"""Labels of entities in pictures: ``car 17``; the simulator's id; the simulator's type name."""
 
 
 def called(graph: SceneGraph, names: Names) -> SceneGraph:
-    """A graph whose entities are called otherwise in pictures, where that is known."""
+    """Replace the labels of entities by ids or types, where they are known."""
     if names == "number":
         return graph
     key = {"ident": "ident", "type": "type_name"}[names]
@@ -155,12 +155,12 @@ def called(graph: SceneGraph, names: Names) -> SceneGraph:
 
 
 def _lifetime(about: Mapping[str, Any], names: Names) -> str:
-    """What tells an entity from others that had its id before: ``#2``."""
+    """Return the suffix that distinguishes entities with a reused id: ``#2``."""
     return f"#{about['lifetime']}" if names == "ident" and about.get("lifetime", 1) > 1 else ""
 
 
 def caption(node: int, attributes: Mapping[str, Any]) -> str:
-    """Name of a node in a picture: what it is called, ``car 17``, ``lane 12/0/-1``, ``ego (car 0)``."""
+    """Return the caption of a node: its label, ``car 17``, ``lane 12/0/-1``, ``ego (car 0)``."""
     told = clean(attributes.get(CALLED, ""), 32)
     if told:
         return f"ego ({told})" if attributes.get("is_ego") and told != "ego" else told
@@ -174,7 +174,7 @@ def caption(node: int, attributes: Mapping[str, Any]) -> str:
 
 
 def number(attributes: Mapping[str, Any], name: str) -> float:
-    """A number of a node; NaN where it is missing, infinite or no number."""
+    """Return a number of a node; NaN if it is missing, infinite or not a number."""
     value = attributes.get(name)
     if not isinstance(value, Real) or not math.isfinite(value):
         return math.nan
@@ -182,7 +182,7 @@ def number(attributes: Mapping[str, Any], name: str) -> float:
 
 
 def place_of(attributes: Mapping[str, Any]) -> tuple[float, float] | None:
-    """Map coordinates of a node, or ``None``."""
+    """Return the map coordinates of a node, or ``None``."""
     x, y = number(attributes, "x"), number(attributes, "y")
     return None if math.isnan(x + y) else (x, y)
 
@@ -194,11 +194,11 @@ def view_of(
     *,
     north_up: bool = False,
 ) -> MapWindow:
-    """The view of a frame: the ego in the middle, heading up.
+    """Return the view of a frame: the ego in the middle, heading up.
 
-    Without an ego, or where its place is not known, the middle is that of the entities (else of the
-    parts of the map) and north is up. Without a radius it is the smallest that shows the entities,
-    but within :data:`SMALLEST_RADIUS` and :data:`GREATEST_RADIUS`; for the matched up to :data:`SIGHT`.
+    Without an ego or its position, the middle is that of the entities (else of the map parts) and
+    north is up. Without a radius it is the smallest one that shows the entities, within
+    :data:`SMALLEST_RADIUS` and :data:`GREATEST_RADIUS`; for matched nodes up to :data:`SIGHT`.
     """
     ego = graph.nodes.get(graph.ego, {}) if graph.ego is not None else {}
     middle = place_of(ego)
@@ -220,9 +220,9 @@ def view_of(
 
 
 def bodies_of(graph: SceneGraph, view: MapWindow) -> tuple[list[Body], int]:
-    """The entities that can be drawn, and how many cannot because the graph has no place for them.
+    """Return the drawable entities, and the number of entities without a position.
 
-    What stands about in the map is part of the ground, not an entity here; its signals are.
+    Scenery of the map is part of the ground, but its signals are entities.
     """
     bodies: list[Body] = []
     lost = 0
@@ -239,14 +239,14 @@ def bodies_of(graph: SceneGraph, view: MapWindow) -> tuple[list[Body], int]:
 
 
 def outline(body: Body, smallest: float) -> Floats:
-    """(5, 2) corners of a body's box from its front left on, closed; picture axes, m.
+    """Return the corners (5, 2) of a body's box from its front left, closed; picture axes, m.
 
     Parameters
     ----------
     body : Body
-        A missing or absurd extent is that of a point; a missing angle is up.
+        A missing or absurd extent becomes a point; a missing angle becomes up.
     smallest : float
-        Least width; the least length is half as much again. What is smaller would not be seen; m.
+        Least width; the least length is 1.5 times as much. Smaller boxes would be invisible; m.
     """
     greatest = 60.0 * smallest + 100.0
     half_l = min(max(_or(body.length, 0.0), 1.5 * smallest), greatest) / 2
@@ -256,14 +256,14 @@ def outline(body: Body, smallest: float) -> Floats:
 
 
 def turned(points: Floats, body: Body) -> Floats:
-    """(N, 2) picture coordinates of points in a body's own axes (forward, left)."""
+    """Convert points in a body's own axes (forward, left) to picture coordinates (N, 2)."""
     angle = _or(body.angle, math.pi / 2)
     cos, sin = math.cos(angle), math.sin(angle)
     return points @ np.array(((cos, sin), (-sin, cos))) + (body.x, body.y)
 
 
 def distance(a: Mapping[str, Any], b: Mapping[str, Any]) -> float:
-    """Distance between the centres of two nodes, in space where both heights are known; m, or NaN."""
+    """Return the distance of two nodes' centres, in space if both heights are known; m, or NaN."""
     dz = number(a, "z") - number(b, "z")
     return math.hypot(
         number(a, "x") - number(b, "x"), number(a, "y") - number(b, "y"), _or(dz, 0.0)
@@ -309,8 +309,8 @@ def _or(value: float, other: float) -> float:
 
 
 # Relations that are drawn of a graph, and their texts -------------------------------------------
-# A frame of forty entities has thousands of edges. Drawn is what a person asks first: what is close to
-# the ego, and how the matched nodes stand to one another. Everything else on demand.
+# A frame of forty entities has thousands of edges. The picture shows the most important ones:
+# proximity to the ego, and relations among matched nodes. The others are optional.
 
 Relations = Literal["ego", "all", "none"]
 Family = Literal["ego", "matched", "entity", "road", "mixed", "light"]
@@ -318,7 +318,7 @@ Family = Literal["ego", "matched", "entity", "road", "mixed", "light"]
 RANK: Final[dict[str, int]] = {name: rank for rank, name in enumerate(PROXIMITY)}
 ALONG: Final = ("leads", "follows", "overlaps")
 _UNMET: Final = frozenset(MAP_KINDS) | SCENERY
-"""What the ego does not meet: parts of the map, and what stands beside the road."""
+"""Kinds without proximity lines to the ego: map parts and scenery."""
 _ORDER: Final = (*PROXIMITY, *ALONG, *DIRECTIONS, *SIDES)
 
 
@@ -333,10 +333,10 @@ class DrawnLink:
     there : tuple of str
         Relations from ``b`` to ``a``: ``near, inDFrontOf`` reads *b is near and in front of a*.
     back : tuple of str
-        Relations from ``a`` to ``b``, without those that are also in ``there``.
+        Relations from ``a`` to ``b`` that are not in ``there``.
     family : str
-        What the line is of: ``ego``, ``matched``, ``light`` (a signal and the ego's lane), or the
-        quiet ones ``entity``, ``road`` and ``mixed``.
+        Family of the line: ``ego``, ``matched``, ``light`` (a signal and the ego's lane), or the
+        faint ones ``entity``, ``road`` and ``mixed``.
     """
 
     a: int
@@ -347,17 +347,17 @@ class DrawnLink:
 
     @property
     def closeness(self) -> str | None:
-        """The closest proximity relation of the two, or ``None``."""
+        """Return the closest proximity relation of the two, or ``None``."""
         close = [r for r in (*self.there, *self.back) if r in RANK]
         return min(close, key=RANK.__getitem__, default=None)
 
 
 def links_of(graph: SceneGraph, matched: frozenset[int], relations: Relations) -> list[DrawnLink]:
-    """The links to draw, the quiet ones first, then the ego's, then those of matched nodes.
+    """Return the links to draw: faint ones first, then the ego's, then those of matched nodes.
 
-    ``ego``: the ego's proximity to all but what stands about (its other relations, where the graph has
-    no proximity at all), signals that control the ego's lane, and every edge among matched nodes.
-    ``all``: every edge. ``none``: none.
+    ``ego``: the ego's proximity to all except scenery (its other relations, if the graph has no
+    proximity), signals that control the ego's lane, and every edge among matched nodes. ``all``:
+    every edge. ``none``: no edges.
     """
     if relations == "none":
         return []
@@ -390,7 +390,7 @@ def _quiet_family(a: object, b: object) -> Family:
 
 
 def ego_lane(graph: SceneGraph) -> int | None:
-    """The lane that the ego is in above all, or ``None``."""
+    """Return the ego's primary lane, or ``None``."""
     lanes = [
         (not attributes.get("is_primary", False), dst)
         for src, relation, dst, attributes in graph.edges
@@ -402,7 +402,7 @@ def ego_lane(graph: SceneGraph) -> int | None:
 
 
 def seen_from_ego(graph: SceneGraph) -> dict[int, tuple[str, ...]]:
-    """Each entity's relations to the ego, most telling first, for those that have any."""
+    """Return each entity's relations to the ego, most informative first."""
     if graph.ego is None:
         return {}
     return {
@@ -413,16 +413,16 @@ def seen_from_ego(graph: SceneGraph) -> dict[int, tuple[str, ...]]:
 
 
 def sentences(link: DrawnLink, names: Mapping[int, str]) -> list[str]:
-    """A link's relations as they read, by the names of its nodes: ``p near, inDFrontOf v``."""
+    """Return a link's relations as text, with the names of its nodes: ``p near, inDFrontOf v``."""
     a, b = (clean(names.get(node) or node, 16) for node in (link.a, link.b))
     there = [f"{b} {', '.join(link.there)} {a}"] if link.there else []
     return there + ([f"{a} {', '.join(link.back)} {b}"] if link.back else [])
 
 
 def linked(graph: SceneGraph) -> dict[tuple[int, int], tuple[tuple[str, ...], tuple[str, ...]]]:
-    """Relations of each pair of nodes ``(a, b)``, most telling first: those from b to a, and those from a to b.
+    """Map each pair of nodes ``(a, b)`` to its relations from b to a, and from a to b.
 
-    The ego is ``a``.
+    The ego is ``a``. The most informative relations are first.
     """
     return {
         ends: (_most_telling(there), _most_telling(back))
@@ -431,7 +431,7 @@ def linked(graph: SceneGraph) -> dict[tuple[int, int], tuple[tuple[str, ...], tu
 
 
 def _pairs(graph: SceneGraph) -> dict[tuple[int, int], tuple[list[str], list[str]]]:
-    """Relations of each pair of nodes ``(a, b)``: those from b to a, and those from a to b."""
+    """Map each pair of nodes ``(a, b)`` to its relations from b to a, and from a to b."""
     pairs: dict[tuple[int, int], tuple[list[str], list[str]]] = {}
     for src, relation, dst, _ in graph.edges:
         if src == dst or src not in graph.nodes or dst not in graph.nodes:
