@@ -1,11 +1,11 @@
-"""The compiler: text to SQL statements, with subgraphs and ``--explain``.
+"""Compiler: converts query text to SQL statements, with subgraphs and ``--explain``.
 
-With ``RETURN SUBGRAPHS`` each match is a small graph, made from the columns of one statement.
+With ``RETURN SUBGRAPHS`` each match is a small graph, built from the columns of one statement.
 
-The graph of a match has the nodes that the pattern binds, those without a name too, with all that is known of
-them, and the edges that it asks for. A path of exactly n edges is there edge by edge; one of m to n edges is
-one edge from end to end, whose relation is written ``isIn*1..3``. An edge that was asked for either way runs as
-it is written, and says so.
+The graph of a match contains the nodes bound by the pattern, named or not, with all known attributes, and the
+edges of the pattern. A path of exactly n edges is shown edge by edge. A path of m to n edges is shown as one
+edge from end to end, with a relation such as ``isIn*1..3``. An undirected edge has the direction in which it
+is written, and a mark ``either_way``.
 """
 
 from __future__ import annotations
@@ -90,41 +90,41 @@ if TYPE_CHECKING:
 
 
 Record = dict[str, Any]
-"""A node or an edge as networkx has it in node-link form."""
+"""Node or edge in the node-link form of networkx."""
 
 COLUMNS: Final = ("nodes", "edges")
-"""Columns of a graph in a row: lists of :data:`Record`."""
+"""Columns with the graph of a row: lists of :data:`Record`."""
 
 _TWICE: Final = frozenset({"id", "type"})
-"""Attributes that are there already, or under their own names (``type_name``, ``lane_type``)."""
+"""Attributes that are already present, or present under other names (``type_name``, ``lane_type``)."""
 
 
 @dataclass(frozen=True, slots=True)
 class _ValuePlace:
-    """A node or an edge of the pattern, and where its values stand in a row."""
+    """Node or edge of the pattern, with the columns of its values in a row."""
 
     part: Node | Edge
     first: int
     names: tuple[str, ...]
 
     def known(self, row: Sequence[Any]) -> Record:
-        """The values that are not missing."""
+        """Return the known values of the node or edge in a row."""
         values = zip(self.names, row[self.first :], strict=False)
         return {name: value for name, value in values if value is not None}
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """A query whose rows hold all that the graphs of its matches are made of.
+    """Query whose rows contain all values of the match graphs.
 
     Attributes
     ----------
     query : Query
-        As bound; it returns frames with values, and each match is one row.
+        Bound query. It returns frames with values, one row for each match.
     columns : tuple of str
         Names of the columns of :meth:`row`.
     places : tuple of _ValuePlace
-        Where the values of each node and edge stand in a row of the query.
+        Columns of each node and edge in a row of the query.
     """
 
     query: Query
@@ -134,7 +134,7 @@ class Layout:
 
     @classmethod
     def of(cls, query: Query) -> Layout:
-        """Return the layout of the graphs of a query's matches; other results are kept."""
+        """Return the layout of the match graphs of a query. Its own result columns are kept."""
         scope = _bound_variables(query)
         result = query.result
         kept = result.form == "subgraphs" or result.whole
@@ -160,14 +160,14 @@ class Layout:
         return cls(replace(query, scope=scope, result=framed), names, tuple(places), width)
 
     def row(self, row: Sequence[Any]) -> tuple[Any, ...]:
-        """A row of the query as a row with a graph."""
+        """Convert a row of the query to a row with a graph."""
         bound = {place.part.key: place.known(row) for place in self.places}
         parts = [(place.part, bound[place.part.key]) for place in self.places]
         return (*row[: self._width], *graph_of(parts))
 
 
 def _bound_variables(query: Query) -> Scope:
-    """The pattern with all its nodes and single edges bound, those of a path of exactly n edges too."""
+    """Return the pattern with all nodes and single edges bound. Paths of fixed length are expanded."""
     scope = unfold_paths(query.scope, Catalog(), injective=query.injective)
     nodes = {
         key: replace(node, role="unnamed") if node.role == "hidden" else node
@@ -178,22 +178,22 @@ def _bound_variables(query: Query) -> Scope:
 
 
 def graph_of(parts: Sequence[tuple[Node | Edge, Record]]) -> tuple[list[Record], list[Record]]:
-    """Nodes and edges of a match, in the order of the pattern.
+    """Return the nodes and edges of a match, in the order of the pattern.
 
     Parameters
     ----------
     parts : sequence of (Node or Edge, dict)
-        All nodes of the pattern with what is known of each, its ``id`` too; then the edges, with ``relation``
-        and attributes.
+        All nodes of the pattern with their known attributes, including ``id``; then the edges, with
+        ``relation`` and attributes.
 
     Returns
     -------
     nodes : list of dict
-        ``id``, ``variables`` (names in the pattern), and attributes. A node that several variables mean is
-        there once.
+        ``id``, ``variables`` (names in the pattern), and attributes. A node bound to several variables occurs
+        once.
     edges : list of dict
-        ``source`` and ``target`` (ids), ``relation``, and attributes; ``either_way`` where the pattern leaves
-        the direction open. An edge that the pattern asks for twice is there once.
+        ``source`` and ``target`` (ids), ``relation``, and attributes; ``either_way`` for an undirected edge.
+        An edge that occurs twice in the pattern is listed once.
     """
     ids: dict[str, int] = {}
     nodes: dict[int, Record] = {}
@@ -216,13 +216,13 @@ def graph_of(parts: Sequence[tuple[Node | Edge, Record]]) -> tuple[list[Record],
 
 
 def path_text(edge: Edge) -> str:
-    """Return a path of edges as text: ``isIn*1..3``, ``*2..4``."""
+    """Return a path of edges as text, such as ``isIn*1..3`` or ``*2..4``."""
     relations = "|".join(sorted(edge.relations)) if edge.relations != any_relation() else ""
     return f"{relations}*{edge.low}..{edge.high}"
 
 
 def _of_node(node: Node) -> list[tuple[str, NodeValue | NodeAttribute]]:
-    """The id of a node, and the attributes that it can have."""
+    """Return the id and the possible attributes of a node, by name."""
     known: list[tuple[str, NodeValue | NodeAttribute]] = [("id", NodeValue(node.key))]
     return known + [
         (attribute.name, NodeAttribute(node.key, attribute, attribute.type))
@@ -240,7 +240,7 @@ def _of_edge(edge: Edge) -> list[tuple[str, EdgeRelation | EdgeAttribute]]:
 
 
 def edge_attributes(edge: Edge) -> Iterator[Attribute]:
-    """The attributes that an edge of a pattern can be asked for."""
+    """Yield the attributes that an edge of a pattern can have."""
     if edge.high > 1 or len(edge.relations) > 1:
         return
     for attribute in EDGE_ATTRIBUTES.values():
@@ -254,7 +254,7 @@ def edge_attributes(edge: Edge) -> Iterator[Attribute]:
 def _shown(
     nodes: Sequence[Mapping[str, Any]], edges: Sequence[Mapping[str, Any]]
 ) -> tuple[str, str]:
-    """Nodes and edges of a graph as texts for people: ``e = car 0, v = car 3``, ``car 0 -near-> car 3``."""
+    """Return nodes and edges of a graph as text: ``e = car 0, v = car 3`` and ``car 0 -near-> car 3``."""
     called = {node["id"]: str(node.get("name", node["id"])) for node in nodes}
     named = (" = ".join([*node["variables"], called[node["id"]]]) for node in nodes)
     lines = (
@@ -265,27 +265,27 @@ def _shown(
     return ", ".join(named), ", ".join(lines)
 
 
-# Rows as a person wants to read them ---
+# Rows for display ---
 
 
 def for_people(
     columns: tuple[str, ...], rows: Iterable[tuple[Any, ...]], *, graphs: bool
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-    """Columns and rows of an answer, shorter.
+    """Return shorter columns and rows for display.
 
     Parameters
     ----------
     columns : tuple of str
-        As a query gives them.
+        Columns of the query.
     rows : iterable of tuple
     graphs : bool
-        Whether each row ends in a graph, as ``RETURN SUBGRAPHS`` asks.
+        True if each row ends in a graph, as with ``RETURN SUBGRAPHS``.
 
     Returns
     -------
     columns, rows
-        A frame, and the first one of an interval, as ``trace#seq``, which every command takes; a variable as
-        the name of its node; a graph as two texts. What has neither frame nor interval comes as it is.
+        A frame, or the first frame of an interval, as ``trace#seq``, which every command accepts; a variable
+        as the name of its node; a graph as two texts. Rows without frame and interval are unchanged.
     """
     if columns[: len(INTERVAL_COLUMNS)] == INTERVAL_COLUMNS:
         return _intervals(columns, rows)
@@ -308,7 +308,7 @@ def for_people(
 
 
 def _named(name: str) -> str | None:
-    """The variable whose name a column holds."""
+    """Return the variable whose name a column holds, or None."""
     return name.removesuffix(".name") if name.endswith(".name") else None
 
 
@@ -338,7 +338,7 @@ _PLACES: Final = frozenset({"span", "name_span"})
 
 
 def tree_text(part: Any) -> str:
-    """A syntax tree, one part a line; places in the text and what is absent are left out."""
+    """Return a syntax tree as text, one part per line, without positions and absent parts."""
     return "\n".join(_tree(part, ""))
 
 
@@ -360,12 +360,12 @@ def _tree(part: Any, indent: str) -> list[str]:
 
 
 def statements_text(statements: tuple[Statement, ...]) -> str:
-    """The syntax trees of a text."""
+    """Return the syntax trees of statements as text."""
     return "\n".join(tree_text(statement) for statement in statements)
 
 
 def query_text(query: Query) -> str:
-    """A bound query: what may be bound to what, under which conditions."""
+    """Return a bound query as text: variables, conditions and results."""
     lines = [line for stage in query.stages for line in _stage(stage)]
     lines += [] if query.stages else _scope(query.scope, "")
     result = query.result
@@ -377,7 +377,7 @@ def query_text(query: Query) -> str:
 
 
 def _stage(stage: Stage) -> list[str]:
-    """A part of a query in several."""
+    """Return the text lines of one stage of a query."""
     if isinstance(stage, MatchStage):
         return ["optional match" if stage.optional else "match", *_scope(stage.scope, "  ")]
     nodes = [new if new == key else f"{key} AS {new}" for new, key in stage.nodes]
@@ -396,7 +396,7 @@ def _stage(stage: Stage) -> list[str]:
 
 
 def _passed(name: str) -> str:
-    """What a query calls a value that ``WITH`` passes on."""
+    """Return the name in the query of a value that ``WITH`` passes on."""
     return name.removeprefix(PASSED).rpartition(" ")[0]
 
 
@@ -414,7 +414,7 @@ def _scope(scope: Scope, indent: str) -> list[str]:
 
 
 def edge_text(edge: Edge) -> str:
-    """An edge between the keys of its nodes."""
+    """Return an edge as text, with the keys of its nodes."""
     some = [relation for relation in RELATIONS if relation in edge.relations]
     label = "" if edge.relations == any_relation() else f":{'|'.join(some)}"
     times = "" if edge.high == 1 else f"*{edge.low}..{edge.high}"
@@ -441,16 +441,16 @@ def _kinds(kinds: frozenset[str]) -> str:
 
 
 def unnumbered_text(value: Bound) -> str:
-    """An expression as :func:`value_text` prints it, without the numbers that tell unnamed nodes apart."""
+    """Return an expression as text, as :func:`value_text`, but without the numbers of unnamed nodes."""
     return _NUMBERED.sub(lambda found: "#" if found[0][0] == "#" else found[0], value_text(value))
 
 
 _NUMBERED: Final = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|#\d+""")
-"""Texts, which are left as they are, and numbers of nodes."""
+"""Quoted texts, which are kept, and numbers of unnamed nodes."""
 
 
 def value_text(value: Bound, indent: str = "") -> str:  # noqa: PLR0911 - a case each
-    """An expression, nearly as one would write it."""
+    """Return an expression as text, close to the query language."""
     match value:
         case Value(value=constant):
             return "NULL" if constant is None else repr(constant)
@@ -558,28 +558,28 @@ def _block(block: BlockValue, indent: str) -> str:
     return "\n".join([f"{block.word} {{", *inside, f"{indent}  }}"])
 
 
-# Text → statements, by way of the stages: parse, bind, rewrite, emit. Each is a pure function ----
+# Compiler stages from text to statements: parse, bind, rewrite, emit. Each is a pure function ----
 
 
 @dataclass(frozen=True, slots=True)
 class Compiled:
-    """A query that can be asked of a store.
+    """Compiled query, ready to run on a store.
 
     Attributes
     ----------
     text : str
-        As it was written.
+        Text of the query.
     bound : Query
-        As the binder gave it.
+        Query from the binder.
     query : Query
-        Rewritten.
+        Rewritten query.
     catalog : Catalog
-        What it was compiled against: that of the abstraction which it names, or of the store.
+        Catalog used for the compilation: of the named abstraction, or of the store.
     stored : Catalog, optional
-        Of the store.
+        Catalog of the store.
     finder : function, optional
-        Of a query with steps: gives what matches, with what is worked out for each match, in the whole traces
-        of a window.
+        For a query with steps: function that returns the matches and their computed values in a window of
+        whole traces.
     """
 
     text: str
@@ -591,31 +591,31 @@ class Compiled:
 
     @property
     def whole(self) -> Query:
-        """As the binder gave it; of one that returns graphs, what rows these are made of."""
+        """Bound query. For a query that returns graphs: the query of the rows that form the graphs."""
         return self.bound if self.layout is None else Layout.of(self.bound).query
 
     @property
     def layout(self) -> Layout | None:
-        """If it returns graphs: how they are made of its rows."""
+        """Layout of the result graphs. ``None`` if the query does not return graphs."""
         return Layout.of(self.bound) if self.bound.result.form == "subgraphs" else None
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of what it returns."""
+        """Names of the result columns."""
         if self.layout is not None:
             return self.layout.columns
         return results.names_of(self.query)
 
     @property
     def chosen(self) -> tuple[TraceFacts, ...]:
-        """The traces that it asks, those that cannot answer it among them."""
+        """Traces selected by the query, including traces that cannot answer it."""
         only, ego = self.catalog.only, self.query.ego
         chosen = [t for t in self.catalog.traces if ego in {None, t.ego}]
         return tuple(t for t in chosen if only is None or t.trace_id in only)
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Names of the traces that cannot answer it, because they know nothing of a relation, and why."""
+        """Reasons by name of the selected traces that lack a relation of the query."""
         if self.query.unknown_is_false:
             return {}
         wanted = self.query.relations
@@ -624,18 +624,18 @@ class Compiled:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Names of the traces that cannot answer it, because they know nothing of a relation."""
+        """Names of the selected traces that lack a relation of the query."""
         return tuple(self.reasons)
 
     def rows(self, window: Window | None = None, query: Query | None = None) -> SqlStatement:
-        """The statement for its rows, or for those of another query with the same pattern."""
+        """Return the SQL for the rows of the query, or of another query with the same pattern."""
         query, writer, span = self._told(query or self.query, window)
         return results.rows(query, self.catalog, window, writer, span)
 
     def _told(
         self, query: Query, window: Window | None
     ) -> tuple[Query, SqlBuilder | None, results.Span | None]:
-        """Return the finder of a query over several frames; ``None`` for any other query."""
+        """Return the query, a builder if its matches are already known, and the span of its matches."""
         if query.stages:
             return query, staged_matches(query, self.catalog, window), None
         if not query.steps:
@@ -652,18 +652,18 @@ class Compiled:
         return query, external_matches(query, self.catalog, found, told), span
 
     def frames(self, window: Window | None = None) -> SqlStatement:
-        """The frames that match, each once, with their log times."""
+        """Return the SQL for the matching frames, without duplicates, with their log times."""
         query, writer, _ = self._told(replace(self.query, result=Result()), window)
         return results.frames(query, self.catalog, window, writer)
 
     def bindings(self, window: Window | None = None) -> SqlStatement:
-        """Frames and what the variables are bound to, whatever ``RETURN`` says."""
+        """Return the SQL for frames and bindings. ``RETURN`` is ignored."""
         return self.rows(window, replace(self.query, result=Result()))
 
     def intervals(self, window: Window | None = None) -> SqlStatement:
-        """Intervals in which what it returns stays the same; without ``RETURN``, what it binds.
+        """Return the SQL for intervals with constant results. Without ``RETURN``: with constant bindings.
 
-        Of a query that returns rows these are all intervals, whatever its order and its limit.
+        If the query returns rows, its order and its limit are ignored.
         """
         query, result = self.query, self.query.result
         if result.whole or result.aggregated or self.layout is not None:
@@ -674,16 +674,16 @@ class Compiled:
         return self.rows(window, query)
 
     def bound_intervals(self, window: Window | None = None) -> SqlStatement:
-        """Intervals in which the same nodes are bound, whatever ``RETURN`` says."""
+        """Return the SQL for intervals in which the same nodes are bound. ``RETURN`` is ignored."""
         return self.rows(window, results.with_bindings(self.query))
 
     def clips(self, before_ns: int, after_ns: int, window: Window | None = None) -> SqlStatement:
-        """Clips around the frames that match; the offsets of ``RETURN CLIPS`` win over those given.
+        """Return the SQL for clips around the matching frames. Offsets of ``RETURN CLIPS`` take precedence.
 
         Parameters
         ----------
         before_ns, after_ns : int
-            What is added before the first and after the last frame of each; ns.
+            Time added before the first and after the last frame of each clip; ns.
         window : Window, optional
         """
         result = self.query.result
@@ -692,12 +692,12 @@ class Compiled:
         return self.rows(window, replace(self.query, result=result))
 
     def told_apart(self) -> Compiled:
-        """The query with further columns: the owner of each node that it returns, where no frame tells it."""
+        """Return the query with extra columns: the owner of each returned node, if rows have no frame."""
         result = results.with_owners(self.query.result)
         return replace(self, query=replace(self.query, result=result))
 
     def limited(self, most: int) -> Compiled:
-        """The query with no more rows than so many, as if it ended in ``LIMIT``."""
+        """Return the query with at most ``most`` rows, as with ``LIMIT``."""
 
         def limit(query: Query) -> Query:
             held = query.result.limit
@@ -708,7 +708,7 @@ class Compiled:
 
     @property
     def in_windows(self) -> bool:
-        """Tell whether its rows can be had window by window: if none depends on those of other windows."""
+        """True if the rows can be computed window by window, independently of other windows."""
         result = self.query.result
         framed = result.whole or result.framed or result.form != "rows"
         across = result.distinct and not framed
@@ -717,7 +717,7 @@ class Compiled:
 
     @property
     def limited_to_frames(self) -> Compiled | None:
-        """If it lists a limited number of rows: the query that says of each its frame and log time."""
+        """Query for the frame and log time of each row. ``None`` if the rows are not limited."""
         result = self.query.result
         if not result.chooses or result.form != "rows" or result.aggregated:
             return None
@@ -727,7 +727,7 @@ class Compiled:
         return replace(self, query=replace(self.query, result=result))
 
     def stages(self) -> str:
-        """The text after each stage of the compiler."""
+        """Return the text after each stage of the compiler."""
         statements = parse(self.text)
         statement = self.rows()
         values = "".join(f"\n${i} = {v!r}" for i, v in enumerate(statement.values, start=1))
@@ -740,7 +740,7 @@ class Compiled:
         return "\n\n".join(f"---- {name}\n{text}" for name, text in parts)
 
     def count(self, window: Window | None = None) -> SqlStatement:
-        """Return the statement for the number of frames that match."""
+        """Return the SQL for the number of matching frames."""
         query, writer, _ = self._told(replace(self.query, result=Result()), window)
         return results.count(query, self.catalog, window, writer)
 
@@ -748,25 +748,25 @@ class Compiled:
 def compile_query(
     text: str, catalog: Catalog, parameters: Mapping[str, Any] | None = None
 ) -> Compiled:
-    """A query that can be asked of a store.
+    """Compile a query for a store.
 
     Parameters
     ----------
     text : str
-        One ``MATCH``, with the predicates that it needs.
+        Text with one ``MATCH`` and the predicates that it needs.
     catalog : Catalog
-        Of the store.
+        Catalog of the store.
     parameters : mapping of str to value
         Values of ``$name``: numbers, texts, truth values, or lists of these.
 
     Raises
     ------
     QuerySyntaxError
-        The text is not a sentence of the language.
+        The text does not match the grammar.
     QueryNameError
-        It names what is not known.
+        An unknown name.
     QueryError
-        Its types do not fit together.
+        Types do not match.
     """
     _log.debug("compiled for %d traces: %s", len(catalog.traces), text)
     with asking(catalog.names):
@@ -781,19 +781,19 @@ def compile_query(
 def compile_checks(
     text: str, catalog: Catalog, parameters: Mapping[str, Any] | None = None
 ) -> tuple[CheckInCatalog, ...]:
-    """The checks of a text, bound; what they need of single frames is compiled when it is asked.
+    """Bind the checks of a text. Their single-frame parts are compiled when the check runs.
 
     Parameters
     ----------
     text : str
-        ``CHECK`` statements, with the predicates that they need.
+        Text with ``CHECK`` statements and the predicates that they need.
     catalog, parameters
         As in :func:`compile_query`.
 
     Raises
     ------
     QueryError
-        As in :func:`compile_query`; or there is no check.
+        As in :func:`compile_query`, or a text without a check.
     """
     given = parameters or {}
     with asking(catalog.names):
@@ -801,7 +801,7 @@ def compile_checks(
 
 
 def _seen(statements: Sequence[object], catalog: Catalog, parameters: Mapping[str, Any]) -> Catalog:
-    """The catalog of the abstraction, the dataset and the scope that a query names, if they are known."""
+    """Return the catalog for the abstraction, dataset and scope that the settings of a query select."""
     seen, world = catalog, any(isinstance(one, CheckClause) for one in statements)
     for statement in statements:
         for setting in (

@@ -1,7 +1,7 @@
-"""Evaluation in memory: one binding at a time, or columns of nodes.
+"""Evaluation of expressions in memory, for one binding or for columns of nodes.
 
-Expressions have the meaning that :mod:`sgstore.lang._sql_masks` gives them in a store: ``None`` is NULL, and
-logic has three values.
+Expressions have the same meaning as in :mod:`sgstore.lang._sql_masks`, which evaluates them in a store:
+``None`` is NULL, and logic has three values.
 """
 
 from __future__ import annotations
@@ -42,35 +42,35 @@ if TYPE_CHECKING:
 
 
 ENTITY: Final = (*COLUMNS, *OPTIONAL)
-"""Columns of an entity that numbers of pairs are made of."""
+"""Columns of an entity needed for pair numbers."""
 
 Attributes = Mapping[str, Any]
 NodePair = tuple["int | None", "int | None"]
-"""To whom something happens, and with whom."""
+"""Nodes of an event. ``None`` means no node."""
 
 
 @dataclass
 class FrameView:
-    """A scene graph as a search wants it, with what is known of its frame and trace.
+    """Scene graph prepared for the search, with attributes of its frame and trace.
 
     Parameters
     ----------
     graph : SceneGraph
     frame, trace : mapping
-        Attributes of ``frame`` and ``trace`` by their names in the language, as far as they are known.
+        Known attributes of ``frame`` and ``trace``, by their names in the query language.
     classes : callable, optional
-        Gives the class of the graph in an abstraction, by its name; asked only where a query asks, and once.
-        Without it classes are not known.
+        Function from the name of an abstraction to the class of the graph. It is called once, and only if a
+        query needs it. Without it, classes are unknown.
     roles : callable, optional
-        Gives what lanes are to the ego, by node id; asked as classes are.
+        Function that returns the roles of lanes relative to the ego, by node id. It is called once, if needed.
     events : mapping, optional
-        What has happened in the frame, and to whom: by kind, or by the name of a user's own table. By default
-        what the graph says.
+        Events of the frame with their nodes, by kind or by name of a user table. The default is the events of
+        the graph.
     recorded : callable, optional
-        Gives a measure of what was recorded later, of two nodes. Without it none is known.
+        Function that returns a measure of two nodes from later frames. Without it, such measures are unknown.
     drawn : SceneGraph, optional
-        The graph of the frame, if ``graph`` is all that is known of the world around it; edges of patterns are
-        those of the graph.
+        Graph of the frame, if ``graph`` contains all known data around it. Edges of patterns are searched in
+        ``drawn``.
     """
 
     graph: SceneGraph
@@ -83,23 +83,23 @@ class FrameView:
     drawn: SceneGraph | None = None
 
     def in_world(self) -> FrameView:
-        """Return the same frame in scope ``world``: with all that is known beyond its graph."""
+        """Return the same frame in scope ``world``, with all data beyond its graph."""
         known = self.graph.known()
         if known is self.graph:
             return self
         return replace(self, graph=known, drawn=self.graph)
 
     def linked(self, edge: b.Edge) -> FrameView:
-        """Return whose edges an edge is one of: the graph's, or, of one in braces, all that are known."""
+        """Return the view in which an edge is searched: the graph, or all data for an edge in braces."""
         return self if self.drawn is None or edge.known else self._drawn
 
     def draws(self, node: int) -> bool:
-        """Tell whether a node is in the graph of the frame, not beyond it."""
+        """True if a node is in the graph of the frame, and not beyond it."""
         return self.drawn is None or node in self.drawn.nodes
 
     @cached_property
     def _drawn(self) -> FrameView:
-        assert self.drawn is not None  # noqa: S101 - it is asked only then
+        assert self.drawn is not None  # noqa: S101 - checked by the caller
         return FrameView(self.drawn)
 
     @cached_property
@@ -109,7 +109,7 @@ class FrameView:
 
     @cached_property
     def by_kind(self) -> Mapping[str, list[int]]:
-        """Nodes of each kind, the ego among them."""
+        """Nodes of each kind, including the ego."""
         found: defaultdict[str, list[int]] = defaultdict(list)
         for node, attributes in self.nodes.items():
             found[attributes["kind"]].append(node)
@@ -117,7 +117,7 @@ class FrameView:
 
     @cached_property
     def links(self) -> Mapping[tuple[int, int], dict[str, Attributes]]:
-        """Relation and attributes of the edges of each pair of nodes."""
+        """Relations and attributes of the edges between each pair of nodes."""
         found: defaultdict[tuple[int, int], dict[str, Attributes]] = defaultdict(dict)
         for src, relation, dst, attributes in self.graph.edges:
             found[src, dst][relation] = attributes
@@ -125,12 +125,12 @@ class FrameView:
 
     @cached_property
     def ahead(self) -> Mapping[tuple[str, int], list[int]]:
-        """Nodes to which the edges of a relation lead from a node."""
+        """Target nodes of edges, by relation and source node."""
         return self._neighbours(0, 2)
 
     @cached_property
     def back(self) -> Mapping[tuple[str, int], list[int]]:
-        """Nodes from which the edges of a relation lead to a node."""
+        """Source nodes of edges, by relation and target node."""
         return self._neighbours(2, 0)
 
     def _neighbours(self, at: int, other: int) -> Mapping[tuple[str, int], list[int]]:
@@ -141,11 +141,11 @@ class FrameView:
 
     @cached_property
     def crowds(self) -> dict[b.Kinds, NodeColumns]:
-        """Nodes of some kinds with their numbers, kept by :mod:`sgstore.lang._evaluate`."""
+        """Cache of node columns by kinds, filled by :mod:`sgstore.lang._evaluate`."""
         return {}
 
     def class_in(self, abstraction: str) -> str | None:
-        """The class of the graph in an abstraction; ``None`` where it is not known."""
+        """Return the class of the graph in an abstraction, or None if unknown."""
         if abstraction not in self._classes:
             self._classes[abstraction] = self.classes(abstraction) if self.classes else None
         return self._classes[abstraction]
@@ -155,7 +155,7 @@ class FrameView:
         return {}
 
     def role_of(self, node: int) -> str | None:
-        """Return the role of a lane to the ego; ``None`` where it is not known."""
+        """Return the role of a lane relative to the ego, or None if unknown."""
         return self._roles.get(node)
 
     @cached_property
@@ -163,7 +163,7 @@ class FrameView:
         return self.roles() if self.roles else {}
 
     def happens(self, asked: b.Happened, nodes: tuple[int, ...]) -> bool | None:
-        """Tell whether something happens to some nodes; ``None``: the trace does not say such things."""
+        """True if an event involves the given nodes. ``None`` if the trace does not record such events."""
         told = (self.graph.events if self.events is None else self.events).get(asked.kind)
         if told is None:
             return None
@@ -172,12 +172,12 @@ class FrameView:
         return any(nodes in {pair[: len(nodes)], pair[::-1][: len(nodes)]} for pair in told)
 
     def is_one(self, node: int, kinds: b.Kinds) -> bool:
-        """Tell whether a node is of these kinds."""
+        """True if a node has one of the kinds."""
         kind = self.nodes[node]["kind"]
         return kind in (kinds.ego if node == self.graph.ego else kinds.other)
 
     def pair(self, name: str, one: int, other: int) -> float | None:
-        """A number of a pair of entities; ``None`` where something that it needs is missing."""
+        """Return a number of a pair of entities, or None if a needed value is missing."""
         if name in WAYS:
             return self._by_lanes(name, one, other)
         if name in RECORDED:
@@ -192,7 +192,7 @@ class FrameView:
         return None if math.isnan(value) else value
 
     def _by_lanes(self, name: str, one: int, other: int) -> float | None:
-        """A number that is looked up by lanes."""
+        """Return a number that is looked up by lanes, or None if unknown."""
         reach = self.graph.reach
         if reach is None:
             return None
@@ -205,9 +205,10 @@ class FrameView:
         return reach.between(*ends)
 
     def pairs(self, name: str, one: int, *, ahead: bool = True) -> Floats:
-        """(E,) a number of one entity and each other, by :attr:`rows`; all at once, for most will be asked.
+        """Return the numbers (E,) of one entity paired with every entity, ordered as :attr:`rows`.
 
-        NaN where something that it needs is missing. Unless ``ahead``, of each other and the one.
+        All pairs are computed at once, because most are needed. NaN means that a needed value is missing.
+        Without ``ahead``, the pairs are reversed.
         """
         place = self.rows.get(one)
         if place is None:
@@ -220,7 +221,7 @@ class FrameView:
         return self._pairs[key][name]
 
     def _on(self, node: int, *, parts: bool = False) -> Sequence[tuple[int, float, float]]:
-        """The stretches of lanes on which an entity, or with ``parts`` a part of the map, is."""
+        """Return the stretches of lanes on which an entity is, or with ``parts`` a part of the map."""
         reach, kind = self.graph.reach, self.nodes[node]["kind"]
         if node >= 0 or reach is None:
             return self._stretches.get(node, ())
@@ -244,13 +245,13 @@ class FrameView:
 
     @cached_property
     def rows(self) -> Mapping[int, int]:
-        """Places of the entities in :meth:`pairs`."""
+        """Row of each entity in the result of :meth:`pairs`."""
         known = (n for n, about in self.nodes.items() if about["kind"] not in MAP_KINDS)
         return {node: row for row, node in enumerate(known)}
 
     @cached_property
     def _boxes(self) -> Floats:
-        """(E, 15) what numbers of pairs are made of; what stands for ever has acceleration 0."""
+        """Values (E, 15) from which pair numbers are computed. Static entities have acceleration 0."""
         rows: list[list[float]] = []
         heights: list[tuple[float, bool, bool]] = []
         for node in self.rows:
@@ -258,7 +259,7 @@ class FrameView:
             known: Attributes = {"ax": 0.0, "ay": 0.0} if about.get("is_static") else {}
             known = {**known, **about, "node_id": node}
             if about.get("is_static"):
-                known["pitch"] = math.nan  # a store keeps none
+                known["pitch"] = math.nan  # the store has no pitch for static entities
             rows.append([known.get(name, math.nan) for name in ENTITY])
             kind = about["kind"]
             heights.append((about.get("height", math.nan), kind in HUNG, kind in UPRIGHT))
@@ -274,16 +275,16 @@ class FrameView:
 
 @dataclass(slots=True)
 class Binding:
-    """Nodes and edges that the variables are bound to while a graph is searched.
+    """Nodes and edges bound to the variables during the search of a graph.
 
     Attributes
     ----------
     view : FrameView
     nodes : dict of str to int
-        Node ids by key; only those of the keys that the search has come to mean something.
+        Node ids by key, for the keys bound so far.
     edges : dict of str to (relation, attributes)
     passed : dict of str to value
-        What ``WITH`` passed on, and paths, by the names of what stands for them.
+        Values passed by ``WITH`` and paths, by the names of their placeholders.
     """
 
     view: FrameView
@@ -299,13 +300,13 @@ Blocks = Callable[[b.BlockValue], Evaluate]
 
 
 def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, PLR0911, PLR0912 - a case each
-    """The function that gives the value of an expression.
+    """Return the function that evaluates an expression for a binding.
 
     Parameters
     ----------
     expression : Bound
     blocks : function
-        Gives the function of a block; it belongs to who can search.
+        Function that returns the evaluator of a block. It is provided by the search.
     """
     match expression:
         case b.Value(value=value):
@@ -355,7 +356,7 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
 
 
 def _of_node(node: str, attribute: Attribute) -> Evaluate:  # noqa: PLR0911 - a case each
-    """Return the function that gives an attribute of a node."""
+    """Return the function that evaluates an attribute of a node."""
     if attribute.unit is DisplayUnit.binding:
         return lambda at: at.nodes[node]
     if attribute.unit is DisplayUnit.role:
@@ -376,19 +377,19 @@ def _of_node(node: str, attribute: Attribute) -> Evaluate:  # noqa: PLR0911 - a 
 
 
 def _in_junction(at: Binding, node: int) -> bool | None:
-    """Tell whether a part of the map, whose id is below zero, belongs to a junction."""
+    """True if a part of the map, with a negative id, belongs to a junction. ``None`` for entities."""
     return "junction" in at.view.nodes[node] if node < 0 else None
 
 
 def _text_of(value: Any) -> str | None:
-    """The text of a value of JSON, as the database has it."""
+    """Return a JSON value as text, as the database formats it."""
     if value is None or isinstance(value, str):
         return value
     return json.dumps(value, ensure_ascii=False, separators=(",", ":"))
 
 
 def _number_of(value: Any) -> Any:
-    """A value of JSON if it is a number; another trace may have texts."""
+    """Return a JSON value if it is a number, or None. Other traces may have texts."""
     return value if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
@@ -397,11 +398,11 @@ _OWN: Final[Mapping[Type, Callable[[Any], Any]]] = {
     Type.text: _text_of,
     Type.boolean: lambda value: value if isinstance(value, bool) else None,
 }
-"""Type of an attribute of a client's own → what makes the value of one of JSON."""
+"""Conversions from JSON to the type of a user-defined attribute."""
 
 
 def _lifetime(node: int, attributes: Attributes) -> int | None:
-    """Which of the entities with an id it is; the first where a graph of a client's own does not say."""
+    """Return the number of an entity among those with the same id. The default is 1."""
     return None if node < 0 else attributes.get("lifetime", 1)
 
 
@@ -409,17 +410,17 @@ def _type_of(attributes: Attributes) -> Any:
     return attributes.get("lane_type" if attributes["kind"] == "lane" else "type_name")
 
 
-# Conditions asked of many nodes at once: what :mod:`sgstore.lang._evaluate` asks of one after the other ----
-# Numbers of a node, and of a pair of it and one that is bound already, are columns over all nodes that it may
-# be; a condition on them is a few operations on arrays. Answers are the same, to the last bit. What is told by
-# something else than numbers (texts, blocks, edges) is not asked here.
+# Conditions evaluated for many nodes at once ----
+# Numbers of a node, and of its pair with a bound node, are columns over all candidate nodes. A condition on
+# them is a few array operations. The results are identical to the last bit. Conditions on texts, blocks and
+# edges are not evaluated in this way.
 
 MOST: Final = 2.0**53
-"""Whole numbers up to here are the same as floats."""
+"""Largest integer up to which all integers are exact floats."""
 
 
 class NodeColumns:
-    """The nodes of one graph that a variable may be.
+    """Candidate nodes of a variable in one graph, with columns of their numbers.
 
     Parameters
     ----------
@@ -437,10 +438,10 @@ class NodeColumns:
         self._rows = [view.rows.get(node, -1) for node in self.nodes]
         self._columns: dict[object, Column] = {}
 
-    # The view is not kept, for it keeps the crowd: what refers to one another is freed late.
+    # The view is not stored, because it holds a reference to this object, and reference cycles are freed late.
 
     def attribute(self, view: FrameView, name: str, *, truth: bool) -> Column:
-        """(N,) an attribute that is a number, or true or false (``truth``)."""
+        """Return a column (N,) of an attribute: numbers, or booleans if ``truth``."""
         column = self._columns.get(name)
         if column is None:
             nodes = view.nodes
@@ -452,7 +453,7 @@ class NodeColumns:
         return column
 
     def pair(self, view: FrameView, name: str, one: int, *, ahead: bool) -> Column:
-        """(N,) a number of a node and each of these, or, unless ``ahead``, of each of these and the node."""
+        """Return a column (N,) of a pair number of a node and each candidate. Without ``ahead``, reversed."""
         key = name, one, ahead
         column = self._columns.get(key)
         if column is None:
@@ -467,7 +468,7 @@ def _known(values: Floats) -> Column:
 
 
 def crowd(view: FrameView, kinds: b.Kinds) -> NodeColumns:
-    """The nodes of a graph that are of some kinds, put together once."""
+    """Return the nodes of a graph with some kinds, computed once for each view."""
     found = view.crowds.get(kinds)
     if found is None:
         found = view.crowds[kinds] = NodeColumns(view, kinds)
@@ -477,20 +478,20 @@ def crowd(view: FrameView, kinds: b.Kinds) -> NodeColumns:
 T = TypeVar("T")
 
 Columns = Callable[[T], Column]
-"""The values of an expression, given what it is asked of."""
+"""Function that evaluates an expression for many items at once."""
 
 
 def column_evaluator(
     expression: b.Bound, leaf: Callable[[b.Bound], Columns[T] | None]
 ) -> Columns[T]:
-    """Return the function of the values of an expression for many bindings or frames at once.
+    """Return the function that evaluates an expression for many bindings or frames at once.
 
     Parameters
     ----------
     expression : Bound
     leaf : function
-        Gives that of a part which is no constant and no operation, or which is something else here; ``None``:
-        it is what it is anywhere.
+        Function that returns the evaluator of a special part, such as an attribute. ``None`` means that the
+        part is evaluated by default rules.
     """
     found = leaf(expression)
     if found is not None:
@@ -514,29 +515,30 @@ def _always(column: Column) -> Columns[Any]:
     return lambda _: column
 
 
-# What is asked of the nodes of a graph ------------------------------------------------------------------------
+# Conditions on the nodes of a graph ---------------------------------------------------------------------------
 
 Asked = tuple[Binding, NodeColumns]
 Test = Callable[[Binding, NodeColumns], "Bools"]
 
 
-class _Alone(Exception):  # noqa: N818 - no error: this is asked of one node after the other
+class _Alone(Exception):  # noqa: N818 - not an error: the condition is evaluated node by node
     pass
 
 
 def crowd_test(condition: b.Bound, key: str) -> Test | None:
-    """Return the function that tells where a condition is true, for all that one variable may be.
+    """Return a function that tests a condition for all candidates of one variable.
 
     Parameters
     ----------
     condition : Bound
     key : str
-        The variable; the others are bound.
+        Key of the variable. The others are bound.
 
     Returns
     -------
     function or None
-        (N,) bool of a binding and a crowd; ``None``: it is to be asked of one node after the other.
+        Function from a binding and candidates to a mask (N,) of bool. ``None`` means that the condition must
+        be tested node by node.
     """
     try:
         asked = column_evaluator(condition, lambda part: _of_crowd(part, key))
@@ -557,7 +559,7 @@ def _of_crowd(part: b.Bound, key: str) -> Columns[Asked] | None:
         case b.Value(value=int() | float() as number) if abs(number) > MOST:
             raise _Alone
         case b.Operation(word="coalesce", type=Type.number):
-            raise _Alone  # of what others have left over: numbers of pairs are dear
+            raise _Alone  # for the remaining nodes only, because pair numbers are expensive
         case b.Value() | b.Operation():
             return None
         case b.NodeAttribute(node=node, attribute=attribute) if attribute.type in {
@@ -585,7 +587,7 @@ def _of_crowd(part: b.Bound, key: str) -> Columns[Asked] | None:
 
 
 def _is_derived(attribute: Attribute) -> bool:
-    """Tell whether an attribute is not told with the node as a float, or as true or false."""
+    """True if an attribute is not stored in the node as a number or a boolean."""
     return attribute.unit in {
         DisplayUnit.inside,
         DisplayUnit.binding,
@@ -595,7 +597,7 @@ def _is_derived(attribute: Attribute) -> bool:
 
 
 def _of_others(value: b.NodeAttribute | b.PairNumber) -> Columns[Asked]:
-    """The value of nodes that are bound: the same for all that are not."""
+    """Return the function for a value of bound nodes, which is the same for all candidates."""
     told = evaluator(value, _no_blocks)
 
     def same(asked: Asked) -> Column:

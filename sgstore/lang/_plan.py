@@ -1,7 +1,7 @@
-"""The query plan: which condition is answered in which phase, and the order of rows.
+"""Query plan: the phase of each condition, and the order of rows.
 
-The first phase works on bit masks, the second on single frames. A node that only the second one needs waits
-for it.
+The first phase works on bit masks, the second on single frames. A node that only the second phase needs is
+bound there.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """A range of buckets: ``low`` is in it, ``high`` is not; with ``traces``, only those of these traces."""
+    """Range of buckets from ``low`` up to, not including, ``high``. ``traces`` limits it to some traces."""
 
     low: int
     high: int
@@ -50,13 +50,13 @@ class Window:
 
     @classmethod
     def of(cls, extents: Sequence[tuple[int, int]]) -> Window:
-        """The window of whole traces, or of a part of one, by first bucket and number of buckets of each."""
+        """Return the window of whole traces, or of a part of one trace."""
         low, high = min(first for first, _ in extents), max(first + many for first, many in extents)
         traces = tuple(first >> TRACE_OF_BUCKET for first, _ in extents)
         return cls(low, high, traces if len(traces) > 1 else None)
 
     def whole(self, extents: Iterable[tuple[int, int]]) -> Window:
-        """The same as a range alone, if no other of all extents, such as are given, begins in it."""
+        """Return the window as a plain range if no other trace begins inside it."""
         if self.traces is None:
             return self
         many = sum(self.low <= first < self.high for first, _ in extents)
@@ -69,15 +69,15 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class Gathered:
-    """A table that a statement speaks of and the store has not: what was found otherwise.
+    """Temporary table of a statement, with matches that were computed outside the database.
 
     Attributes
     ----------
     name : str
     types : mapping of str to str
-        The type of each column in the database.
+        Database type of each column.
     block : function
-        The columns of what is found in a window of whole traces.
+        Function that returns the columns of the matches in a window of whole traces.
     """
 
     name: str
@@ -87,17 +87,17 @@ class Gathered:
 
 @dataclass(frozen=True, slots=True)
 class SharedRelation:
-    """A shared relation: of the first phase, or, of matches that are known, one row a frame and match.
+    """Relation shared by parts of a statement: masks of the first phase, or known matches.
 
     Attributes
     ----------
     name : str
     nodes, edges : frozenset of str
-        What it binds.
+        Keys bound by the relation.
     told : mapping of FrameAttribute to str
-        Values that it has beside them, and their columns.
+        Extra values and their columns.
     runs : bool
-        Whether a row is of all frames of a bucket from ``first`` to ``last``, rather than of one.
+        True if a row stands for all frames from ``first`` to ``last`` of a bucket, instead of for one frame.
     """
 
     name: str
@@ -107,7 +107,7 @@ class SharedRelation:
     runs: bool = False
 
     def frames(self, alias: str) -> str:
-        """The relation with a row for each frame, as ``FROM`` takes it."""
+        """Return the relation for ``FROM``, with one row for each frame."""
         if not self.runs:
             return f"{quoted(self.name)} AS {quoted(alias)}"
         every = ['unnest(range("first", "last" + 1)) AS "frame_id"', '* EXCLUDE ("first", "last")']
@@ -116,30 +116,30 @@ class SharedRelation:
 
 @dataclass(slots=True)
 class Phases:
-    """The conditions of a scope by how they are answered.
+    """Conditions of a scope, grouped by the way they are evaluated.
 
     Attributes
     ----------
     blocks : list
-        ``EXISTS``, ``NOT EXISTS`` and comparisons of ``COUNT`` with a number: by masks.
+        ``EXISTS``, ``NOT EXISTS`` and comparisons of ``COUNT`` with a number: evaluated by masks.
     single : dict
-        Node → conditions on its attributes alone: by masks.
+        Conditions on attributes of a single node, by node: evaluated by masks.
     lane : dict
-        Edge → conditions on its attributes alone: by masks.
+        Conditions on attributes of a single edge, by edge: evaluated by masks.
     direct : list
-        On node ids, relations and constants: where the edges are joined.
+        Conditions on node ids, relations and constants: evaluated in the join of the edges.
     alone : list of BlockValue
-        Blocks that are relations of their own: joined as edges are.
+        Blocks that become their own relations and are joined as edges.
     happened : list of Happened
-        What must have happened: joined as edges are.
+        Required events: joined as edges.
     trace : list
-        On the trace alone: on the bucket.
+        Conditions on the trace: evaluated for the bucket.
     rest : list
-        In the second phase.
+        Conditions evaluated in the second phase.
     late : set of str
-        Nodes that are bound in the second phase.
+        Nodes bound in the second phase.
     empty : bool
-        Whether the first phase has nothing to say.
+        True if the first phase has no conditions.
     """
 
     blocks: list[Bound] = field(default_factory=list[Bound])
@@ -155,7 +155,7 @@ class Phases:
 
 
 def phases_of(scope: Scope, query: Query, catalog: Catalog) -> Phases:
-    """The conditions of a scope, filed."""
+    """Group the conditions of a scope by the way they are evaluated."""
     parts = Phases()
     for condition in scope.where:
         if stands_alone(condition, catalog):
@@ -203,7 +203,7 @@ def _file(condition: Bound, parts: Phases) -> None:
 
 
 def is_masked(condition: Bound) -> bool:
-    """Tell whether a condition is a block, or the negation of one, or compares a count with a number."""
+    """True if a condition is ``EXISTS`` or ``NOT EXISTS``, or compares a count with a number."""
     match condition:
         case BlockValue(word="EXISTS") | Operation("NOT", (BlockValue(word="EXISTS"),)):
             return True
@@ -227,7 +227,7 @@ def _edge_alone(found: set[Leaf]) -> str | None:
 
 
 def _of_null(condition: Bound) -> bool:
-    """Tell whether a condition may be true of what has no row: of an edge without attributes."""
+    """True if a condition may be true for a missing row, as of an edge without attributes."""
     return any(
         isinstance(part, Operation) and part.word in {"IS NULL", "IS NOT NULL", "coalesce", "case"}
         for part in walk(condition)
@@ -235,9 +235,9 @@ def _of_null(condition: Bound) -> bool:
 
 
 def _late(scope: Scope, parts: Phases, query: Query, catalog: Catalog) -> Iterator[str]:
-    """Nodes that no edge or block has a say in, but values have; and a node that is all there is.
+    """Yield nodes to bind in the second phase: without edges or blocks, but used in values.
 
-    To bind them by their presence would mean to group all states into masks, and to expand these again.
+    Otherwise, all states would be grouped into masks and then expanded again.
     """
     bound_nodes = {key for edge in scope.edges for key in (edge.src, edge.dst)}
     bound_nodes |= {key for one in parts.happened for key in one.nodes}
@@ -258,7 +258,7 @@ def _late(scope: Scope, parts: Phases, query: Query, catalog: Catalog) -> Iterat
 
 
 def blocked(query: Query) -> frozenset[str]:
-    """Nodes that blocks speak of from inside, anywhere in a query."""
+    """Return outer nodes that blocks use, anywhere in a query."""
     return frozenset(_blocked((*query.scope.where, *query.result.values)))
 
 
@@ -270,7 +270,7 @@ def _blocked(expressions: tuple[Bound, ...]) -> Iterator[str]:
 
 
 def traces_of(query: Query, catalog: Catalog) -> tuple[set[int] | None, set[int]]:
-    """Ids of the traces that a query chooses (``None``: all), and of those that cannot answer it."""
+    """Return ids of the selected traces (None means all), and of traces that cannot answer."""
     chosen = None
     if query.ego is not None:
         chosen = {trace.trace_id for trace in catalog.traces if trace.ego == query.ego}
@@ -284,9 +284,9 @@ def traces_of(query: Query, catalog: Catalog) -> tuple[set[int] | None, set[int]
 
 
 def apart(scope: Scope, nodes: set[str], new: set[str]) -> Iterator[tuple[str, str]]:
-    """Pairs of nodes that must differ and could be the same, of those bound, one of which is newly bound.
+    """Yield pairs of bound nodes that must differ, with at least one newly bound node.
 
-    Of two nodes whose kinds exclude one another nothing need be said.
+    Pairs with disjoint kinds differ anyway and are omitted.
     """
     for a, b in sorted(scope.distinct):
         if {a, b} <= nodes and {a, b} & new:
@@ -295,42 +295,42 @@ def apart(scope: Scope, nodes: set[str], new: set[str]) -> Iterator[tuple[str, s
                 yield a, b
 
 
-# The order in which traces come where nothing else is said: by name, ``run2`` before ``run10`` ----
-# Ids of traces are digests, so the order of ids is none that anybody knows. A catalog has its traces in order
-# (see :attr:`sgstore.lang.Catalog.traces`); rows are ordered by the places of their traces there, which are
-# numbers, and never by names.
+# Default order of traces: by name, ``run2`` before ``run10`` ----
+# Trace ids are digests, so their order has no meaning. A catalog has its traces in order (see
+# :attr:`sgstore.lang.Catalog.traces`). Rows are sorted by the index of their trace in the catalog, never by
+# name.
 
 TRACE_OF_BUCKET: Final = 18
-"""``bucket >> 18`` is the trace of a bucket."""
+"""``bucket >> 18`` is the trace id of a bucket."""
 
 TRACE_OF_FRAME: Final = 24
-"""``frame_id >> 24`` is the trace of a frame; the bits below are its place in the trace."""
+"""``frame_id >> 24`` is the trace id of a frame. The lower bits are its position in the trace."""
 
 
 def extents(catalog: Catalog) -> list[tuple[int, int]]:
-    """First bucket and number of buckets of each trace, in the order of the traces."""
+    """Return the first bucket and number of buckets of each trace, in trace order."""
     return [trace.extent for trace in catalog.traces]
 
 
 def frame_key(
     select: Select, frame: str, catalog: Catalog, window: Window | None, values: BoundValues
 ) -> str:
-    """Return the sort key that puts traces in order, and the frames of each in theirs.
+    """Return the sort key for frames: by trace order, then by frame order.
 
-    It is one number, for that is sorted fastest: the id of the frame, with the place of the trace instead of
-    its id. Where ids are in order already, it is the id.
+    The key is one number, which sorts fastest: the frame id, with the index of the trace instead of its id.
+    If the ids are already in trace order, the key is the frame id.
 
     Parameters
     ----------
     select : Select
-        The places of the traces are joined to it.
+        Statement to which the indexes of the traces are joined.
     frame : str
-        The column of the frame's id.
+        Column of the frame id.
     catalog : Catalog
     window : Window or None
-        What the statement looks at.
+        Window of the statement.
     values : BoundValues
-        Of the statement.
+        Bound values of the statement.
     """
     order = [trace.trace_id for trace in catalog.traces]
     if window is not None:
@@ -347,18 +347,18 @@ def frame_key(
 def name_key(
     select: Select, number: int, column: str, catalog: Catalog, values: BoundValues
 ) -> str:
-    """Return the sort key that replaces a column with names of traces.
+    """Return the sort key that replaces a column with trace names.
 
     Parameters
     ----------
     select : Select
-        The places of the traces are joined to it.
+        Statement to which the indexes of the traces are joined.
     number : int
-        Tells this key from others of the statement.
+        Number that makes this key unique in the statement.
     column : str
     catalog : Catalog
     values : BoundValues
-        Of the statement.
+        Bound values of the statement.
     """
     names, alias = [trace.name for trace in catalog.traces], f":order {number}"
     _join(select, alias, ("VARCHAR", names), list(range(len(names))), column, values)
@@ -373,7 +373,7 @@ def _join(
     column: str,
     values: BoundValues,
 ) -> None:
-    """Join a number to each row by a column: which numbers belong to which of its values."""
+    """Join a number to each row, by the value of a column."""
     kind, keys = known
     text = (
         f'SELECT unnest(CAST({values.add(list(keys))} AS {kind}[])) AS ":trace",'

@@ -1,7 +1,7 @@
 """SQL of results: rows, frames, intervals, clips and counts.
 
-A node id is a number within a trace, or, below 0, within a map. So an entity is a trace and a number, a part
-of a map is a map and a number, and traces may share that map.
+A node id is unique within a trace, or, if negative, within a map. So an entity is identified by trace and id,
+a part of a map by map and id. Traces may share a map.
 """
 
 from __future__ import annotations
@@ -69,23 +69,23 @@ if TYPE_CHECKING:
 
 
 _TRACE_KEYS: Final = (TRACE_ATTRIBUTES["id"], TRACE_ATTRIBUTES["name"], FRAME_ATTRIBUTES["id"])
-"""What tells the trace, and so whose numbers ids are."""
+"""Attributes that identify the trace, and therefore the owner of node ids."""
 
 
 OWNER: Final = Attribute("owner", Type.number, {}, "whose number the node id is", DisplayUnit.owner)
-"""What nodes of several traces are told apart by, beside their ids: of an entity the trace, of a part of a map
-the map, which traces may share. No query can name it."""
+"""Owner of a node id, which distinguishes nodes of several traces: the trace of an entity, or the map of a
+map part. Traces may share a map. Queries cannot use this attribute."""
 
 
 def owner_of(node: str) -> NodeAttribute:
-    """Return the owner of a node id: a trace or a map."""
+    """Return the owner attribute of a node: a trace or a map."""
     return NodeAttribute(node, OWNER, Type.number)
 
 
 def owners_of(values: Iterable[Bound], query: Query, catalog: Catalog) -> list[NodeAttribute]:
-    """Return the owners that tell the nodes among some values apart, beside these values.
+    """Return the owners needed to distinguish the nodes in some values.
 
-    Nothing where only one trace is asked, or one of the values says which trace it is.
+    Empty if only one trace is searched, or if a value identifies the trace.
     """
     values = list(values)
     if _tells_trace(values) or not _several(query, catalog):
@@ -94,7 +94,7 @@ def owners_of(values: Iterable[Bound], query: Query, catalog: Catalog) -> list[N
 
 
 def with_owners(result: Result) -> Result:
-    """A result with further columns: the owner of each node that it returns, where no frame tells it."""
+    """Return a result with extra columns: the owner of each returned node, if rows have no frame."""
     if result.names:
         return result
     owners = (
@@ -106,7 +106,7 @@ def with_owners(result: Result) -> Result:
 
 
 def counted_apart(query: Query, catalog: Catalog) -> Query:
-    """A query in which ``COUNT(DISTINCT v)`` of nodes counts those of each trace, or map, by themselves."""
+    """Return a query in which ``COUNT(DISTINCT v)`` counts nodes separately for each trace or map."""
     keys = [column.value for column in query.result.columns]
     if _tells_trace(keys) or not _several(query, catalog):
         return query
@@ -129,42 +129,43 @@ def _tells_trace(keys: Iterable[Bound]) -> bool:
 
 
 def _several(query: Query, catalog: Catalog) -> bool:
-    if catalog.part:  # others have traces, too
+    if catalog.part:  # other parts have traces, too
         return True
     chosen, _ = traces_of(query, catalog)
     return len(catalog.traces if chosen is None else chosen) != 1
 
 
-# Masks → runs: from which frame to which something holds without a break ------------------------
-# A frame *goes on* with a run if the same holds in the frame before it and the recording has no gap between the
-# two (``bucket.joined``). Frames of a mask that do not go on are the first of a run; those with which none goes
-# on are the last. So runs are found a bucket at a time, and only their ends are looked at as frames.
+# Runs of frames from masks ----------------------------------------------------------------------
+# A frame *continues* a run if the same keys hold in the frame before it, without a gap in the recording
+# between the two (``bucket.joined``). A frame of a mask that continues no run is the first of a run. A frame
+# that no frame continues is the last. So runs are found bucket by bucket, and only their ends are read as
+# frames.
 
 FIRST, OWNER_KEY, TOP_OWNER = ":first frame", ":owner", ":top owner"
-"""Columns of intervals that are keyed: the id of the first frame, and whose the nodes are of which samples,
-or the first ones, are taken."""
+"""Extra columns of intervals with ``keyed``: the id of the first frame, and the owners of the nodes used as
+sampling keys."""
 
 _LAST: Final = 59
-"""The bit of the last frame of a bucket."""
+"""Bit of the last frame of a bucket."""
 
 
 def runs(masks: str, keys: list[str], apart: list[str]) -> str:
-    """Maximal runs of consecutive frames of a trace in which the same keys hold.
+    """Return SQL for the longest runs of consecutive frames of a trace with the same keys.
 
     Parameters
     ----------
     masks : str
-        A relation with the columns ``bucket`` and ``mask`` and those of the keys; each bucket and combination
-        of keys once.
+        Relation with the columns ``bucket``, ``mask`` and the key columns. Each bucket and combination of
+        keys occurs once.
     keys : list of str
-        Columns, quoted.
+        Quoted key columns.
     apart : list of str
-        Those of them by which they differ within a trace.
+        Key columns that can differ within a trace.
 
     Returns
     -------
     str
-        A relation with the columns of the keys, ``":from"`` and ``":to"``: ids of the first and the last frame.
+        Relation with the key columns, ``":from"`` and ``":to"``: ids of the first and the last frame.
     """
     trace = f'"bucket" >> {TRACE_OF_BUCKET}'
     same = f'PARTITION BY {", ".join([trace, *apart])} ORDER BY "bucket"'
@@ -200,19 +201,18 @@ def runs(masks: str, keys: list[str], apart: list[str]) -> str:
 
 
 def _first_of(mask: str) -> str:
-    """The id of the first frame of a mask: that of its lowest bit."""
+    """Return the SQL of the first frame of a mask: its lowest bit."""
     return f'"bucket" * 64 + bit_count(("{mask}" & -"{mask}") - 1)'
 
 
-# Relations → statements: what a query returns of the frames and bindings that match -------------
-# Rows come in the order of traces, frames and bindings, unless the query orders them. An *interval* is a
-# maximal run of consecutive frames of one trace in which the same binding holds; a gap of more than 2.5
-# median periods ends it.
+# Statements for the results of a query -------------------------------------------------------------
+# Rows are sorted by trace, frame and binding, unless the query has an order. An *interval* is a longest run
+# of consecutive frames of one trace with the same binding. A gap of more than 2.5 median periods ends it.
 
 CONSTANTS: Final = """
 SELECT node_id, ident, type_name, lifetime, {parked} AS parked FROM inside.entity WHERE trace_id = ?
 """
-"""What does not change about the entities of a trace, and stands in no frame."""
+"""Constants of the entities of a trace that are not stored with frames."""
 
 LOG_TIME: Final = "log_time_ns"
 
@@ -226,13 +226,13 @@ _T: Final = seconds_text('{0} - ":trace"."start_ns"')
 
 @dataclass(frozen=True, slots=True)
 class SqlStatement:
-    """SQL with the values that it binds, the names of its columns, and tables that are put together first.
+    """SQL with its bound values, column names and temporary tables.
 
     Attributes
     ----------
     stages : tuple of (str, str)
-        Relations that ``last`` speaks of, each by its name; one may speak of those before it. ``sql`` is all of
-        it in one statement.
+        Named relations that ``last`` uses. A relation may use earlier ones. ``sql`` combines all of them in
+        one statement.
     last : str
     """
 
@@ -244,10 +244,11 @@ class SqlStatement:
     last: str = ""
 
     def steps(self) -> list[tuple[str, dict[str, Any]]]:
-        """Statements with their values, one after the other: a temporary table for each stage, then the last.
+        """Return separate statements with their values: a temporary table for each stage, then the last.
 
-        The answer is that of ``sql``. But the database plans each step knowing how many rows those before it
-        gave; in one statement it takes a pattern of 180 rows for 40 million, and joins accordingly.
+        The result is the same as that of ``sql``. But the database plans each step with the exact number of
+        rows of earlier steps. In one statement, it estimated 40 million rows for a pattern with 180, and
+        chose a slow join.
         """
         made = [
             f"CREATE OR REPLACE TEMP TABLE {quoted(name)} AS {body}" for name, body in self.stages
@@ -255,20 +256,20 @@ class SqlStatement:
         return [(text, self._bound(text)) for text in (*made, self.last or self.sql)]
 
     def _bound(self, text: str) -> dict[str, Any]:
-        """The values that a part of the statement binds."""
+        """Return the values bound by a part of the statement."""
         numbers = {found[1] for found in _BOUND.finditer(text) if found[1]}
         return {number: self.values[int(number) - 1] for number in sorted(numbers)}
 
 
 _BOUND: Final = re.compile(r"""'(?:[^']|'')*'|"(?:[^"]|"")*"|\$(\d+)""")
-"""A quoted text or name, or the number of a value."""
+"""Quoted text or name, or number of a bound value."""
 
 Span = tuple[Leaf, Leaf]
-"""Of a match over several frames: the values that are its first and its last ``frame_id``."""
+"""Values of the first and the last ``frame_id`` of a match over several frames."""
 
 
 def names_of(query: Query) -> tuple[str, ...]:
-    """Return the names of the columns of what a query returns."""
+    """Return the names of the result columns of a query."""
     result, scope = query.result, query.scope
     names = list(result.names)
     if result.form == "rows" and result.whole:
@@ -286,7 +287,7 @@ def rows(
     writer: SqlBuilder | None = None,
     span: Span | None = None,
 ) -> SqlStatement:
-    """The statement for what a query returns, whatever its form.
+    """Return the SQL for the results of a query, in any form.
 
     Parameters
     ----------
@@ -294,9 +295,9 @@ def rows(
     catalog : Catalog
     window : Window, optional
     writer : SqlBuilder, optional
-        Says what matches; by default what the pattern finds.
+        Builder with the matches. The default searches the pattern.
     span : Span, optional
-        Of a query whose matches are intervals themselves.
+        Span values, for a query whose matches are intervals.
     """
     if query.result.form in {"intervals", "clips"}:
         return intervals(query, catalog, window, writer, span)
@@ -307,7 +308,7 @@ def rows(
 def frames(
     query: Query, catalog: Catalog, window: Window | None = None, writer: SqlBuilder | None = None
 ) -> SqlStatement:
-    """The frames that match, each once, with their log times."""
+    """Return the SQL for the matching frames, without duplicates, with their log times."""
     writer = writer or SqlBuilder(query, catalog, window)
     relation = frames_of(writer, query.scope, None, frozenset())
     outputs = [*_frame_columns(), (LOG_TIME, f'{_FRAME}."{LOG_TIME}"')]
@@ -321,7 +322,7 @@ def frames(
 def count(
     query: Query, catalog: Catalog, window: Window | None = None, writer: SqlBuilder | None = None
 ) -> SqlStatement:
-    """Return the statement for the number of frames that match."""
+    """Return the SQL for the number of matching frames."""
     told, writer = writer is not None, writer or SqlBuilder(query, catalog, window)
     parts = phases(writer, query.scope)
     if parts.rest or parts.late or told:
@@ -339,13 +340,13 @@ def intervals(
     writer: SqlBuilder | None = None,
     span: Span | None = None,
 ) -> SqlStatement:
-    """Intervals in which what is returned (nothing but a match, if nothing is) stays the same."""
+    """Return the SQL for intervals in which the returned values stay the same."""
     query = _spelled(query, catalog)
     return _IntervalStatement(query, writer or SqlBuilder(query, catalog, window), span).statement()
 
 
 def about_frame(attributes: Sequence[FrameAttribute]) -> str:
-    """The statement for what is told of one frame, given its id: one row, a column each."""
+    """Return SQL for attributes of one frame, selected by its id: one row."""
     texts = [frame_text(one, _FRAME, _TRACE, '":map"') for one in attributes]
     select = Select(
         [f"{text} AS {quoted(column_of(a))}" for text, a in zip(texts, attributes, strict=True)]
@@ -356,7 +357,7 @@ def about_frame(attributes: Sequence[FrameAttribute]) -> str:
 
 
 def with_bindings(query: Query) -> Query:
-    """A query that returns its bindings and their names as columns: what intervals of a match keep."""
+    """Return a query for intervals with the bindings and the names of bound nodes as columns."""
     columns: list[ReturnColumn] = []
     for node in query.scope.nodes.values():
         if node.role == "named":
@@ -369,7 +370,7 @@ def with_bindings(query: Query) -> Query:
 
 
 def told_apart_by(query: Query) -> list[FrameAttribute]:
-    """Values that ``WITH`` passed on by which the rows of a query are told apart."""
+    """Return values passed by ``WITH`` that distinguish the rows of a query."""
     result = query.result
     if result.whole:
         return [one.value for one in result.columns if is_passed_on(one.value)]
@@ -377,7 +378,7 @@ def told_apart_by(query: Query) -> list[FrameAttribute]:
 
 
 class _RowStatement:
-    """Writes the statement of a query whose results are rows."""
+    """Builder of the SQL for results in rows."""
 
     def __init__(self, query: Query, writer: SqlBuilder) -> None:
         self.query, self.result = query, query.result
@@ -387,29 +388,31 @@ class _RowStatement:
         roles = {"named", "unnamed"} if counted and not self.result.whole else {"named"}
         self.nodes = frozenset(k for k, node in scope.nodes.items() if node.role in roles)
         self.edges = frozenset(edge.key for edge in scope.edges if edge.named)
-        if query.stages and writer.found is not None:  # what WITH does not pass on counts, too
+        if (
+            query.stages and writer.found is not None
+        ):  # variables that WITH does not pass on count too
             self.nodes, self.edges = writer.found.nodes, writer.found.edges
         if self.result.framed or self.result.distinct:
             self.nodes, self.edges = frozenset(), frozenset()
         if self.result.whole:
             self.nodes = frozenset(k for k, n in scope.nodes.items() if n.role == "named")
             self.edges = frozenset(edge.key for edge in scope.edges if edge.named)
-        # A row tells of several frames.
+        # A row stands for several frames.
         listed = self.result.framed or self.result.whole
         self.grouped = (self.result.distinct or self.result.aggregated) and not listed
-        # Of what samples are taken of, and of what the first ones are taken of.
+        # Sampling keys, and keys of ``LIMIT … PER``.
         self.owners, self.top_owners = (
             [] if per is None else owners_of([per], query, writer.catalog)
             for per in (_per(self.result, one) for one in (self.result.sample, self.result.top))
         )
-        self.texts = dict[str, str]()  # of the columns by which matches are grouped
-        # Numbers of 32 bits are grouped as they are, and shown as their shortest text.
+        self.texts = dict[str, str]()  # SQL of the grouping columns
+        # 32-bit numbers are grouped by value, and shown with their shortest decimal text.
         self.shortened = {
             quoted(column.name): _named(shortest_text(quoted(column.name)), column.name)
             for column in self.result.columns
             if column.single and self.grouped
         }
-        # What WITH passed on tells matches apart, too.
+        # Values passed by WITH also distinguish matches.
         self.passed = told_apart_by(query)
 
     def statement(self) -> SqlStatement:
@@ -449,14 +452,14 @@ class _RowStatement:
         return finished(self.writer, text, tuple(names))
 
     def _tops(self) -> dict[str, str]:
-        """Columns, beside those that are returned, that tell apart of what the first rows are taken."""
+        """Return the extra columns for ``LIMIT … PER``."""
         top = self.result.top
         per = [] if top is None or top.per is None or isinstance(top.per, str) else [top.per]
         values = [*per, *self.top_owners]
         return {f":top {number}": self._text(value) for number, value in enumerate(values)}
 
     def _placed(self, relation: str) -> str:
-        """Matches with their places in the order in which they come where nothing else is said."""
+        """Return SQL for matches with their position in the default order."""
         select = Select([f"{_ROWS}.*"])
         select.join(nested(relation, ":rows"), [])
         frame, writer = f'{_ROWS}."frame_id"', self.writer
@@ -467,7 +470,7 @@ class _RowStatement:
         return select.text()
 
     def _outputs(self) -> list[tuple[str, str]]:
-        """Names and texts of the columns."""
+        """Return the names and SQL texts of the columns."""
         texts: list[str] = []
         if self.result.whole or self.result.framed:
             texts += [text for _, text in _frame_columns()]
@@ -498,26 +501,26 @@ class _RowStatement:
         return self._of_group(leaf.name) if isinstance(leaf, GroupKey) else _column(leaf)
 
     def _of_group(self, name: str) -> str:
-        """The text of a value by which matches are grouped: everywhere the same, with the same bound values."""
+        """Return the SQL of a grouping value. It is the same at each use, with the same bound values."""
         if name not in self.texts:
             value = next(c.value for c in self.result.columns if c.name == name)
             self.texts[name] = self._text(value)
         return self.texts[name]
 
     def _ordered(self, select: Select, names: list[str], tops: list[str]) -> str:
-        """The statement in the order of the query, or else of traces, frames, bindings; as many as wanted."""
+        """Return SQL for the sorted and limited rows: in query order, then in default order."""
         keys = [directed(self._key(k.value), k.descending) for k in self.result.order]
         frame, own, writer = f'{_ROWS}."frame_id"', len(keys), self.writer
         grouped = self.grouped
         once = self.result.framed or (self.result.distinct and not grouped)  # with their frames
         if not grouped:
             keys.append(frame_key(select, frame, writer.catalog, writer.window, writer.values))
-        if once and keys[own] == frame:  # it is the first of the names
+        if once and keys[own] == frame:  # the frame is the first of the names
             del keys[own]
         moved = once and len(keys) > own
         bindings = [f"{_ROWS}.{column}" for column in columns_of(self.nodes, self.edges)]
         bindings += [_column(one) for one in self.passed]
-        if self.query.steps:  # several matches may bind the same in their last frame
+        if self.query.steps:  # several matches may have the same binding in their last frame
             bindings += [self._text(column.value) for column in self.result.columns]
         keys += names if once or grouped else bindings
         sample, top = self.result.sample, self.result.top
@@ -543,7 +546,7 @@ class _RowStatement:
         return select.text()
 
     def _named_traces(self, keys: list[str], own: int) -> list[int]:
-        """Return the sort keys that are names of traces whose characters give another order."""
+        """Return the sort keys with trace names whose alphabetical order differs from the trace order."""
         known = [trace.name for trace in self.writer.catalog.traces]
         if known == sorted(known):
             return []
@@ -555,10 +558,9 @@ class _RowStatement:
 
 
 class _IntervalStatement:
-    """Writes the statement of a query whose results are intervals, or the clips around them.
+    """Builder of the SQL for results in intervals or clips.
 
-    What stays the same in an interval are its *keys*: the values that are returned, or, of a name that is put
-    together, its parts.
+    The *keys* of an interval stay the same: the returned values, or the parts of a composed name.
     """
 
     def __init__(self, query: Query, writer: SqlBuilder, span: Span | None) -> None:
@@ -567,7 +569,7 @@ class _IntervalStatement:
         kept = [value for column in self.result.columns for value in _kept(column.value)]
         distinct = enumerate(dict.fromkeys(kept))
         self.keys = {value: quoted(f"key {number}") for number, value in distinct}
-        # In a trace, what has one id has one kind.
+        # In a trace, an id has only one kind.
         implied = {kind for c in self.result.columns for kind in _kept(c.value)[:-1]}
         self.apart = [key for value, key in self.keys.items() if value not in implied]
 
@@ -587,7 +589,9 @@ class _IntervalStatement:
         writer = self.writer
         order.append(frame_key(select, first, writer.catalog, writer.window, writer.values))
         order += [self._told(column.value) for column in columns]
-        order += ['"max seq"'] if self.span is not None else []  # several may begin in one frame
+        order += (
+            ['"max seq"'] if self.span is not None else []
+        )  # several intervals may begin in one frame
         names = (*(name for name, _ in own), *(column.name for column in columns), *hidden)
         if self.result.having is not None:
             select.where.append(self._having(self.result.having, told))
@@ -605,7 +609,7 @@ class _IntervalStatement:
         return finished(self.writer, select.text(), names)
 
     def _hidden(self, told: dict[str, str]) -> dict[str, str]:
-        """Columns for places of intervals of several stores: their first frames, and whose the nodes are."""
+        """Return extra columns that order intervals of several stores: first frames and owners of nodes."""
         hidden = {FIRST: '":runs"."first"'}
         for name, chosen in ((OWNER_KEY, self.result.sample), (TOP_OWNER, self.result.top)):
             for owner in self._per(chosen, told)[1:]:
@@ -613,16 +617,16 @@ class _IntervalStatement:
         return hidden
 
     def _having(self, condition: Bound, columns: dict[str, str]) -> str:
-        """The condition on an interval, given the names of its columns and what they are."""
+        """Return the SQL of the condition on an interval, from its columns."""
 
         def leaf(found: Leaf) -> str:
-            assert isinstance(found, GroupKey)  # noqa: S101 - the binder lets nothing else in
+            assert isinstance(found, GroupKey)  # noqa: S101 - guaranteed by the binder
             return columns[found.name]
 
         return expression_text(condition, leaf, self.writer.values)
 
     def _per(self, chosen: Sampling | None, told: dict[str, str]) -> list[str]:
-        """Return the texts of what rows are chosen of each of, given those of all columns by name."""
+        """Return the SQL texts of the sampling key and of the owner of its node."""
         if chosen is None or chosen.per is None:
             return []
         assert isinstance(chosen.per, str)  # noqa: S101 - the binder knows the names of intervals only
@@ -636,7 +640,7 @@ class _IntervalStatement:
         return per
 
     def _told(self, value: Bound) -> str:
-        """A value that is returned, in terms of the keys."""
+        """Return the SQL of a returned value, in terms of the keys."""
         if value in self.keys and not isinstance(value, NodeAttribute):
             return self.keys[value]
         return expression_text(value, self.keys.__getitem__, self.writer.values)
@@ -646,8 +650,8 @@ class _IntervalStatement:
         return shortest_text(text) if column.single else text
 
     def _keys(self) -> dict[str, str]:
-        """Key → the value that stays the same."""
-        # A word of the vocabulary is a number inside, as long as it is not told.
+        """Return the SQL of the constant value of each key column."""
+        # A word of the vocabulary stays an internal number until it is returned.
         texts = [
             _column(value)
             if isinstance(value, NodeAttribute)
@@ -657,7 +661,7 @@ class _IntervalStatement:
         return dict(zip(self.keys.values(), texts, strict=True))
 
     def _spans(self, wanted: list[Leaf]) -> str:
-        """The first and the last frame of each interval, with the keys."""
+        """Return SQL for the first and last frame of each interval, with the keys."""
         scope = self.query.scope
         if self.span is not None:
             wanted = [*wanted, *self.span]
@@ -672,7 +676,7 @@ class _IntervalStatement:
         return runs(in_masks(self.writer, scope, wanted, self._keys()), keys, self.apart)
 
     def _between(self, spans: str) -> str:
-        """Return the columns about the frames at both ends."""
+        """Return SQL for columns of the first and last frame of each interval."""
         select = Select(['":from"."trace_id" AS "trace_id"', *self.keys.values()])
         select.columns += ['":from"."frame_id" AS "first"']
         select.columns += ['":to"."seq" - ":from"."seq" + 1 AS "frames"']
@@ -701,14 +705,14 @@ def _column(leaf: Leaf) -> str:
 
 
 def _kept(value: Bound) -> tuple[Bound, ...]:
-    """Return the columns that must stay the same for a value to do so."""
+    """Return the columns that must stay the same so that a value stays the same."""
     return (
         tuple(leaves(value)) if isinstance(value, Operation) and value.word == "name" else (value,)
     )
 
 
 def _name_of(node: str, query: Query, catalog: Catalog) -> Bound:
-    """The name of a node; that of an entity is put together late, for till then it is but two numbers."""
+    """Return the name of a node. The name of an entity is composed late, from its kind and id."""
     name = NodeAttribute(node, _NAME, Type.text)
     profile = Profile.of(query.scope.kinds(node), catalog)
     if query.steps or query.stages or profile.mapped or profile.places != 1:
@@ -720,7 +724,7 @@ def _name_of(node: str, query: Query, catalog: Catalog) -> Bound:
 
 
 def _spelled(query: Query, catalog: Catalog) -> Query:
-    """A query in whose results names are put together late, where they can be."""
+    """Return a query whose results compose names as late as possible."""
 
     def spelled(value: Bound) -> Bound:
         match value:
@@ -743,14 +747,14 @@ def _frame_columns() -> list[tuple[str, str]]:
 
 
 def _from_frames(select: Select, relation: str) -> None:
-    """A relation with the rows of its frames and of their traces."""
+    """Join a relation to the rows of its frames and traces."""
     select.join(nested(relation, ":rows"), [])
     select.join(f'"frame" AS {_FRAME}', [f'{_FRAME}."frame_id" = {_ROWS}."frame_id"'])
     select.join(f'"trace" AS {_TRACE}', [f'{_TRACE}."trace_id" = {_FRAME}."trace_id"'])
 
 
 def shortest_text(text: str) -> str:
-    """Return the SQL of a number of 32 bits as the number of 64 bits with the same shortest text."""
+    """Return the SQL that converts a 32-bit number to a 64-bit number with the same shortest text."""
     return f"CAST(CAST(CAST({text} AS FLOAT) AS VARCHAR) AS DOUBLE)"
 
 
@@ -768,7 +772,7 @@ def directed(text: str, descending: bool) -> str:  # noqa: FBT001
 
 
 def _per(result: Result, chosen: Sampling | None) -> Bound | None:
-    """The value of each of which rows are chosen; ``None`` if of none, or of what tells the frame."""
+    """Return the value of a sampling key, or None."""
     per = chosen and chosen.per
     if isinstance(per, str):
         return next((column.value for column in result.columns if column.name == per), None)
@@ -776,17 +780,17 @@ def _per(result: Result, chosen: Sampling | None) -> Bound | None:
 
 
 def _told_apart(select: Select, names: list[str], apart: list[NodeAttribute]) -> Select:
-    """Rows that differ, or whose nodes do: nodes of several traces may have the same number."""
+    """Return a statement with distinct rows, where nodes of different owners count as different."""
     select.columns += [f'{_column(one)} AS ":owner {i}"' for i, one in enumerate(apart)]
     return Select([quoted(name) for name in names], [nested(select.text(), ":distinct")])
 
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """Number of rows that are chosen of each combination of some values.
+    """Selection of a number of rows for each combination of some values.
 
-    Without a frame, or if ``first`` of the keys are those of an order, they are the first ones; else they are
-    chosen by a number that depends on the frame alone.
+    Without a frame, or with ``first`` sort keys, the first rows are selected. Otherwise, rows are selected by
+    a pseudo-random number computed from the frame.
     """
 
     number: int
@@ -798,7 +802,7 @@ class Chosen:
 def sampled(
     select: Select, columns: list[str], names: list[str], keys: list[str], chosen: Chosen
 ) -> tuple[Select, list[str]]:
-    """The statement of the rows that are chosen, with some columns, and the keys of their order."""
+    """Return the statement for the selected rows, and its sort keys."""
     partition = [f'":per {place}"' for place in range(len(chosen.per))]
     if chosen.frame is not None:
         select.columns.append(f'{chosen.frame} % 1000003 * 48271 % 2147483647 AS ":mixed"')
@@ -817,7 +821,7 @@ def sampled(
 
 
 def keyed(select: Select, names: list[str], keys: list[str]) -> list[str]:
-    """Add keys to a statement as columns, where they are none; what a statement around it is ordered by."""
+    """Add sort keys to a statement as columns. Return the keys for an outer statement."""
     ordered = [key.removesuffix(" NULLS LAST") for key in keys]
     plain = [key.removesuffix(" ASC").removesuffix(" DESC") for key in ordered]
     inner = [key if key in names else f'":key {i}"' for i, key in enumerate(plain)]
@@ -829,7 +833,7 @@ def keyed(select: Select, names: list[str], keys: list[str]) -> list[str]:
 
 
 def in_order(part: Bound) -> bool:
-    """Tell whether it depends on the order in which matches come."""
+    """True if an expression depends on the order of matches, as ``collect`` does."""
     return isinstance(part, Aggregate) and part.word == "collect" and not part.distinct
 
 
@@ -838,7 +842,7 @@ def _aggregates(column: ReturnColumn) -> bool:
 
 
 def finished(writer: SqlBuilder, text: str, columns: Iterable[str]) -> SqlStatement:
-    """A statement with the shared relations before it."""
+    """Return the final statement, with the shared relations before it."""
     shadows = [
         (f"{quoted(name)} AS NOT MATERIALIZED", body) for name, body in writer.catalog.shadows
     ]
@@ -850,7 +854,7 @@ def finished(writer: SqlBuilder, text: str, columns: Iterable[str]) -> SqlStatem
 
 
 def _preceded(relations: Iterable[tuple[str, str]], text: str) -> str:
-    """A statement behind the relations that it speaks of, each with what names it."""
+    """Return a statement with its relations before it in a ``WITH`` clause."""
     before = ",\n".join(
         f"{head} (\n" + "\n".join(f"  {line}" for line in body.splitlines()) + "\n)"
         for head, body in relations

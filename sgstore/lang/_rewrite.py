@@ -1,6 +1,7 @@
-"""Bound query → bound query of the same meaning that is cheaper to answer: rules, one after the other.
+"""Rewriting rules that make a bound query faster without changing its meaning.
 
-Each rule makes a scope of a scope; it says what it does and why the meaning stays. None can fail.
+Each rule converts a scope to a scope. Its docstring explains the change and why the meaning stays the same.
+No rule can fail.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ _MIRRORED: Final = {"=": "=", "<>": "<>", "<": ">", ">=": "<=", ">": "<", "<=": 
 
 
 def rewritten(query: Query, catalog: Catalog) -> Query:
-    """The query after all rules."""
+    """Return the query after all rewriting rules."""
     if query.stages:
         return _staged(query, catalog)
     query = _ruled(query, catalog)
@@ -102,10 +103,10 @@ def _ruled(query: Query, catalog: Catalog) -> Query:
 
 
 def _staged(query: Query, catalog: Catalog) -> Query:
-    """A query in several parts after all rules, each part by itself.
+    """Return a query with stages after all rules, applied to each stage.
 
-    What is bound is narrowed to what the patterns leave of it. A node that may be absent is looked up by its
-    id, the ego too: that a frame has one does not say that it was found.
+    Nodes are limited to the kinds that the patterns allow. A node that may be absent is looked up by its id.
+    This includes the ego: even if the frame has an ego, the pattern may not bind it.
     """
     nothing = Scope({}, {}, (), (), frozenset())
     kinds: dict[str, Kinds] = {}
@@ -151,7 +152,7 @@ def _staged(query: Query, catalog: Catalog) -> Query:
 
 
 def path_ways(stage: MatchStage, *, injective: bool) -> Iterator[PathWay]:
-    """The pattern of a stage, once for all the lengths that its paths with names may have."""
+    """Yield the pattern of a stage once for each combination of lengths of its named paths."""
     edges = {edge.key: edge for edge in stage.scope.edges}
     repeated = [edges[key] for path in stage.paths for key, _ in path.edges if edges[key].high > 1]
     for lengths in product(*(range(edge.low, edge.high + 1) for edge in repeated)):
@@ -170,7 +171,7 @@ def path_ways(stage: MatchStage, *, injective: bool) -> Iterator[PathWay]:
 
 
 def _kinds_in(scopes: Iterable[Scope]) -> dict[str, Kinds]:
-    """The kinds that nodes may have in any of some patterns, those that cannot match left out."""
+    """Return the kinds that nodes can have in any of the patterns that can match."""
     every = list(scopes)
     found: dict[str, Kinds] = {}
     for scope in [one for one in every if one.where != (FALSE,)] or every:
@@ -180,7 +181,7 @@ def _kinds_in(scopes: Iterable[Scope]) -> dict[str, Kinds]:
 
 
 def _expression(value: Any, values: Callable[[Result], Result]) -> Any:
-    """A value after all rules for results."""
+    """Return a value after all rules for results."""
     return values(Result(columns=(ReturnColumn("", value),))).columns[0].value
 
 
@@ -188,7 +189,7 @@ _Rule = Callable[[Scope, Catalog], Scope]
 
 
 def _in_scopes(rule: _Rule, query: Query, catalog: Catalog) -> Query:
-    """A query with a rule applied to every scope, the inner ones first."""
+    """Apply a rule to every scope of a query, inner scopes first."""
 
     def inside(expression: Bound) -> Bound:
         if isinstance(expression, BlockValue):
@@ -206,7 +207,7 @@ def _in_scopes(rule: _Rule, query: Query, catalog: Catalog) -> Query:
 
 
 def nothing_beyond(scope: Scope, catalog: Catalog) -> Scope:
-    """In scope ``graph``, and where nothing is known beyond the graphs, all are in the graph."""
+    """Replace ``in_graph`` by true unless the store has data beyond the graphs in scope ``world``."""
 
     def known(value: Bound) -> Bound:
         if isinstance(value, NodeAttribute) and value.attribute.unit is DisplayUnit.inside:
@@ -217,7 +218,7 @@ def nothing_beyond(scope: Scope, catalog: Catalog) -> Scope:
 
 
 def computed_or_imported(scope: Scope, catalog: Catalog) -> Scope:
-    """Relations of traces with settings were computed by them."""
+    """Replace ``computed``: true for traces with settings, whose relations were computed."""
     ids = [trace.trace_id for trace in catalog.traces if trace.reach is not None]
     told: Bound = Value(value=bool(ids), type=Type.boolean)
     if 0 < len(ids) < len(catalog.traces):
@@ -232,7 +233,7 @@ def computed_or_imported(scope: Scope, catalog: Catalog) -> Scope:
 
 
 def push_negations(scope: Scope, _: Catalog) -> Scope:
-    """``NOT`` moves inwards to what cannot be split, so that more conditions stand alone.
+    """Move ``NOT`` inwards, so that more conditions can be evaluated separately.
 
     De Morgan's laws and ``NOT a < b`` = ``a >= b`` hold in three-valued logic too.
     """
@@ -280,7 +281,7 @@ def _negated_operation(word: str, operands: tuple[Bound, ...]) -> Bound:
 
 
 def counts_to_existence(scope: Scope, _: Catalog) -> Scope:
-    """``COUNT {…} > 0`` is ``EXISTS {…}``, which need not count; ``COUNT {…} = 0`` is its negation."""
+    """Replace ``COUNT {…} > 0`` by ``EXISTS {…}``, and ``COUNT {…} = 0`` by its negation."""
     return replace(scope, where=tuple(map(_existence, scope.where)))
 
 
@@ -300,7 +301,7 @@ def _existence(condition: Bound) -> Bound:
 
 
 def counted_block(condition: Bound) -> tuple[BlockValue, str, float] | None:
-    """The parts of ``COUNT {…} sign number``, the block on the left; ``None`` if it is something else."""
+    """Return block, sign and number of ``COUNT {…} sign number``, or None for other conditions."""
     match condition:
         case Operation(
             word, (BlockValue(word="COUNT") as block, Value(value=int() | float() as n))
@@ -315,7 +316,7 @@ def counted_block(condition: Bound) -> tuple[BlockValue, str, float] | None:
 
 
 def complement(sign: str) -> str:
-    """The comparison that is true where another is false."""
+    """Return the opposite comparison, such as ``>=`` for ``<``."""
     return _OPPOSITE[sign]
 
 
@@ -323,10 +324,10 @@ def complement(sign: str) -> str:
 
 
 def unfold_paths(scope: Scope, _: Catalog, *, injective: bool) -> Scope:
-    """A path of exactly n edges becomes n edges with hidden nodes between them.
+    """Replace a path of exactly n edges by n edges with hidden nodes between them.
 
-    As in a path of m to n edges, these nodes differ from one another and from both ends, if nodes must
-    differ at all; with the other nodes of the pattern they may coincide.
+    If nodes must differ, the hidden nodes differ from each other and from both ends. They may coincide with
+    other nodes of the pattern. The same holds for a path of m to n edges.
     """
     for edge in scope.edges:
         if edge.low == edge.high > 1:
@@ -335,7 +336,7 @@ def unfold_paths(scope: Scope, _: Catalog, *, injective: bool) -> Scope:
 
 
 def chain(scope: Scope, edge: Edge, length: int, *, injective: bool) -> Scope:
-    """A scope in which a path has become ``length`` edges with hidden nodes between them."""
+    """Replace a path by ``length`` edges with hidden nodes between them."""
     between = [f"#{edge.key}.{number}" for number in range(1, length)]
     stops = [edge.src, *between, edge.dst]
     hidden = {key: Node(key, any_kinds(), "hidden", edge.span) for key in between}
@@ -353,7 +354,7 @@ def chain(scope: Scope, edge: Edge, length: int, *, injective: bool) -> Scope:
 
 
 def labels_from_conditions(scope: Scope, _: Catalog) -> Scope:
-    """``v.kind = 'car'``, ``v.is_ego`` and the like say what a node may be, which the edges know too."""
+    """Convert conditions such as ``v.kind = 'car'`` or ``v.is_ego`` to labels, which edges can use."""
     nodes, rest = dict(scope.nodes), list[Bound]()
     for condition in scope.where:
         key, kinds = _label(condition)
@@ -383,10 +384,11 @@ def _label(condition: Bound) -> tuple[str, Kinds]:
 
 
 def open_exists(scope: Scope, catalog: Catalog) -> Scope:
-    """An ``EXISTS {…}`` that must be true joins the pattern around it, its nodes hidden, if that binds a node.
+    """Merge a required ``EXISTS {…}`` into the pattern around it, with hidden nodes.
 
-    A node that no edge of the pattern binds would otherwise be tried with every entity of the frame. Of several
-    that stand alone each stays: the database would join the ways of all of them before it comes to the edges.
+    This needs a free node: one that the block binds, but no edge of the pattern. Otherwise, such a node would
+    be tried with every entity of the frame. If several blocks are separate relations (:func:`stands_alone`),
+    they are kept. The database would join all of them before it reads the edges.
     """
     alone = [one for one in scope.where if stands_alone(one, catalog)]
     while True:
@@ -408,11 +410,11 @@ def open_exists(scope: Scope, catalog: Catalog) -> Scope:
 
 
 LONG_WAY: Final = 3
-"""Edges from which on a block is a relation of its own."""
+"""Smallest number of edges of a block that becomes its own relation."""
 
 
 def stands_alone(condition: Bound, catalog: Catalog) -> TypeGuard[BlockValue]:
-    """Tell whether a block, in scope ``world``, is a relation of its own: its edges bind all it speaks of."""
+    """True if a block in scope ``world`` becomes its own relation, because its edges bind all its nodes."""
     if not catalog.around or not isinstance(condition, BlockValue) or condition.word != "EXISTS":
         return False
     scope = condition.scope
@@ -424,13 +426,13 @@ def stands_alone(condition: Bound, catalog: Catalog) -> TypeGuard[BlockValue]:
 
 
 def _of_table(leaf: NodeAttribute) -> bool:
-    """Tell whether an attribute stands in the table of its node."""
+    """True if an attribute is stored in the table of its node."""
     bare = {DisplayUnit.role, DisplayUnit.own, DisplayUnit.owner, DisplayUnit.inside}
     return leaf.attribute.unit not in bare
 
 
 def _ends(scope: Scope) -> set[str]:
-    """Nodes that edges of a scope bind."""
+    """Return the nodes bound by the edges of a scope."""
     return {key for edge in scope.edges for key in (edge.src, edge.dst)}
 
 
@@ -448,13 +450,13 @@ def _merged(scope: Scope, block: BlockValue) -> Scope:
     )
 
 
-# What the store holds ------------------------------------------------------------------------------
+# Contents of the store ------------------------------------------------------------------------------
 
 
 def narrowed(scope: Scope, catalog: Catalog) -> Scope:
-    """Nodes are narrowed to the kinds that occur at the ends of such edges in the store.
+    """Limit nodes to the kinds that occur at the ends of such edges in the store.
 
-    A pattern whose edges do not occur at all has no match: its condition becomes false.
+    If the edges of a pattern do not occur in the store, its condition becomes false.
     """
     triples = tuple({**catalog.map_edges, **catalog.edges})
     kinds = kinds_left(scope, triples, catalog.moving | catalog.fixed | catalog.mapped)
@@ -467,7 +469,7 @@ def narrowed(scope: Scope, catalog: Catalog) -> Scope:
 def kinds_left(
     scope: Scope, triples: Collection[Triple], held: frozenset[str]
 ) -> dict[str, Kinds] | None:
-    """Kinds that each node may be of where such edges and kinds occur; ``None``: there is no match."""
+    """Return possible kinds of each node, for the given triples and kinds. ``None`` means no match."""
     kinds = {key: scope.kinds(key).only(held) for key in (*scope.nodes, *scope.outer)}
     single = [edge for edge in scope.edges if edge.high == 1]
     ways = [[*possible(e, kinds[e.src], kinds[e.dst], triples)] for e in single]
@@ -477,7 +479,7 @@ def kinds_left(
 
 
 def _pass(kinds: dict[str, Kinds], edges: list[Edge], ways: list[list[Triple]]) -> bool:
-    """Narrow the ends of each edge once, and what it may be; whether that changed anything."""
+    """Narrow both ends and the triples of each edge once. Return true if something changed."""
     changed = False
     for place, edge in enumerate(edges):
         starts, ends = kinds[edge.src].every, kinds[edge.dst].every
@@ -492,7 +494,7 @@ def _pass(kinds: dict[str, Kinds], edges: list[Edge], ways: list[list[Triple]]) 
 
 
 def possible(edge: Edge, src: Kinds, dst: Kinds, triples: Iterable[Triple]) -> Iterator[Triple]:
-    """The triples that an edge may be, as seen from its ends: the second is what ``src`` is."""
+    """Yield the triples that an edge can have. The second item is the kind of ``src``."""
     relations, starts, ends, both = edge.relations, src.every, dst.every, edge.both
     for triple in triples:
         relation, one, other = triple
@@ -505,7 +507,7 @@ def possible(edge: Edge, src: Kinds, dst: Kinds, triples: Iterable[Triple]) -> I
 
 
 def ordered(scope: Scope, catalog: Catalog) -> Scope:
-    """Edges in an order that starts with the rarest and goes on with the rarest that is connected."""
+    """Sort edges by frequency, rarest first, so that each is connected to an earlier edge if possible."""
     counts = {**catalog.map_edges, **catalog.edges}
 
     def rows(edge: Edge) -> int:
@@ -524,12 +526,12 @@ def ordered(scope: Scope, catalog: Catalog) -> Scope:
 
 
 def labels_to_conditions(scope: Scope, _: Catalog) -> Scope:
-    """A label that a block asks of a node outside it is a condition on that node's attributes."""
+    """Convert labels that a block requires of outer nodes to conditions on their attributes."""
     return replace(scope, where=tuple(map(_attributes, scope.where)))
 
 
 def _attributes(condition: Bound) -> Bound:
-    """The same, if it is not a label; values that are returned are made of labels, too."""
+    """Convert label tests in an expression to conditions on attributes."""
     if not isinstance(condition, LabelTest):
         return with_operands(condition, _attributes)
     kind = NodeAttribute(condition.node, NODE_ATTRIBUTES["kind"], Type.text)
@@ -552,11 +554,11 @@ def _words(kinds: frozenset[str]) -> Choices:
 INVARIANT: Final = FrameAttribute(
     Attribute("held", Type.number, {}, "how many frames a row stands for"), Type.number
 )
-"""What counts of matches add up where a row may stand for many frames."""
+"""Number of frames of a row. ``COUNT(*)`` sums it if a row can stand for several frames."""
 
 
 def is_lasting(leaf: Leaf, scope: Scope, catalog: Catalog) -> bool:
-    """Tell whether a value is the same in all frames of a bucket in which its binding holds."""
+    """True if a value is the same in all frames of a bucket in which its binding holds."""
     match leaf:
         case NodeValue() | EdgeRelation() | TraceAttribute():
             return True
@@ -572,10 +574,9 @@ def is_lasting(leaf: Leaf, scope: Scope, catalog: Catalog) -> bool:
 
 
 def count_by_buckets(query: Query, catalog: Catalog) -> Query:
-    """``COUNT(*)`` of what is the same in all frames of a bucket adds up how many frames each row holds in.
+    """Replace ``COUNT(*)`` by the sum of the frames per row, if no value needs single frames.
 
-    Nothing else of the result may need single frames: values are constants, and of the other aggregates there
-    are only those to which it is all the same how often a value comes.
+    All values must be constant within a bucket. Other aggregates must not depend on how often a value occurs.
     """
     result = query.result
     values = result.values
@@ -614,7 +615,7 @@ _MORE: Final = {">", ">=", "="}
 
 
 def bounds(conditions: list[Bound]) -> list[Bound]:
-    """Conditions that follow from others and are cheap to test: ``gap < t`` needs circles that near."""
+    """Return simple conditions that follow from others: ``gap < t`` implies that circles are near."""
     found: list[Bound] = []
     for condition in conditions:
         match condition:
@@ -638,7 +639,7 @@ def _bound(pair: PairNumber, limit: Bound) -> list[Bound]:
 
 
 def is_dear(leaf: Leaf) -> bool:
-    """Tell whether it is a number of pairs that takes long to compute."""
+    """True if a pair number is expensive to compute."""
     return (
         isinstance(leaf, PairNumber)
         and leaf.function in PAIR_FUNCTIONS

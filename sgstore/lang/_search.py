@@ -1,7 +1,7 @@
-"""Patterns over one graph in memory: the online twin of the SQL that the compiler emits.
+"""Search of patterns in one graph in memory, with the same results as the SQL of the compiler.
 
-The nodes of a pattern are bound one after the other: where an edge leads there, from the neighbours of one that
-is bound already. Every condition is tested as soon as all that it speaks of is bound.
+The nodes of a pattern are bound one after the other. If an edge leads to a node, its candidates are the
+neighbours of a bound node. Each condition is tested as soon as all its variables are bound.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class _SearchStep:
-    """A node to be bound, where it is looked for, and what can be tested once it is bound.
+    """Node to bind, the source of its candidates, and the tests after it is bound.
 
-    ``crowd`` is tested before, of all that it may be at once.
+    The tests in ``crowd`` run before binding, for all candidates at once.
     """
 
     key: str
@@ -48,20 +48,20 @@ class _SearchStep:
 
     @property
     def among(self) -> bool:
-        """Tell whether all nodes of its kinds are looked at, not only neighbours or the ego."""
+        """True if the candidates are all nodes of some kinds, not only neighbours or the ego."""
         return bool(self.key) and self.via is None and bool(self.kinds.other)
 
 
 @dataclass(slots=True)
 class _NamedEdge:
-    """An edge that is bound too, because it has a name or conditions of its own."""
+    """Edge to bind, because it has a name or conditions."""
 
     edge: Edge
     tests: list[Evaluate]
 
 
 class ScopeSearch:
-    """The plan of one scope: what is bound in which order."""
+    """Search plan of one scope: the order in which its nodes are bound."""
 
     def __init__(self, scope: Scope, *, injective: bool) -> None:
         self._scope = scope
@@ -97,7 +97,7 @@ class ScopeSearch:
                 (place.tests if place else step.tests).append(test)
 
     def _order(self) -> list[_SearchStep]:
-        """Own nodes: those that an edge leads to from what is bound, the ego, then those of few kinds."""
+        """Return the search steps: nodes reached by edges first, then the ego, then nodes of few kinds."""
         scope, bound, steps = self._scope, set(self._scope.outer), list[_SearchStep]()
         left = dict.fromkeys(scope.nodes)
         while left:
@@ -116,7 +116,7 @@ class ScopeSearch:
         return steps
 
     def _way(self, key: str, bound: set[str]) -> Edge | None:
-        """An edge of length 1 that leads to a node from what is bound."""
+        """Return a single edge from a bound node to the given node, or None."""
         for edge in self._scope.edges:
             other = edge.dst if edge.src == key else edge.src
             if key in {edge.src, edge.dst} and other in bound and edge.high == 1:
@@ -124,7 +124,7 @@ class ScopeSearch:
         return None
 
     def run(self, at: Binding) -> Iterator[None]:
-        """Every way to bind the scope; ``at`` holds it while it is looked at."""
+        """Yield once for each match of the scope. ``at`` holds the current binding."""
         if all(at.view.is_one(at.nodes[key], kinds) for key, kinds in self._outer):
             yield from self._bound(at, 0)
 
@@ -146,13 +146,13 @@ class ScopeSearch:
                 yield from self._bound(at, number)
 
     def _bound(self, at: Binding, number: int) -> Iterator[None]:
-        """Go on after a step, if what can be tested now is true."""
+        """Continue after a step if all its tests are true."""
         step = self._steps[number]
         if all(self._linked(at, edge) for edge in step.edges) and _all(step.tests, at):
             yield from self._name(at, number, 0)
 
     def _name(self, at: Binding, number: int, nth: int) -> Iterator[None]:
-        """Bind the edges of a step that have names or conditions, then go on."""
+        """Bind the edges of a step that have names or conditions, then continue."""
         step = self._steps[number]
         if nth == len(step.named):
             yield from self._bind(at, number + 1)
@@ -162,7 +162,7 @@ class ScopeSearch:
             at.edges[named.edge.key] = found
             if _all(named.tests, at):
                 yield from self._name(at, number, nth + 1)
-                if not named.edge.named:  # that there is one is enough
+                if not named.edge.named:  # one such edge is sufficient
                     return
 
     def _linked(self, at: Binding, edge: Edge) -> bool:
@@ -176,7 +176,7 @@ class ScopeSearch:
     def _walks(
         self, view: FrameView, edge: Edge, here: int, dst: int, length: int, seen: tuple[int, ...]
     ) -> bool:
-        """Tell whether so many edges lead from one node to another; nodes on the way differ, if nodes do."""
+        """True if a path of the given length connects two nodes. Inner nodes differ if nodes must differ."""
         if length == 0:
             return here == dst
         for step in _steps(view.linked(edge), edge.relations, here, both=edge.both):
@@ -188,13 +188,13 @@ class ScopeSearch:
 
 
 def expression(of: b.Bound, *, injective: bool) -> Evaluate:
-    """The function that gives the value of an expression for a binding.
+    """Return the function that evaluates an expression for a binding.
 
     Parameters
     ----------
     of : Bound
     injective : bool
-        Whether different nodes of a block are bound to different nodes.
+        True if different nodes of a block must be bound to different nodes.
     """
     return evaluator(of, lambda block: _block(block, injective=injective))
 
@@ -204,7 +204,7 @@ def _block(block: BlockValue, *, injective: bool) -> Evaluate:
     value = expression(block.value, injective=injective) if block.value is not None else None
 
     def of_block(at: Binding) -> Any:
-        # The search binds as it goes, and must leave what is bound outside as it is.
+        # The search changes bindings, but must not change the outer ones.
         within = Binding(at.view, dict(at.nodes), dict(at.edges))
         found = inner.run(within)
         if block.word == "EXISTS":
@@ -232,12 +232,12 @@ def _all(tests: list[Evaluate], at: Binding) -> bool:
 
 
 def _needs(condition: b.Bound) -> tuple[frozenset[str], frozenset[str]]:
-    """Nodes and edges that must be bound before a condition can be tested."""
+    """Return the nodes and edges that must be bound before a condition can be tested."""
     return b.nodes_of(condition), b.edges_of(condition)
 
 
 def _candidates(at: Binding, step: _SearchStep) -> Iterator[int]:
-    """Nodes that a step may bind: neighbours of a bound one, or all of the kinds."""
+    """Yield the candidates of a step: neighbours of a bound node, or all nodes of some kinds."""
     view, edge = at.view, step.via
     if edge is not None:
         forward = edge.dst == step.key
@@ -253,7 +253,7 @@ def _candidates(at: Binding, step: _SearchStep) -> Iterator[int]:
 
 
 def _fitting(at: Binding, step: _SearchStep) -> list[int]:
-    """Nodes that a step may bind of which all is true that is tested at once."""
+    """Return the candidates of a step that pass all tests for many nodes at once."""
     among = crowd(at.view, step.kinds)
     fits = step.crowd[0](at, among)
     for test in step.crowd[1:]:
@@ -264,7 +264,7 @@ def _fitting(at: Binding, step: _SearchStep) -> list[int]:
 def _steps(
     view: FrameView, relations: frozenset[str], here: int, *, both: bool, forward: bool = True
 ) -> Iterator[int]:
-    """Nodes to which edges lead from a node, each once."""
+    """Yield the neighbours of a node along some relations, without duplicates."""
     sides = (view.ahead, view.back) if both else (view.ahead,) if forward else (view.back,)
     found: dict[int, None] = {}
     for side in sides:
@@ -274,7 +274,7 @@ def _steps(
 
 
 def _between(at: Binding, edge: Edge) -> Iterator[tuple[str, Attributes]]:
-    """Relation and attributes of the edges between two bound nodes, each relation once."""
+    """Yield relation and attributes of the edges between two bound nodes, each relation once."""
     src, dst = at.nodes[edge.src], at.nodes[edge.dst]
     links = at.view.linked(edge).links
     found = dict(links.get((src, dst), {}))

@@ -1,8 +1,8 @@
-"""SQL of queries in several parts: ``OPTIONAL MATCH``, ``WITH``, and a ``MATCH`` behind them.
+"""SQL of queries with stages: ``OPTIONAL MATCH``, ``WITH``, and later ``MATCH`` clauses.
 
-Each part makes a relation of the one before it: one row a frame and match, with the nodes and edges that are
-bound, and the values that ``WITH`` passed on. What is returned is asked of the last one as of matches that are
-known (:attr:`SqlBuilder.found`): a node that is NULL has no rows in any table, so all its values are NULL.
+Each stage converts the relation of the previous stage: one row for each frame and match, with the bound nodes
+and edges, and the values passed by ``WITH``. The results are computed from the last relation as from known
+matches (:attr:`SqlBuilder.found`). A node that is NULL has no rows in any table, so all its values are NULL.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ if TYPE_CHECKING:
 
 
 def staged_matches(query: Query, catalog: Catalog, window: Window | None) -> SqlBuilder:
-    """A builder for a query in several parts, whose matches are a relation before the statement.
+    """Return a builder for a query with stages, with its matches as a shared relation.
 
     Parameters
     ----------
     query : Query
-        Rewritten.
+        Rewritten query.
     catalog : Catalog
     window : Window or None
     """
@@ -87,7 +87,7 @@ def _first(sql: SqlBuilder, query: Query, stage: MatchStage) -> SharedRelation:
 
 
 def _late(stage: MatchStage) -> tuple[list[Bound], list[Leaf]]:
-    """Conditions about what has been passed on, and paths, and what of the pattern they are made of."""
+    """Return conditions on passed values and paths, and the pattern values that they need."""
     late = [one for one in stage.scope.where if _speaks_of_passed(one)]
     wanted = [leaf for one in late for leaf in leaves(one) if not is_passed_on(leaf)]
     return late, list(dict.fromkeys(wanted))
@@ -100,7 +100,7 @@ def _pattern(
     rows: SharedRelation | None,
     wanted: list[Leaf],
 ) -> str:
-    """The matches of the pattern of a stage, with its paths as lists, and some values."""
+    """Return SQL for the matches of a stage, with its paths as lists and the wanted values."""
     nodes, edges = _bound(stage.scope)
     outer = frozenset(stage.scope.outer)
     texts: list[str] = []
@@ -108,7 +108,8 @@ def _pattern(
     for way in [one for one in stage.ways if one.scope.where != (FALSE,)] or stage.ways[:1]:
         where = tuple(one for one in way.scope.where if not _speaks_of_passed(one))
         scope = replace(way.scope, where=where)
-        # Conditions of blocks in a later pattern are looked for in the query; it is not the outermost scope.
+        # Conditions of blocks in a later pattern are searched in the query. The pattern is not the outermost
+        # scope.
         asked = scope if rows is None else replace(scope)
         told = Result(columns=tuple(ReturnColumn(column_of(leaf), leaf) for leaf in wanted))
         sql.query, sql.found = replace(query, scope=asked, result=told, stages=()), None
@@ -136,7 +137,7 @@ def _with_paths(
 def _joined(
     sql: SqlBuilder, query: Query, rows: SharedRelation, stage: MatchStage
 ) -> SharedRelation:
-    """The rows so far with the matches of a further pattern beside them."""
+    """Join the matches of another pattern to the previous rows."""
     outer = frozenset(stage.scope.outer)
     nodes, edges = _bound(stage.scope)
     late, wanted = _late(stage)
@@ -160,13 +161,13 @@ def _joined(
 
 
 def _bound(scope: Scope) -> tuple[frozenset[str], frozenset[str]]:
-    """Nodes and edges of its own by which the matches of a pattern are told apart."""
+    """Return the nodes and edges that distinguish the matches of a pattern."""
     nodes = frozenset(key for key, node in scope.nodes.items() if node.role != "hidden")
     return nodes, frozenset(edge.key for edge in scope.edges if edge.named)
 
 
 def _given(sql: SqlBuilder, rows: SharedRelation, outer: frozenset[str]) -> SharedRelation:
-    """What the outer nodes of a pattern are bound to, as masks; where one is NULL it has no match."""
+    """Return masks of the outer nodes of a pattern. Rows with NULL have no match."""
     keys = columns_of(outer)
     known = [f"{key} IS NOT NULL" for key in keys]
     each = Select(['"frame_id"', *keys], [quoted(rows.name)], known, distinct=True)
@@ -183,7 +184,7 @@ def _speaks_of_passed(condition: Bound) -> bool:
 def _passed(
     sql: SqlBuilder, query: Query, rows: SharedRelation, stage: WithStage
 ) -> SharedRelation:
-    """The rows that ``WITH`` passes on."""
+    """Return the rows that ``WITH`` passes on."""
     values = [column.value for column in stage.values]
     collected = any(in_order(part) for value in values for part in walk(value))
     text = _of_rows(sql, query, rows, stage.before, values)
@@ -205,7 +206,7 @@ def _passed(
     texts: dict[str, str] = {}
     groups = list(range(1, len(select.columns) + 1))
     columns = zip(stage.values, stage.places, strict=True)
-    # A value by which rows are grouped comes before what is counted beside it, and has the same text there.
+    # A grouping value comes before the aggregates, and has the same SQL text there.
     for column, place in sorted(columns, key=lambda one: is_counted(one[0].value)):
         texts[column.name] = expression_text(column.value, _leaf_of(texts), sql.values)
         select.columns.append(f"{texts[column.name]} AS {quoted(column_of(place))}")
@@ -232,7 +233,7 @@ def _told(rows: SharedRelation) -> list[str]:
 def _of_rows(
     sql: SqlBuilder, query: Query, rows: SharedRelation, scope: Scope, values: Iterable[Bound]
 ) -> str:
-    """The rows so far, with what some values are made of."""
+    """Return SQL for the previous rows, with the leaves of some values."""
     asked = replace(query, scope=scope, result=Result(), stages=())
     sql.query, sql.found = asked, rows
     wanted: list[Leaf] = [leaf for value in values for leaf in leaves(value)]
@@ -251,7 +252,7 @@ def _leaf_of(texts: dict[str, str]) -> Callable[[Leaf], str]:
 def _chosen(
     sql: SqlBuilder, query: Query, rows: SharedRelation, stage: WithStage
 ) -> SharedRelation:
-    """The first rows of each frame, and those of them of which the condition is true."""
+    """Return the first rows of each frame that meet the condition."""
     columns = ['"frame_id"', *columns_of(rows.nodes, rows.edges), *_told(rows)]
     if stage.skip or stage.limit is not None:
         keys = [

@@ -1,7 +1,7 @@
-"""SQL of numbers that are looked up: by lanes (distances, courses), and in what was recorded later.
+"""SQL of looked-up numbers: lane distances, lane properties, and measures from later frames.
 
-A node is on stretches of lanes: an entity in one place of each of its own lanes, a light or a sign where the
-lanes that it controls are waited on, a part of the map where ``map_place`` has it.
+A node lies on stretches of lanes: an entity at one point of each of its own lanes, a light or a sign at the
+waiting places of the lanes that it controls, a part of the map at its ``map_place``.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _SIGNALS: Final = frozenset(SIGNALS)
 
 @dataclass(frozen=True, slots=True)
 class WayEnd:
-    """A node that a way leads from or to: the column of its id, and what it may be."""
+    """Start or end node of a way: the column of its id, and its possible kinds."""
 
     node: str
     kinds: Kinds
@@ -43,9 +43,9 @@ def way_text(function: str, frame: str, ends: tuple[WayEnd, WayEnd], catalog: Ca
     ----------
     function : str
     frame : str
-        The column of the frame.
+        Column of the frame id.
     ends : (WayEnd, WayEnd)
-        The same twice, where it is a function of one.
+        Both nodes; the same node twice for a function of one node.
     catalog : Catalog
     """
     if function in NEXT_PARTS:
@@ -63,14 +63,14 @@ _BEHIND: Final = """max(CASE WHEN "way" < 0 THEN "way" END)"""
 
 
 def _between_entities(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog) -> str:
-    """The distance between two places, which need no stretches."""
+    """Return the SQL of the lane distance between two entities, which are points on lanes."""
     conditions = [
         condition
         for alias, end in zip((":a", ":b"), ends, strict=True)
         for condition in _kinds_of(end, alias, catalog)
     ]
     a, b = (end.node for end in ends)
-    # Each row is tied to the frame asked for, not to the others: that is what tells DuckDB where to begin.
+    # Each row is joined to the given frame, not to other rows. So DuckDB starts with the frame.
     more = "".join(f"\n        AND {condition}" for condition in conditions)
     return f"""(
     SELECT CASE WHEN {_BEHIND} IS NULL OR {_AHEAD} <= -{_BEHIND} THEN {_AHEAD} ELSE {_BEHIND} END
@@ -86,7 +86,7 @@ def _between_entities(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog)
 
 
 def _between(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog, *, parts: bool) -> str:
-    """The distance from the end of one stretch to the start of the other, 0 where they overlap."""
+    """Return the SQL of the distance between two stretches of lanes, 0 if they overlap."""
     one, other = (_stretches(frame, end, catalog, parts=parts) for end in ends)
     near = '":r"."start" + (":b"."first" - ":a"."last")'
     far = '":r"."start" + (":b"."last" - ":a"."first")'
@@ -102,7 +102,7 @@ def _between(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog, *, parts
 
 
 def _next_text(frame: str, end: WayEnd, what: str, catalog: Catalog) -> str:
-    """The distance to the next part of the map of one sort, 0 on it."""
+    """Return the SQL of the distance to the next map part of one type, 0 on it."""
     places = _stretches(frame, end, catalog, parts=False)
     return f"""(
     SELECT min(CASE WHEN "near" < 0 THEN 0 ELSE "near" END)
@@ -118,7 +118,7 @@ def _next_text(frame: str, end: WayEnd, what: str, catalog: Catalog) -> str:
 
 
 def _course_text(frame: str, end: WayEnd, column: str, catalog: Catalog) -> str:
-    """How the lane runs that an entity is in above all, where it is."""
+    """Return the SQL of a property of the primary lane at the place of an entity."""
     more = "".join(f" AND {one}" for one in _kinds_of(end, ":s", catalog))
     return f"""(
     SELECT min(":c"."{column}")
@@ -131,7 +131,7 @@ def _course_text(frame: str, end: WayEnd, column: str, catalog: Catalog) -> str:
 
 
 def told_lanes(what: str) -> str:
-    """The statement for the traces whose map tells of lanes: ``ways``, ``curvature``, ``slope``."""
+    """Return SQL for the traces whose map has lane data: ``ways``, ``curvature`` or ``slope``."""
     known = "" if what == "ways" else f' AND ":c"."{what}" IS NOT NULL'
     table = "map_reach" if what == "ways" else "map_course"
     return (
@@ -141,7 +141,7 @@ def told_lanes(what: str) -> str:
 
 
 def _stretches(frame: str, end: WayEnd, catalog: Catalog, *, parts: bool) -> str:
-    """A relation of the lanes on which a node is, from where to where along them."""
+    """Return SQL for the lane stretches on which a node lies, with start and end along the lane."""
     kinds, held = end.kinds.every, catalog.moving | catalog.fixed
     found: list[str] = []
     if kinds & entity_kinds() - _SIGNALS:
@@ -168,7 +168,7 @@ def _stretches(frame: str, end: WayEnd, catalog: Catalog, *, parts: bool) -> str
 
 
 def _controlled(frame: str, node: str, kinds: frozenset[str], edges: str) -> str:
-    """Places to wait on lanes that a light or a sign controls: as the map says, else at a junction."""
+    """Return SQL for the waiting places of a light or sign: from the map, otherwise at a junction."""
     at = """coalesce(":p"."start", CASE WHEN ":m"."junction" IS NOT NULL THEN 0 ELSE ":m"."length" END)"""
     signals = ", ".join(literal(kind) for kind in SIGNALS if kind in kinds)
     return f"""SELECT ":c"."dst" AS "lane", {at} AS "first", {at} AS "last"
@@ -181,25 +181,25 @@ def _controlled(frame: str, node: str, kinds: frozenset[str], edges: str) -> str
 
 
 def _kinds_of(end: WayEnd, alias: str, catalog: Catalog) -> list[str]:
-    """Conditions on the rows of ``lane_state`` of an entity, so that fewer are looked at."""
+    """Return conditions on the ``lane_state`` rows of an entity, to reduce the rows to read."""
     kinds = end.kinds.only(entity_kinds() - _SIGNALS)
     held = catalog.moving | catalog.fixed
     return kind_conditions(kinds, f'"{alias}"."kind"', f'"{alias}"."is_ego"', held)
 
 
-# What was recorded later ---------------------------------------------------------------------------
+# Measures from later frames ------------------------------------------------------------------------
 
 LOOKED_UP: Final = WAYS | RECORDED.keys()
-"""Numbers of pairs that are no expressions of values of both."""
+"""Pair numbers that are looked up, not computed from values of both nodes."""
 
 
 def of_later(found: Iterable[Leaf]) -> list[PairNumber]:
-    """The measures of what was recorded among values: dear, so that they are asked when all else is tested."""
+    """Return the measures from later frames. They are expensive, so they are evaluated last."""
     return [leaf for leaf in found if isinstance(leaf, PairNumber) and leaf.function in RECORDED]
 
 
 def recorded_text(value: PairNumber, *, world: bool) -> str:
-    """A measure of what was recorded, of the nodes of a row; stores have the function (``_encounters``)."""
+    """Return the SQL call of a measure from later frames, a function that stores define."""
     name = f"{KNOWN if world else ''}{value.function}"
     ends = ", ".join(quoted(f"{key}.id") for key in (value.a, value.b))
     return f'recorded({literal(name)}, "frame_id" >> {TRACE_OF_FRAME}, {ends})'

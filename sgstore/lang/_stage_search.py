@@ -1,7 +1,7 @@
-"""Queries in several parts over one graph in memory: ``OPTIONAL MATCH``, ``WITH``, paths with names.
+"""Search of queries with stages in one graph in memory: ``OPTIONAL MATCH``, ``WITH``, named paths.
 
-Each part makes other rows of the rows so far: a row says what nodes and edges are bound to (``None``: absent),
-and what values ``WITH`` and paths have. :mod:`sgstore.lang._sql_stages` is its twin in a store.
+Each stage converts the rows of the previous stage. A row holds the bound nodes and edges (``None`` means
+absent), and the values of ``WITH`` and paths. :mod:`sgstore.lang._sql_stages` does the same in a store.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ _Part = Callable[[FrameView, Rows], Rows]
 
 
 class StageSearch:
-    """Plan of a query in several parts.
+    """Search plan of a query with stages.
 
     Parameters
     ----------
     query : Query
-        With stages, as it was bound.
+        Bound query with stages.
     """
 
     def __init__(self, query: b.Query) -> None:
@@ -44,14 +44,14 @@ class StageSearch:
         ]
 
     def rows(self, view: FrameView) -> Rows:
-        """Rows of a graph after all parts."""
+        """Return the rows of a graph after all stages."""
         rows = [Binding(view)]
         for part in self._parts:
             rows = part(view, rows)
         return rows
 
     def value(self, of: b.Bound) -> Evaluate:
-        """The function that gives the value of an expression about a row."""
+        """Return the function that evaluates an expression for a row."""
         return _value(of, injective=self._injective)
 
 
@@ -59,7 +59,7 @@ class StageSearch:
 
 
 class _Joining:
-    """A pattern whose matches stand beside the rows so far."""
+    """Stage that joins the matches of a pattern to the previous rows."""
 
     def __init__(self, stage: b.MatchStage, injective: bool) -> None:  # noqa: FBT001
         self._stage = stage
@@ -95,7 +95,7 @@ class _Joining:
         return found
 
     def _beside(self, view: FrameView, row: Binding) -> Iterator[Binding]:
-        """The row with each match of the pattern."""
+        """Yield a row extended by each match of the pattern."""
         if _absent(row, self._stage.scope.outer, ()):
             return
         told: set[object] = set()
@@ -125,7 +125,7 @@ def _row(view: FrameView, nodes: Any, edges: Any, passed: Any) -> Binding:
 
 
 class _Passing:
-    """What ``WITH`` makes of the rows of a frame."""
+    """``WITH`` stage: converts the rows of a frame."""
 
     def __init__(self, stage: b.WithStage, injective: bool) -> None:  # noqa: FBT001
         self._stage, self._injective = stage, injective
@@ -157,7 +157,7 @@ class _Passing:
         return [row for row in found if all(test(row) is True for test in self._where)]
 
     def _passed(self, row: Binding, *, bare: bool = False) -> Binding:
-        """A row with the names, and the values, that are passed on; with nothing else if it is ``bare``."""
+        """Return a row with the passed names and values. With ``bare``, all others are removed."""
         stage = self._stage
         nodes = {new: row.nodes[old] for new, old in stage.nodes}
         edges = {edge.key: row.edges[old] for edge, old in stage.edges}
@@ -168,7 +168,7 @@ class _Passing:
         return Binding(row.view, nodes, edges, passed)
 
     def _groups(self, rows: Rows) -> Rows:
-        """A row for each combination of what is passed on and not counted."""
+        """Return one row for each combination of grouping values."""
         members: dict[object, Rows] = {}
         kept: dict[object, Binding] = {}
         for row in rows:
@@ -186,7 +186,7 @@ class _Passing:
         return list(kept.values())
 
     def _counted(self, value: b.Bound, rows: Rows, told: Mapping[str, Any]) -> Any:
-        """A value that is counted of some rows, or made of such values."""
+        """Evaluate an aggregating expression over some rows."""
         match value:
             case b.Aggregate():
                 return _aggregate(value, rows, injective=self._injective)
@@ -204,14 +204,14 @@ def _always(value: Any) -> Evaluate:
 
 
 def _place(row: Binding) -> tuple[tuple[bool, Any], ...]:
-    """Where a row comes if nothing else is said."""
+    """Return the default sort key of a row."""
     nodes = [row.nodes[key] for key in sorted(row.nodes)]
     edges = [row.edges[key] and row.edges[key][0] for key in sorted(row.edges)]
     return tuple((one is None, one or 0) for one in (*nodes, *edges, *row.passed.values()))
 
 
 def _aggregate(of: b.Aggregate, rows: Rows, *, injective: bool) -> Any:
-    """``COUNT``, ``SUM``, … of some rows; see :mod:`sgstore.lang._aggregates`."""
+    """Evaluate an aggregate over some rows; see :mod:`sgstore.lang._aggregates`."""
     if of.operand is None:
         return len(rows)
     value = _value(of.operand, injective=injective)
@@ -241,17 +241,17 @@ AGGREGATE: Final[Mapping[str, Callable[[list[Any], b.Aggregate], Any]]] = {
     "percentile": _quantile,
     "collect": lambda values, of: sorted(values) if of.distinct else values,
 }
-"""Values of aggregates, of the values that are known."""
+"""Functions that compute aggregates from the known values."""
 
 
 # Values -------------------------------------------------------------------------------------------
 
 _OF_NOTHING: Final = {"EXISTS": False, "COUNT": 0, "SUM": 0.0}
-"""The value of a block that speaks of a node which is absent; of others it is not known."""
+"""Values of blocks that use an absent node. Other blocks are unknown."""
 
 
 def _value(of: b.Bound, *, injective: bool) -> Evaluate:
-    """The function that gives the value of an expression about a row, some of whose nodes may be absent."""
+    """Return the function that evaluates an expression for a row, whose nodes may be absent."""
     match of:
         case b.Operation(word=word, operands=operands):
             return OPERATORS[word].one([_value(one, injective=injective) for one in operands])
@@ -269,6 +269,6 @@ def _value(of: b.Bound, *, injective: bool) -> Evaluate:
 
 
 def _absent(row: Binding, nodes: Iterable[str], edges: Iterable[str]) -> bool:
-    """Tell whether some of these nodes and edges are bound to nothing."""
+    """True if at least one of the nodes and edges is absent."""
     bound = {**row.nodes, **row.edges}
     return any(bound.get(key) is None for key in (*nodes, *edges))

@@ -1,7 +1,7 @@
-"""``UNION``: the answers of several queries as one.
+"""Splitting of a ``UNION`` into its queries, and joining of their rows.
 
-Each part is a query of its own, with settings, order and limits of its own; here a text is taken apart into
-them. Their answers are joined by :class:`sgstore.matches.UnionMatches`.
+Each part is a separate query with its own settings, order and limits. :class:`sgstore.matches.UnionMatches`
+joins their answers.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class UnionPart:
-    """A query of a ``UNION``.
+    """Query that is part of a ``UNION``.
 
     Attributes
     ----------
     text : str
-        The whole text, with blanks in place of the other parts: places in it stay what they are.
+        The whole text, with blanks in place of the other parts, so that positions stay valid.
     values : mapping of str to value
-        Those of the parameters that it speaks of.
+        Values of the parameters that the part uses.
     span : TextSpan
-        Where it stands.
+        Position of the part in the text.
     """
 
     text: str
@@ -49,22 +49,22 @@ class UnionPart:
 
 @dataclass(frozen=True, slots=True)
 class UnionParts:
-    """The parts of a ``UNION``; ``distinct`` unless it is ``UNION ALL``."""
+    """Parts of a ``UNION``. ``distinct`` is false for ``UNION ALL``."""
 
     parts: tuple[UnionPart, ...]
     distinct: bool
 
     def each(self, find: Callable[[str, Mapping[str, Any]], T], text: str) -> list[T]:
-        """The answers to all parts, given what answers one, and the whole text.
+        """Run all parts with a function and return their answers.
 
         Raises
         ------
         QueryError
-            A part is no query, or names what is not known.
+            A part is invalid, or contains an unknown name.
         """
         try:
             return [find(part.text, part.values) for part in self.parts]
-        except QueryError as error:  # its text has blanks in place of the other parts
+        except QueryError as error:  # the text of the error has blanks in place of the other parts
             reason, span = error.reason, error.span
             raise type(error)(reason, text=text, span=span, hint=error.hint) from None
 
@@ -74,20 +74,20 @@ _LETTER: Final = re.compile(r"[^\n]")
 
 
 def union_parts(text: str, values: Mapping[str, Any]) -> UnionParts | None:
-    """The parts of a text that is a ``UNION``; ``None`` if it is none.
+    """Return the parts of a ``UNION`` text, or None for other texts.
 
     Parameters
     ----------
     text : str
     values : mapping of str to value
-        Of its parameters.
+        Values of the parameters.
 
     Raises
     ------
     QuerySyntaxError
-        The text is not a sentence of the language.
+        The text does not match the grammar.
     QueryError
-        There is another query beside the union, or a parameter that no part has.
+        The text has another query besides the union, or no part uses a parameter.
     """
     if not _UNION.search(text):  # most texts: they are parsed once
         return None
@@ -113,7 +113,7 @@ def union_parts(text: str, values: Mapping[str, Any]) -> UnionParts | None:
 
 
 def _parameters_of(part: s.MatchClause, defined: Iterable[s.Define]) -> set[str]:
-    """The names of the parameters of a part, and of the definitions that it uses."""
+    """Return the names of the parameters of a part and of the definitions that it uses."""
     found, waiting = set(parameters_in(part)), {*_called(part)}
     by_name = {normalize_name(one.name): one for one in defined}
     while used := waiting & by_name.keys():
@@ -126,7 +126,7 @@ def _parameters_of(part: s.MatchClause, defined: Iterable[s.Define]) -> set[str]
 
 
 def _called(part: object) -> Iterator[str]:
-    """The folded names of what a part of a text calls."""
+    """Yield the folded names that a part of a text calls."""
     return (
         normalize_name(one.name) for one in _walk(part) if isinstance(one, s.Call | s.ScenarioStep)
     )
@@ -141,23 +141,23 @@ def _alone(text: str, union: TextSpan, part: TextSpan) -> str:
 def joined_rows(
     columns: Sequence[str], tables: Sequence[str], result: Sequence[Result], *, distinct: bool
 ) -> tuple[Select, bool]:
-    """The statement of the rows of several tables, and whether it binds the names of the traces.
+    """Return the statement that joins the rows of several tables.
 
     Parameters
     ----------
     columns : sequence of str
-        That all tables have; they may have others, which tell rows apart.
+        Columns that all tables have. Tables may have other columns, which distinguish rows.
     tables : sequence of str
     result : sequence of Result
-        What each part returns.
+        Result clause of each part.
     distinct : bool
-        Whether each row comes once.
+        True to remove duplicate rows.
 
     Returns
     -------
     select : Select
     named : bool
-        Whether ``$1`` stands for the names of all traces, in their order.
+        True if ``$1`` is the list of all trace names, in order.
     """
     parts: list[str] = []
     for number, table in enumerate(tables):
@@ -172,7 +172,7 @@ def joined_rows(
     if not distinct and (ordered or not first.names):
         joined.order = ['":number"', '":place"']
         return joined, False
-    # By name of the trace as people count, then by time, then by the values.
+    # Sorted by trace name with numbers by value, then by time, then by the values.
     named = {one.name for one in first.columns if one.value == _TRACE_NAME}
     named |= {"trace"} & set(first.names)
     told = [name for name in columns if name != "frame_id" or not first.names]
@@ -186,18 +186,18 @@ _TRACE_NAME: Final = TraceAttribute(TRACE_ATTRIBUTES["name"], Type.text)
 
 
 def each_match(statements: Iterable[s.Statement]) -> Iterator[s.Statement]:
-    """Statements, with the parts of a union in its place."""
+    """Yield statements, with a union replaced by its parts."""
     for statement in statements:
         yield from statement.parts if isinstance(statement, s.UnionClause) else (statement,)
 
 
 def parameters_in(part: object) -> Iterator[str]:
-    """The names of the parameters in a part of a text."""
+    """Yield the names of the parameters in a part of a text."""
     return (one.name for one in _walk(part) if isinstance(one, s.Parameter))
 
 
 def _walk(part: object) -> Iterator[object]:
-    """A part of a syntax tree, and all that it is made of."""
+    """Yield a part of a syntax tree and all its subparts."""
     yield part
     inner = part if isinstance(part, tuple) else ()
     if is_dataclass(part):
