@@ -1,13 +1,12 @@
-"""Graphs that other tools made → frames of a store, which patterns, classes and coverage treat as any others.
+"""Import of scene graphs from other tools into a store.
 
-``lines`` reads text of strangers within bounds · ``tables`` and ``nodelink`` make graphs as they are given of
-it · ``words`` says what their labels and relations mean · ``meant`` understands graph after graph ·
-``attributes`` turns values into columns · ``blocks`` makes blocks of frames of them · ``running`` brings a
-file into a store.
+``_formats`` and ``_openlabel`` read the files, with limits for untrusted input. ``_resolve`` maps labels and
+relations to the vocabulary. ``_run`` builds frames and stores them.
 
-A file becomes a trace, a graph of it a frame, in the order of the file. A node is the same entity in two
-graphs if it has the same name and kind. Lanes, roads and other parts keep the names of the file and have no
-geometry: what needs poses is unknown of such frames. The view ``imports`` says what the file calls each frame.
+A file becomes a trace; each of its graphs becomes a frame, in file order. Nodes of two graphs are the same
+entity if their name and kind are equal. Lanes, roads and other map parts keep the names of the file and have no
+geometry. Functions of poses are therefore unknown in such frames. The view ``imports`` contains the file's name
+of each frame.
 """
 
 import lazy_loader

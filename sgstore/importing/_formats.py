@@ -1,6 +1,6 @@
-"""File formats of graphs: node-link JSON, and tables of edges.
+"""Readers of graph files: node-link JSON, and tables of edges.
 
-Text files of strangers, line by line, within bounds; ``.xz``, ``.gz`` and ``.bz2`` are unpacked.
+Files are untrusted text, read line by line with limits. ``.xz``, ``.gz`` and ``.bz2`` are decompressed.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ if TYPE_CHECKING:
 
 
 MAX_LINE: Final = 32 << 20
-"""Longest line; bytes. A graph of 100,000 nodes and their attributes is half of it."""
+"""Maximum length of a line; bytes. A graph of 100,000 nodes with attributes needs half of it."""
 
 MAX_TEXT: Final = 1 << 36
-"""Most bytes of a file, unpacked: 64 GiB."""
+"""Maximum size of a decompressed file; bytes: 64 GiB."""
 
 MAX_RATIO: Final = 2_000
-"""Most bytes, unpacked, for each byte of a file beyond the first GiB: text is never packed so well."""
+"""Maximum compression ratio after the first GiB. Text never reaches it."""
 
 _FREE: Final = 1 << 30
 _PACKED: Final = {".xz": lzma.open, ".gz": gzip.open, ".bz2": bz2.open}
 
 
 def stem_of(path: Path) -> str:
-    """The name of a file without what says how it is written: ``graphs.csv.xz`` is ``graphs``."""
+    """Return the file name without its format suffixes: ``graphs.csv.xz`` gives ``graphs``."""
     name = path.name
     for ending in (*_PACKED, ".csv", ".json", ".ndjson", ".jsonl", ".openlabel"):
         if name.lower().endswith(ending) and len(name) > len(ending):
@@ -60,12 +60,13 @@ def stem_of(path: Path) -> str:
 
 @contextmanager
 def lines_of(path: Path) -> Generator[Iterator[str]]:
-    """The lines of a file, with their ends.
+    """Context manager with the lines of a file, including line ends.
 
     Raises
     ------
     TraceError
-        It cannot be opened, is no regular file, is no UTF-8, or exceeds a bound; it says in which line.
+        The file cannot be opened, is not a regular file or not UTF-8, or exceeds a limit. The message contains
+        the line.
     """
     try:
         status = path.stat()
@@ -104,9 +105,8 @@ def _lines(path: Path, file: Any, size: int) -> Iterator[str]:
             ) from error
 
 
-# Graphs as rows, an edge each: node, edge, node. S3C's files, and CSV with a header that says what is what
-# ------------------------------------------------------------------------------------------------
-# Rows of one graph stand together. In a row without relation and second node the first node stands alone.
+# Tables with one edge per row (node, edge, node): files of S3C, and CSV with a header.
+# The rows of a graph are consecutive. A row without relation and second node adds a single node.
 
 S3C: Final = ("ds", "sg", "n_img", "t_id", "node1", "edge", "node2")
 """The header of S3C's files. (Woodlief et al., "S3C", ICSE 2024.)"""
@@ -124,36 +124,36 @@ _NAMES: Final = {
     "time_ns": ("time_ns",),
     "images": ("images", "n_img"),
 }
-"""What a column is → what it may be called."""
+"""Column → its accepted names."""
 
 _IGNORED: Final = frozenset({"ds", "t_id"})
-"""Columns of S3C that say nothing that a graph has: the data set, and the number of a row."""
+"""Ignored columns of S3C: the data set, and the row number."""
 
 MAX_ROW: Final = 1 << 20
-"""Longest row, with all the lines that it goes over; characters."""
+"""Maximum length of a row, over all its lines; characters."""
 
 
 def read_s3c(path: Path) -> Iterator[GivenGraph]:
-    """The graphs of a file of S3C, in its order.
+    """Yield the graphs of an S3C file, in file order.
 
     Raises
     ------
     TraceError
-        Its header is another one, or a row is not what it must be.
+        The header or a row is invalid.
     """
     return _read(path, S3C)
 
 
 def read_csv(path: Path) -> Iterator[GivenGraph]:
-    """The graphs of a CSV file: columns ``graph, src, relation, dst`` and, if they are there, others.
+    """Yield the graphs of a CSV file with the columns ``graph, src, relation, dst`` and optional others.
 
-    These are ``src_kind``, ``dst_kind``, ``src_is_ego``, ``dst_is_ego``, ``t`` (s) or ``time_ns``, and
-    ``images``. They may be called as S3C, pandas and networkx call them.
+    The optional columns are ``src_kind``, ``dst_kind``, ``src_is_ego``, ``dst_is_ego``, ``t`` (s) or
+    ``time_ns``, and ``images``. Column names of S3C, pandas and networkx are also accepted.
 
     Raises
     ------
     TraceError
-        A column is missing or comes twice, or a row is not what it must be.
+        A column is missing or occurs twice, or a row is invalid.
     """
     return _read(path, ())
 
@@ -164,19 +164,19 @@ def _read(path: Path, header: tuple[str, ...]) -> Iterator[GivenGraph]:
 
 
 class _EdgeTable:
-    """A table of edges, row after row."""
+    """Parser of a table of edges, row by row."""
 
     def __init__(self, path: Path, lines: Iterator[str]) -> None:
         self._path, self._lines = path, lines
         self._line = self._taken = 0
         self._number, self._row = 1, list[str]()
         self._names: tuple[str, ...] = ()
-        self._places: dict[str, int] = {}  # of columns by what they are; -1: there is none
+        self._places: dict[str, int] = {}  # Index of each column; -1 if it is missing.
         self._lost: list[int] = []
         self._edge_place = ""
 
     def graphs(self, header: tuple[str, ...]) -> Iterator[GivenGraph]:
-        """The graphs; with a header, only if it is this one."""
+        """Yield the graphs. If ``header`` is not empty, the file must have exactly this header."""
         reader = csv.reader(self._bounded(), strict=True)
         try:
             self._read_header(next(reader, None), header)
@@ -185,7 +185,7 @@ class _EdgeTable:
             raise wrong(self._path, f"row {reader.line_num}", f"no CSV: {error}") from error
 
     def _bounded(self) -> Iterator[str]:
-        """Lines for a CSV reader, which takes as many of them as a row goes over: not too many."""
+        """Yield the lines for the CSV parser, with a limit on the characters of one row."""
         for line in self._lines:
             self._line += 1
             self._taken += len(line)
@@ -249,12 +249,12 @@ class _EdgeTable:
         return f"row {self._number}, column {self._names[self._places[column]]}"
 
     def _text(self, column: str) -> str:
-        """The text in a column; empty if there is no such column."""
+        """Return the text in a column; empty if the column is missing."""
         place = self._places[column]
         return self._row[place].strip() if place >= 0 else ""
 
     def _opened(self, name: str) -> GivenGraph:
-        """A new graph, from its first row."""
+        """Return a new graph for its first row."""
         if not name or len(name) > LONGEST:
             raise self._wrong(
                 "graph", f"expected the name of a graph, of 1 to {LONGEST} characters"
@@ -297,7 +297,7 @@ class _EdgeTable:
         graph.edges.append(GivenEdge(src, sys.intern(relation), dst, *place, NO_ATTRIBUTES))
 
     def _node(self, graph: GivenGraph, end: str) -> str:
-        """Take note of a node, ``src`` or ``dst``; its name."""
+        """Add the node ``src`` or ``dst`` of the row, and return its name."""
         name, label = self._text(end), self._text(f"{end}_kind")
         if not name or len(name) > LONGEST:
             raise self._wrong(end, f"expected the name of a node, of 1 to {LONGEST} characters")
@@ -315,44 +315,44 @@ class _EdgeTable:
         return known.name
 
 
-# Graphs as networkx writes them: node-link JSON, one graph a line, a list of graphs, or one graph ----
+# Node-link JSON of networkx: one graph per line, a list of graphs, or one graph.
 
 MAX_DOCUMENT: Final = 32 << 20
-"""Longest text that is not one graph a line; characters."""
+"""Maximum length of a text that is not one graph per line; characters."""
 
 MAX_VALUES: Final = 3_000_000
-"""Most values in one JSON document, counted before it is read: each takes up to a hundred bytes."""
+"""Maximum number of values in a JSON document, counted before parsing. A value needs up to 100 bytes."""
 
 _TOO_MANY: Final = f"more than {MAX_VALUES:,} values in one JSON document; write one graph a line"
 
 _WHOLE: Final = re.compile(r"-?[0-9]{1,18}")
 
 _LABELS: Final = ("kind", "base_class", "label")
-"""Attributes that say what a node is; the first that is there. (sgstore, CARLASGG, networkx.)"""
+"""Attributes with the label of a node, the first one counts. (sgstore, CARLASGG, networkx.)"""
 
 _RELATIONS: Final = ("relation", "label", "type")
-"""Attributes that say what an edge is; the first that is there, else its key if that is a text."""
+"""Attributes with the relation of an edge, the first one counts. Otherwise its key, if it is a text."""
 
 
 def read_nodelink(path: Path) -> Iterator[GivenGraph]:
-    """The graphs of a file, in its order.
+    """Yield the graphs of a node-link JSON file, in file order.
 
-    Of a graph ``name`` (or ``frame_id``), ``time_ns`` or ``t`` (s), and ``ego`` (a node's id) are read; of a
-    node ``kind``, ``base_class`` or ``label``, ``is_ego``, and the attributes that nodes have here, in the
-    same units; of an edge ``relation``, ``label``, ``type`` or its key.
+    Used keys of a graph: ``name`` (or ``frame_id``), ``time_ns`` or ``t`` (s), and ``ego`` (the id of a node).
+    Of a node: ``kind``, ``base_class`` or ``label``, ``is_ego``, and the node attributes of sgstore in the same
+    units. Of an edge: ``relation``, ``label``, ``type`` or its key.
 
     Raises
     ------
     TraceError
-        It is no JSON, no node-link graph, an undirected one, or exceeds a bound; it says in which line or
-        graph.
+        The file is not JSON, not a directed node-link graph, or exceeds a limit. The message contains the line
+        or graph.
     """
     for number, (where, document) in enumerate(_documents(path)):
         yield _graph(path, number, where, document)
 
 
 def _documents(path: Path) -> Iterator[tuple[str, Any]]:
-    """JSON documents, and where they stand."""
+    """Yield the JSON documents of a file, each with its place in the file."""
     with lines_of(path) as lines:
         numbered = enumerate(lines, start=1)
         number, first = next((one for one in numbered if one[1].strip()), (0, ""))
@@ -377,7 +377,7 @@ def _documents(path: Path) -> Iterator[tuple[str, Any]]:
 
 
 def _whole(path: Path, line: int, lines: Iterator[str]) -> Iterator[tuple[str, Any]]:
-    """The documents of a text that is more than one a line."""
+    """Yield the documents of a file in which a document spans several lines."""
     parts = StringIO()
     values = 0
     for part in lines:
@@ -410,17 +410,17 @@ def _whole(path: Path, line: int, lines: Iterator[str]) -> Iterator[tuple[str, A
 
 
 def _values(text: str) -> int:
-    """About how many values there are in a piece of JSON: never fewer."""
+    """Return an upper bound of the number of values in a JSON text."""
     return sum(map(text.count, "[{,"))
 
 
 def _parsed(text: str) -> Any:
-    """A JSON document.
+    """Parse a JSON document.
 
     Raises
     ------
     ValueError
-        It is none, or nested beyond reason.
+        The text is not JSON, has too many values, or is nested too deeply.
     """
     if _values(text) > MAX_VALUES:
         raise ValueError(_TOO_MANY)
@@ -441,7 +441,7 @@ def _graph(path: Path, number: int, where: str, document: Any) -> GivenGraph:
     if not isinstance(links, list):
         raise wrong(path, where, "expected a list 'edges' or 'links'")
     about = document.get("graph") or {}
-    if isinstance(about, list):  # as networkx wrote it once: pairs
+    if isinstance(about, list):  # Old format of networkx: pairs.
         about = dict(pair for pair in about if isinstance(pair, list) and len(pair) == 2)
     if not isinstance(about, dict):
         raise wrong(path, where, "expected an object 'graph'")
@@ -466,7 +466,7 @@ def _time(path: Path, where: str, about: dict[str, Any]) -> int | None:
         if value is None:
             continue
         if isinstance(value, str) and _WHOLE.fullmatch(value):
-            value = int(value)  # 64-bit numbers come as texts, because JSON readers round them
+            value = int(value)  # 64-bit numbers are texts, because JSON readers round numbers.
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= most:
             raise wrong(path, where, f"expected a time in {key!r}, found {str(value)[:80]}")
         return round(value * unit)

@@ -1,11 +1,11 @@
-"""ASAM OpenLABEL 1.0 → graphs: a frame each, whose nodes are objects, actions, events, contexts and tags.
+"""Reader of ASAM OpenLABEL 1.0 files: each frame becomes a graph.
 
-A file is one JSON document. An element is in the frames that list it, and in its ``frame_intervals``; one
-that says neither is in all frames. Boxes are brought into the axes that have no parent, by the poses of the
-coordinate systems and the transforms of the frames. What has a name and no column here is an attribute of its
-node.
+The nodes are objects, actions, events, contexts and tags. A file is one JSON document. An element is in the
+frames that list it, and in its ``frame_intervals``; without both, it is in all frames. Boxes are transformed
+into the root coordinate system, by the poses of the systems and the transforms of the frames. A named value
+without a column in sgstore is an attribute of its node.
 
-Source: ASAM OpenLABEL 1.0.0, its JSON schema; `velocity` and `time_ns` are names of this house.
+Source: ASAM OpenLABEL 1.0.0, its JSON schema; `velocity` and `time_ns` are additions of sgstore.
 """
 
 from __future__ import annotations
@@ -46,36 +46,37 @@ SECTIONS: Final = {
     "context": "contexts",
     "tag": "tags",
 }
-"""Elements that become nodes, and where they stand. All but objects are kinds of their own."""
+"""Elements that become nodes, and their keys in the file. Each type except objects is a separate kind."""
 UID: Final = "uid"
 """Attribute of a node: the key of its element in the file."""
 
 MAX_DOCUMENT: Final = 256 << 20
 MAX_VALUES: Final = 20_000_000
-"""Longest document, in characters, and most values in it: each takes up to a hundred bytes of memory."""
+"""Maximum number of characters, and of values, in a document. A value needs up to 100 bytes of memory."""
 MAX_FRAMES: Final = 10_000_000
 
 _VECTORS: Final = {"velocity": ("vx", "vy", "vz"), "acceleration": ("ax", "ay", "az")}
 _IN_AXES: Final = ("cuboid", "point3d")
 _FARTHEST: Final = 20
-"""Longest chain of coordinate systems."""
+"""Maximum length of a chain of coordinate systems."""
 _UNITS: Final = ((4e9, 1e9), (4e12, 1e6), (4e15, 1e3), (4e18, 1.0))
-"""Numbers up to which a time is in s, ms, µs and ns, and how many ns these are."""
+"""Upper limits of times in s, ms, µs and ns, each with its unit; ns."""
 
 
 def read_openlabel(path: Path) -> Iterator[GivenGraph]:
-    """The frames of a file, by their numbers; a file without frames is one graph.
+    """Yield the frames of a file as graphs, ordered by number. A file without frames is one graph.
 
     Raises
     ------
     TraceError
-        It is no OpenLABEL 1, or exceeds a bound, or something in it is not what it must be; it says where.
+        The file is not OpenLABEL 1, exceeds a limit, or contains an invalid value. The message contains the
+        place.
     """
     yield from _Labels(path).graphs()
 
 
 def metadata_of(path: Path) -> dict[str, Any]:
-    """The metadata of a file, as they stand there."""
+    """Return the metadata of a file, unchanged."""
     return _Labels(path).root.get("metadata") or {}
 
 
@@ -110,12 +111,12 @@ def _root(path: Path) -> dict[str, Any]:
 
 
 class _Labels:
-    """One file.
+    """Parsed OpenLABEL file.
 
     Attributes
     ----------
     root : dict
-        What stands below ``openlabel``.
+        Contents of ``openlabel``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -150,7 +151,7 @@ class _Labels:
         return found
 
     def _numbered(self) -> list[int]:
-        """Numbers of the frames, ascending; of a file without frames those of its intervals, or one 0."""
+        """Return the frame numbers, ascending. Without frames: those of the intervals, or a single 0."""
         if self._frames:
             if not all(key.isdecimal() and len(key) < 16 for key in self._frames):
                 raise self._wrong("frames", "expected numbers of frames as keys")
@@ -171,12 +172,12 @@ class _Labels:
         return found
 
     def _places(self, element: Mapping[str, Any], where: str) -> Iterator[int]:
-        """Places of the frames in the intervals of an element."""
+        """Yield the indices of the frames in the intervals of an element."""
         for first, last in self._intervals(element, where):
             yield from range(bisect_left(self._numbers, first), bisect_right(self._numbers, last))
 
     def _presence(self) -> list[dict[tuple[str, str], None]]:
-        """Of each frame the elements that are in it, those that it lists first."""
+        """Return the elements in each frame. Elements listed by the frame come first."""
         there: list[dict[tuple[str, str], None]] = [{} for _ in self._numbers]
         listed: set[tuple[str, str]] = set()
         for place, number in enumerate(self._numbers):
@@ -204,7 +205,7 @@ class _Labels:
         return frame
 
     def graphs(self) -> Iterator[GivenGraph]:
-        """The frames."""
+        """Yield the graph of each frame."""
         edges = self._edges()
         for place, number in enumerate(self._numbers):
             frame, where = self._frame(number), f"frame {number}"
@@ -231,7 +232,7 @@ class _Labels:
             yield graph
 
     def _edges(self) -> list[list[tuple[str, str, str]]]:
-        """Of each frame the relations in it: names of nodes at both ends."""
+        """Return the relations in each frame, with the node names of both ends."""
         found: list[list[tuple[str, str, str]]] = [[] for _ in self._numbers]
         listed: dict[str, list[int]] = {}
         for place, number in enumerate(self._numbers):
@@ -296,7 +297,7 @@ class _Labels:
     def _data(
         self, data: Mapping[str, Any], usual: str, where: str, axes: _FrameAxes
     ) -> dict[str, Any]:
-        """Attributes that data of an element are, its pose among them."""
+        """Return the attributes in the data of an element, including its pose."""
         found: dict[str, Any] = {}
         boxes: dict[str, tuple[Any, str]] = {}
         for form, row in self._rows(data, where):
@@ -317,7 +318,7 @@ class _Labels:
         return found
 
     def _rows(self, data: Any, where: str) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Data of an element with their forms, each before its own attributes."""
+        """Yield the data of an element with their type, each before its nested attributes."""
         if not isinstance(data, dict):
             raise self._wrong(where, "expected an object of lists of data")
         for form, rows in data.items():
@@ -336,7 +337,11 @@ class _Labels:
         return [float(one) for one in value]
 
     def _time(self, about: Mapping[str, Any], where: str) -> int | None:
-        """Time of a frame; ns. A number is in s, ms, µs or ns since 1970, or in s since anything."""
+        """Return the time of a frame; ns.
+
+        The unit of a number (s, ms, µs or ns since 1970) follows from its size. Seconds may have
+        another origin.
+        """
         exact = about.get("time_ns")
         if type(exact) is int and abs(exact) < 1 << 62:
             return exact
@@ -362,26 +367,23 @@ class _Labels:
 
 
 def _name(key: tuple[str, str]) -> str:
-    """Name of the node of an element: unique in the file."""
+    """Return the node name of an element, unique in the file."""
     return key[1] if key[0] == "object" else f"{key[0]} {key[1]}"
 
 
 def _tail(told: Any) -> str:
-    """A type without the address of its ontology: ``http://…/ontology#Car`` is ``Car``."""
+    """Return a type without the address of its ontology: ``http://…/ontology#Car`` gives ``Car``."""
     return str(told or "").rpartition("#")[2].rpartition("/")[2]
 
 
-# Coordinate systems ------------------------------------------------------------------------------
-
-
 class _Axes:
-    """The coordinate systems of a file."""
+    """Coordinate systems of a file."""
 
     def __init__(self, systems: Mapping[str, Any]) -> None:
         self._systems = {name: of if isinstance(of, dict) else {} for name, of in systems.items()}
 
     def at(self, transforms: Mapping[str, Any]) -> _FrameAxes:
-        """The same in a frame."""
+        """Return the coordinate systems for one frame, with its transforms."""
         moved: dict[tuple[str, str], NDArray[np.float64]] = {}
         for told in transforms.values():
             if isinstance(told, dict):
@@ -392,12 +394,12 @@ class _Axes:
 
 
 class _FrameAxes:
-    """Coordinate systems in one frame: poses in any of them, as they are in the one without a parent.
+    """Coordinate systems in one frame. Converts poses into the root system.
 
     Attributes
     ----------
     missing : set of str
-        Systems whose pose in their parent nobody tells: what is in them stays as it is.
+        Systems without a known pose in their parent. Poses in these systems are not converted.
     """
 
     def __init__(
@@ -410,7 +412,7 @@ class _FrameAxes:
         self.missing: set[str] = set()
 
     def _outward(self, system: str) -> NDArray[np.float64] | None:
-        """The matrix from a system into the one without a parent; ``None`` if it is that."""
+        """Return the matrix from a system into the root system. ``None`` means the root system itself."""
         if system not in self._known:
             self._known[system] = self._found(system)
         return self._known[system]
@@ -437,12 +439,12 @@ class _FrameAxes:
         return _matrix(self._systems[system].get("pose_wrt_parent"))
 
     def turned(self, vector: list[float], system: str) -> list[float]:
-        """A direction."""
+        """Return a direction rotated into the root system."""
         matrix = self._outward(system)
         return vector if matrix is None else (matrix[:3, :3] @ vector).tolist()
 
     def pose(self, value: list[float], system: str) -> dict[str, float]:
-        """A cuboid, or a point: attributes of a node, in m and degrees."""
+        """Return the node attributes for a cuboid or point; m, degrees."""
         matrix = self._outward(system)
         place = value[:3]
         if matrix is not None:
@@ -462,7 +464,7 @@ class _FrameAxes:
 
 
 def _turn(told: list[float]) -> NDArray[np.float64]:
-    """A rotation, by a quaternion x, y, z, w, or by the angles about x, y and z, z being the first; rad."""
+    """Return a rotation matrix for a quaternion (x, y, z, w) or three angles about x, y, z (z first); rad."""
     if len(told) == 3:
         return _in_sequence("ZYX", told[::-1])
     x, y, z, w = np.array(told) / (np.linalg.norm(told) or 1.0)
@@ -476,7 +478,7 @@ def _turn(told: list[float]) -> NDArray[np.float64]:
 
 
 def _in_sequence(sequence: str, angles: list[float]) -> NDArray[np.float64]:
-    """A rotation about one axis after the other, each as those before have turned it; rad."""
+    """Return a rotation matrix for successive rotations, each about an already rotated axis; rad."""
     made = np.eye(3)
     for letter, angle in zip(sequence, angles, strict=True):
         axis = "XYZ".index(letter)
@@ -489,7 +491,7 @@ def _in_sequence(sequence: str, angles: list[float]) -> NDArray[np.float64]:
 
 
 def _matrix(told: Any) -> NDArray[np.float64] | None:
-    """The homogeneous matrix (4, 4) of transform data; ``None`` if it is none."""
+    """Return the homogeneous (4, 4) matrix of transform data, or ``None`` if the data are invalid."""
     if not isinstance(told, dict):
         return None
     try:

@@ -1,6 +1,6 @@
-"""The meaning of imported labels, relations and attributes.
+"""Resolution of imported labels, relations and attributes.
 
-Graphs as files give them: names, labels and rows, before they mean anything here.
+Graphs before the resolution: names, labels and rows as in the file.
 """
 
 from __future__ import annotations
@@ -51,30 +51,29 @@ if TYPE_CHECKING:
 MAX_NODES: Final = 200_000
 MAX_EDGES: Final = 1_000_000
 MAX_NAMES: Final = 32 << 20
-"""Most nodes and edges of one graph, and characters of the names in it: a few hundred MB, whatever is in it."""
+"""Maximum number of nodes, edges and name characters of a graph, for at most a few hundred MB."""
 
 LONGEST: Final = 1_000
-"""Longest name; characters."""
+"""Maximum length of a name; characters."""
 
 NO_ATTRIBUTES: Final[Mapping[str, Any]] = MappingProxyType({})
 
 
 @dataclass(slots=True)
 class GivenNode:
-    """A node of a graph in a file.
+    """Node of a graph in a file.
 
     Attributes
     ----------
     name : str
-        What tells it from the other nodes of its graph, and makes it the same thing in another graph of the
-        file.
+        Unique in its graph. In another graph of the file, the same name is the same object.
     label : str
-        What the file says that it is; empty: its name says it (``car_3``, ``Ego Lane``).
+        Label in the file; empty if the name contains it (``car_3``, ``Ego Lane``).
     where : str
-        Place in the file, for people: ``row 17, column node1``.
+        Place in the file, for messages: ``row 17, column node1``.
     attributes : dict
     static : bool
-        Whether it never moves: its pose is told once.
+        True if the node never moves; its pose is then read once.
     """
 
     name: str
@@ -86,9 +85,9 @@ class GivenNode:
 
 @dataclass(slots=True)
 class GivenEdge:
-    """An edge between nodes, by their names.
+    """Edge of a graph in a file, between two node names.
 
-    Its place is kept as a number and a text that all edges of a kind share: a graph may have very many.
+    To save memory, its place is stored as a number and a text that similar edges share.
     """
 
     src: str
@@ -100,31 +99,31 @@ class GivenEdge:
 
     @property
     def where(self) -> str:
-        """Place in the file, for people."""
+        """Place in the file, as a text for messages."""
         return self.place.replace("{}", str(self.number), 1)
 
 
 @dataclass(slots=True)
 class GivenGraph:
-    """One graph of a file, which becomes a frame.
+    """Graph of a file, which becomes a frame.
 
     Attributes
     ----------
     name : str
-        What the file calls it: an image, a number. Unique in its file.
+        Name in the file: an image, a number. Unique in its file.
     place : int
-        Row or line where it begins, from 1.
+        Number of its first row or line, from 1.
     nodes : dict
         By name.
     edges : list of GivenEdge
     time_ns : int or None
-        Its time, where the file tells it; ns.
+        Time of the graph; ns. ``None`` means that the file has no time for it.
     images : int
-        How many frames of the source it stands for: S3C gives one graph for each class.
+        Number of source frames that it represents: S3C stores one graph for each class.
     lost : dict
-        What of it cannot be kept → how often.
+        Number of losses by description.
     characters : int
-        Of its names together.
+        Total number of characters in its names.
     """
 
     name: str
@@ -138,12 +137,12 @@ class GivenGraph:
 
 
 def check_size(path: Path, where: str, graph: GivenGraph) -> None:
-    """Refuse a graph that is larger than any scene.
+    """Raise if a graph is too large.
 
     Raises
     ------
     TraceError
-        It has more nodes, edges or characters of names than it may have.
+        The graph has too many nodes, edges or characters of names.
     """
     for number, most, what in (
         (len(graph.nodes), MAX_NODES, "nodes"),
@@ -155,14 +154,14 @@ def check_size(path: Path, where: str, graph: GivenGraph) -> None:
 
 
 def wrong(path: Path, where: str, reason: str) -> TraceError:
-    """The error of a place in a file."""
+    """Return the error for a place in a file."""
     return TraceError(f"{where}: {reason}" if where else reason, path=path)
 
 
-# What the labels and relations of other tools mean: kinds and relations of the vocabulary -------
+# Labels and relations of other tools, mapped to the vocabulary.
 
 EGOS: Final = frozenset({"ego", "egocar", "egovehicle", "hero"})
-"""Labels of the ego, folded; it is a car unless the file says more. (S3C, RoadScene2Vec, CARLA.)"""
+"""Normalised labels of the ego; by default a car. (S3C, RoadScene2Vec, CARLA.)"""
 
 _PARTS: Final = (
     ("off_road", re.compile(r"off[ _]?road", re.IGNORECASE)),
@@ -179,7 +178,7 @@ _PARTS: Final = (
     ("junction", re.compile(r"(junction|intersection)( .+)?", re.IGNORECASE)),
     ("crosswalk", re.compile(r"crosswalk( .+)?", re.IGNORECASE)),
 )
-"""Parts of the road as S3C, CARLASGG and RoadScene2Vec write them."""
+"""Map parts as named by S3C, CARLASGG and RoadScene2Vec."""
 
 _SHORT: Final = {
     "moto": "motorcycle",
@@ -192,28 +191,28 @@ _SHORT: Final = {
     "stopsign": "stop_sign",
     "tree": "vegetation",
 }
-"""Other words for kinds: those of RoadScene2Vec's actors, and of Scenic."""
+"""Other names of kinds, from RoadScene2Vec and Scenic."""
 
 _NUMBERED: Final = re.compile(r"(.+?)[_ ](\d+)")
-"""A label with the number that tells it from others of its kind: ``car_3``, ``car 3``."""
+"""A label with a number: ``car_3``, ``car 3``."""
 
 OTHER: Final = "other"
-"""What ``unknown_as`` calls the kind ``unknown``."""
+"""Value of ``unknown_as`` for the kind ``unknown``."""
 
 OWN: Final = "own"
-"""The ``unknown_as`` by which labels and relations that nobody knows become kinds and relations themselves."""
+"""Value of ``unknown_as`` that turns unknown labels and relations into new kinds and relations."""
 
 
 @dataclass(frozen=True, slots=True)
 class LabelMeaning:
-    """Meaning of a node's label.
+    """Resolved label of a node.
 
     Attributes
     ----------
     kind : str
     is_ego : bool
     type_name : str
-        The file's own label, where it says more than the kind.
+        The file's own label, if it is more specific than the kind.
     special, subkind : str
     """
 
@@ -225,7 +224,7 @@ class LabelMeaning:
 
     @property
     def is_part(self) -> bool:
-        """Return whether it is a part of the road, and no entity."""
+        """True if the node is a map part, not an entity."""
         return self.kind in MAP_KINDS
 
 
@@ -236,20 +235,21 @@ class Words:
     Parameters
     ----------
     kinds : mapping
-        Label → kind: what the client says, before all else.
+        Label → kind. It takes precedence over all other rules.
     relations : mapping
-        The same of relations.
+        Relation of the file → relation of the vocabulary.
     unknown_as : str
-        The kind of what no word is known for: any kind of an entity, or ``other``, which is ``unknown``.
-        Relations that are unknown are then left out, and counted. ``own``: labels become kinds, and names
-        relations, of their own, as many as a process can know; the rest is as of ``other``. Empty: errors.
+        Kind for unknown labels: any kind of an entity, or ``other``, which is ``unknown``. Unknown relations
+        are then dropped and counted. ``own``: unknown labels become new kinds, and unknown names new relations,
+        up to the limit of a process; the rest is treated as ``other``. Empty: unknown labels and relations are
+        errors.
     new_kinds : sequence of str
-        Kinds of entities beside those of the vocabulary, which ``kinds`` may name.
+        Additional kinds of entities, which ``kinds`` may contain.
 
     Raises
     ------
     ConfigError
-        A kind or a relation that is given is none.
+        A given kind or relation does not exist.
     """
 
     kinds: Mapping[str, str] = field(default_factory=dict[str, str])
@@ -280,7 +280,7 @@ class Words:
         return known or ""
 
     def meaning(self, name: str, label: str) -> LabelMeaning | None:
-        """Return the meaning of a node of this name and label; ``None`` if it is unknown."""
+        """Return the resolved label of a node. ``None`` means unknown."""
         for text in dict.fromkeys((label, name) if label else (name, _plain(name))):
             found = self._meant(text)
             if found is not None:
@@ -306,13 +306,13 @@ class Words:
         return _simulators(text)
 
     def relation(self, name: str) -> str | None:
-        """The relation of the vocabulary that a name means; ``None``: nobody knows."""
+        """Return the relation of the vocabulary for a name. ``None`` means unknown."""
         given = {normalize_name(own): relation for own, relation in self.relations.items()}
         known = relation_named(given.get(normalize_name(name), name))
         return _own_relation(name) if known is None and self.unknown_as == OWN else known
 
     def why_not_kind(self, name: str, label: str) -> str:
-        """Explain why a node is not understood, and what can be done."""
+        """Return the error text for an unknown label, with the remedies."""
         text = label or _plain(name)
         several = kinds_labelled(text)
         known = [*labels(), *_SHORT]
@@ -326,7 +326,7 @@ class Words:
         )
 
     def why_not_relation(self, name: str) -> str:
-        """Explain why a relation is not understood, and what can be done."""
+        """Return the error text for an unknown relation, with the remedies."""
         like = suggestion(name, RELATIONS)
         hint = f" (did you mean {like!r}?)" if like else ""
         return (
@@ -335,7 +335,7 @@ class Words:
         )
 
     def as_dict(self) -> dict[str, object]:
-        """All of it as plain values, in one order."""
+        """Return the mapping as JSON values, in a fixed order."""
         return {
             "kinds": dict(sorted(self.kinds.items())),
             "relations": dict(sorted(self.relations.items())),
@@ -345,7 +345,7 @@ class Words:
 
 
 def _plain(name: str) -> str:
-    """A name without the number at its end."""
+    """Return a name without the number at its end."""
     numbered = _NUMBERED.fullmatch(name)
     return numbered[1] if numbered else name
 
@@ -354,7 +354,7 @@ _NO_NAME: Final = re.compile(r"[^A-Za-z0-9]+")
 
 
 def _own_kind(text: str) -> str:
-    """A label of a file as a kind that is known from now on; empty if it can be none."""
+    """Register a label as a new kind and return it; empty if the label is not a valid name."""
     name = _NO_NAME.sub("_", text).strip("_").lower()
     known = kind_named(name)
     with suppress(ValueError):
@@ -363,7 +363,7 @@ def _own_kind(text: str) -> str:
 
 
 def _own_relation(text: str) -> str | None:
-    """The same of a relation; ``None`` if it can be none."""
+    """Register a name as a new relation and return it, or ``None`` if the name is invalid."""
     name = _NO_NAME.sub("_", text).strip("_")
     known = relation_named(name)
     with suppress(ValueError):
@@ -372,12 +372,12 @@ def _own_relation(text: str) -> str | None:
 
 
 def _kind(text: str) -> str:
-    """The one kind that a word means; empty if it is none or several."""
+    """Return the kind for a word; empty if the word is unknown or ambiguous."""
     return kind_named(_SHORT.get(normalize_name(text), text)) or ""
 
 
 def _simulators(text: str) -> LabelMeaning | None:
-    """Kind of a simulator's type name: of the whole, or of what stands before one of its dots."""
+    """Return the meaning of a simulator's type name, or of the longest known prefix before a dot."""
     meanings = type_meanings()
     name = text.lower()
     while name:
@@ -397,14 +397,14 @@ def _no_kind(what: str, kind: str) -> str:
     return f"{what}: no such kind; {hint}; --new-kind {kind} makes it one"
 
 
-# What files say of nodes and edges, in the units that people read, as the columns of the house ----
+# Attributes of nodes and edges in files, converted into columns with internal units.
 
 _RADIANS: Final = frozenset({"heading", "pitch", "roll", "yaw_rate", "heading_error"})
-"""Numbers that are degrees outside."""
+"""Attributes in degrees in files and in radians in columns."""
 
 STATE_NUMBERS: Final = (*POSE, *INPUTS[:3])
 _SHIFTED: Final = {"gear": range(-HIGHEST_GEAR, HIGHEST_GEAR + 1), "hand_brake": (False, True)}
-"""Values of these that their columns take; others (``"D"``) are attributes of a client's own."""
+"""Allowed values of these columns; other values (``"D"``) are custom attributes."""
 PART_NUMBERS: Final = ("x", "y", "z", "heading", "length", "width", "speed_limit", "curvature")
 PART_TEXTS: Final = ("lane_type", "road", "junction", "turn")
 PART_WHOLE: Final = ("section", "lane")
@@ -415,42 +415,43 @@ LANE_NUMBERS: Final = {
     "heading_error": "heading_error",
     "along": "along",
 }
-"""Numbers of an edge ``isIn`` → columns of :class:`sgstore.graph.LaneStates`."""
+"""Attributes of an ``isIn`` edge → columns of :class:`sgstore.graph.LaneStates`."""
 
 _SAID: Final = frozenset(
     {"kind", "base_class", "label", "name", "ident", "is_ego", "is_static", "id"}
 )
-"""Attributes that are read elsewhere, or say again what a graph says."""
+"""Attributes that are read elsewhere, or are redundant."""
 
 _FIXED: Final = frozenset({"speed", "vx", "vy", "vz"})
-"""Attributes that the graphs of this house give signs and lights of a map: these stand."""
+"""Attributes of static signs and lights in exported graphs; always zero."""
 
 _FOLLOWING: Final = frozenset({"accel", "node_id"})
-"""Attributes that follow from others."""
+"""Attributes that can be computed from others."""
 
 _BITS: Final = {
     "lights": VEHICLE_LIGHTS,
     "derived": ("derived_velocity", "derived_acceleration", "derived_yaw_rate"),
 }
-"""Columns of bits, and the attributes that each bit is."""
+"""Bit columns, and the attribute of each bit."""
 _TEXTS: Final = frozenset({"special", "subkind", "type_name", "type", "map_ref"})
 
 
 Own = dict[str, Any]
-"""Attributes of a client's own, by name: what no column takes."""
+"""Custom attributes by name, without a column."""
 
 
 def state_of(
     path: Path, where: str, attributes: Mapping[str, Any], lost: dict[str, int], *, any_state: bool
 ) -> tuple[dict[str, float], Own]:
-    """State of an entity in a frame: columns of :class:`sgstore.world.States`; and its other attributes.
+    """Return the state of an entity in a frame (columns of ``States``), and its other attributes.
 
-    ``any_state``: traffic lights may show what no vocabulary has.
+    The columns are those of :class:`sgstore.world.States`. With ``any_state``, traffic lights may have states
+    outside the vocabulary.
 
     Raises
     ------
     TraceError
-        A value is not what its attribute takes.
+        An attribute has an invalid value.
     """
     found: dict[str, float] = {}
     own: Own = {}
@@ -476,7 +477,7 @@ def state_of(
 
 
 def _drop_implausible(found: dict[str, float], lost: dict[str, int]) -> None:
-    """Leave out the sizes and velocities that no body has."""
+    """Remove implausible sizes and velocities, and count them as losses."""
     row = [found.get(name, math.nan) for name in POSE]
     if is_plausible(*row[6:9], *row[13:]):
         return
@@ -490,7 +491,7 @@ def _drop_implausible(found: dict[str, float], lost: dict[str, int]) -> None:
 
 
 def _speed(attributes: Mapping[str, Any], found: dict[str, float], lost: dict[str, int]) -> None:
-    """A speed without a velocity: along the heading, if that is known."""
+    """Convert a speed into a velocity along the heading, if the velocity is missing."""
     speed = attributes.get("speed")
     if speed is None or "vx" in found:
         return
@@ -502,12 +503,14 @@ def _speed(attributes: Mapping[str, Any], found: dict[str, float], lost: dict[st
 
 
 def part_of(path: Path, where: str, attributes: Mapping[str, Any]) -> tuple[dict[str, Any], Own]:
-    """Attributes of a part of the road: columns of :class:`sgstore.roads.MapNodes`; and its others.
+    """Return the attributes of a map part (columns of ``MapNodes``), and its other attributes.
+
+    The columns are those of :class:`sgstore.roads.MapNodes`.
 
     Raises
     ------
     TraceError
-        A value is not what its attribute takes.
+        An attribute has an invalid value.
     """
     found: dict[str, Any] = {}
     own: Own = {}
@@ -533,7 +536,10 @@ def part_of(path: Path, where: str, attributes: Mapping[str, Any]) -> tuple[dict
 def lane_state_of(
     path: Path, where: str, attributes: Mapping[str, Any]
 ) -> tuple[dict[str, float], Own]:
-    """Position of an entity in a lane, ``primary`` 1 or 0 where the file says it; and what else is said."""
+    """Return the position of an entity in a lane, and the other attributes of the edge.
+
+    ``primary`` is 1 or 0; it is absent if the file does not contain it.
+    """
     found: dict[str, float] = {}
     own: Own = {}
     for name, value in attributes.items():
@@ -549,14 +555,14 @@ def lane_state_of(
 
 
 def gap_of(path: Path, where: str, attributes: Mapping[str, Any]) -> tuple[float, Own]:
-    """The gap of an edge ``leads`` or ``follows``, NaN where it is not known; and its other attributes."""
+    """Return the gap of a ``leads`` or ``follows`` edge, and its other attributes. NaN means unknown."""
     value = attributes.get("gap")
     gap = float("nan") if value is None else _number(path, where, "gap", value)
     return gap, {name: value for name, value in attributes.items() if name != "gap"}
 
 
 def columns_of(rows: list[dict[str, float]]) -> dict[str, NDArray[Any]]:
-    """Rows as columns, NaN, or what stands for nothing, where one says nothing."""
+    """Convert rows into columns. Missing values become NaN or the column's code for unknown."""
     empty = {"lights": -1, "light_state": -1, "derived": 0}
     types = {"lights": np.int64, "light_state": np.int8, "derived": np.int64}
     names = {name for row in rows for name in row}
@@ -587,33 +593,33 @@ def _light_state(path: Path, where: str, value: Any, *, any_state: bool) -> int:
     return code
 
 
-# What the graphs of a file mean: entities, parts of the road, relations; and what all have together ----
+# Resolved graphs of a file: entities, map parts, relations, and their common results.
 
 OFF_ROAD: Final = ("off_road", "off_road")
-"""The part that whatever is on no lane is in; there is one."""
+"""The map part for entities outside all lanes."""
 
 MAX_PARTS: Final = 500_000
 MAX_ENTITIES: Final = 500_000
-"""Most parts of the road, and entities, in one file."""
+"""Maximum number of map parts, and of entities, in a file."""
 
 _REMEMBERED: Final = 1 << 16
-"""Names whose meaning is remembered."""
+"""Maximum number of cached resolved names."""
 
 Part = tuple[str, str]
-"""A part of the road: its kind and its name."""
+"""Map part: kind and name."""
 
 
 @dataclass(slots=True)
 class Meant:
-    """A graph whose words are understood.
+    """Graph with resolved labels and relations.
 
     Attributes
     ----------
     graph : GivenGraph
     entities : dict
-        Name → node and what it is.
+        Name → node and its resolved label.
     parts : dict
-        Name → part of the road.
+        Name → map part.
     ego : str
         Name of the ego; empty without one.
     edges : list of (GivenEdge, int)
@@ -628,7 +634,7 @@ class Meant:
 
 
 class Understanding:
-    """Understands the graphs of one file, one after another."""
+    """Resolver of the graphs of one file, one after another."""
 
     def __init__(self, path: Path, words: Words) -> None:
         self._path = path
@@ -637,12 +643,12 @@ class Understanding:
         self._relations = lru_cache(_REMEMBERED)(words.relation)
 
     def of(self, graph: GivenGraph) -> Meant:
-        """Resolve a graph; parts without a meaning are left out and counted in ``graph.lost``, or are an error.
+        """Resolve a graph. Unknown parts are dropped and counted in ``graph.lost``, or raise an error.
 
         Raises
         ------
         TraceError
-            A node or a relation is not known, there are two egos, or the ego is no entity.
+            A node or a relation is unknown, there are two egos, or the ego is not an entity.
         """
         meant = Meant(graph, {}, {}, "", [])
         taken: dict[Part, str] = {}
@@ -695,19 +701,19 @@ class Understanding:
 
 @dataclass(slots=True)
 class FileMeaning:
-    """Meanings that all graphs of a file share.
+    """Results that all graphs of a file share.
 
     Attributes
     ----------
     graphs : int
     parts : dict
-        The parts of the road, with what is known of each where it comes first; ``off_road`` is the first.
+        Map parts, each with the attributes of its first occurrence; ``off_road`` is the first.
     relations : set of int
         Codes of the relations that occur.
     ego : str
-        Name of the ego, if it is the same wherever there is one.
+        Name of the ego, if all graphs with an ego have the same one.
     timed : int
-        Graphs that tell their time.
+        Number of graphs with a time.
     """
 
     graphs: int = 0
@@ -718,12 +724,12 @@ class FileMeaning:
 
 
 def survey(path: Path, graphs: Iterable[GivenGraph], words: Words) -> FileMeaning:
-    """Go through a file once: everything that is wrong with it is found here.
+    """Check a whole file once, and raise its first error.
 
     Raises
     ------
     TraceError
-        As :meth:`Understanding.of`; some graphs tell their time and others do not; there are too many parts.
+        As in :meth:`Understanding.of`; or only some graphs have a time; or there are too many parts.
     """
     found, understanding = FileMeaning(), Understanding(path, words)
     egos: set[str] = set()
@@ -759,7 +765,7 @@ def survey(path: Path, graphs: Iterable[GivenGraph], words: Words) -> FileMeanin
 
 
 def _check_names(path: Path, digests: array[int], places: array[int]) -> None:
-    """Refuse graphs of one name, of which 8 bytes are remembered."""
+    """Raise if two graphs have the same name, compared by 8-byte hashes."""
     names = np.frombuffer(digests, np.uint64)
     order = np.argsort(names, kind="stable")
     again = np.flatnonzero(names[order[1:]] == names[order[:-1]])

@@ -1,6 +1,6 @@
-"""Files of graphs → traces of a store: graphs as blocks of scene graphs, as ingest makes them of recordings.
+"""Import run: graph files become traces of a store, in blocks as in an ingest.
 
-A file is read twice, once to understand it, once to bring it in.
+A file is read twice: once to resolve its labels, once to store its graphs.
 """
 
 from __future__ import annotations
@@ -67,31 +67,31 @@ FORMATS: Final = {
     "csv": read_csv,
     "openlabel": read_openlabel,
 }
-"""What files are written in → what reads their graphs."""
+"""Format → reader of its graphs."""
 
 _ANSWERED: Final = {"s3c": ("isIn", *PROXIMITY[1:], *DIRECTIONS, "toLeftOf", "toRightOf")}
-"""Relations that all graphs of a format can hold, whether they occur or not."""
+"""Relations that all graphs of a format can contain, even if they do not occur."""
 
 _BLOCK: Final = 2 * BUCKET_FRAMES
 _BLOCK_SIZE: Final = 200_000
-"""Graphs that are brought in together, and their nodes and edges together, unless one has more."""
+"""Maximum number of nodes and edges in a block, except for a single larger graph."""
 
 
 @dataclass(slots=True)
 class Imported:
-    """Outcome of a file.
+    """Outcome of the import of one file.
 
     Attributes
     ----------
     path : Path
     status : str
-        ``added``, ``replaced``, ``present`` (it was in the store already) or ``failed``.
+        ``added``, ``replaced``, ``present`` (already in the store) or ``failed``.
     name : str
-        Of its trace in the store.
+        Name of its trace in the store.
     frames, entities, edges : int
-        How many came in.
+        Number of imported frames, entities and edges.
     lost : dict
-        What could not be kept → how often.
+        Number of losses by description.
     error : SgstoreError or None
     """
 
@@ -105,7 +105,7 @@ class Imported:
     error: SgstoreError | None = None
 
 
-def import_graphs(  # noqa: PLR0913  as many options as there are ways to read
+def import_graphs(  # noqa: PLR0913  one option per way to read
     store: str | Path,
     files: Sequence[str | Path],
     form: str,
@@ -116,7 +116,7 @@ def import_graphs(  # noqa: PLR0913  as many options as there are ways to read
     force: bool = False,
     on_frames: Callable[[Path, int], None] | None = None,
 ) -> list[Imported]:
-    """Bring files of graphs into a store, which is made if there is none.
+    """Import graph files into a store, which is created if it is missing.
 
     Parameters
     ----------
@@ -126,27 +126,27 @@ def import_graphs(  # noqa: PLR0913  as many options as there are ways to read
     form : str
         One of :data:`FORMATS`.
     words : Words, optional
-        What labels and relations mean beside the vocabulary.
+        Additional meanings of labels and relations.
     relations : sequence of str
-        Relations that the graphs can hold, beside those that occur: of others nothing is known.
+        Relations that the graphs can contain, in addition to those that occur. Other relations are unknown.
     period_s : float
-        Time from one frame to the next where the file tells none; s.
+        Time between frames, for files without times; s.
     force : bool
-        Whether files that are in the store already are read anew, and replaced.
+        Import files again that the store already contains, and replace their traces.
     on_frames : function, optional
         Called with the file and the number of frames done.
 
     Returns
     -------
     list of Imported
-        For each file, in the order given. A file with an error leaves nothing in the store.
+        For each file, in the given order. A file with an error leaves nothing in the store.
 
     Raises
     ------
     ValueError
-        There is no such form or relation, or the period is not positive.
+        The form or a relation does not exist, or the period is not positive.
     StoreError
-        What is at the place of the store is none.
+        The file at the path of the store is not a store.
     """
     if form not in FORMATS or not 0 < period_s < 1e6 or not set(relations) <= set(RELATIONS):
         raise ValueError(f"not a way to import: {form!r}, every {period_s} s, {relations}")
@@ -156,7 +156,7 @@ def import_graphs(  # noqa: PLR0913  as many options as there are ways to read
 
 
 class _ImportRun:
-    """One call of :func:`import_graphs`."""
+    """Run of :func:`import_graphs`, with its options."""
 
     period_ns: int
     force: bool
@@ -177,7 +177,7 @@ class _ImportRun:
         done = Imported(path)
         try:
             self._import(path, done)
-        except Exception as error:  # noqa: BLE001  the other files are imported all the same
+        except Exception as error:  # noqa: BLE001  the other files must still be imported
             done.error = failure(error, path)
         return done
 
@@ -243,7 +243,7 @@ class _ImportRun:
                 "period_s": self.period_ns / 1e9,
             }
             told = {"imported": self._form, "import": how, "entities": dict(kinds)}
-            if self._form == "openlabel":  # an export says them again
+            if self._form == "openlabel":  # An export repeats them.
                 told["metadata"] = metadata_of(info.path)
             return segment.seal(report, told)
 
@@ -268,7 +268,7 @@ class _ImportRun:
         return graph
 
     def _variant(self, found: FileMeaning) -> str:
-        """Identity of a map of named parts: these, and the mapping by which the file was understood."""
+        """Return the identity of a map of named parts: the parts and the options of the import, as JSON."""
         about = {
             "of": self._form,
             "words": self._words.as_dict(),
@@ -280,7 +280,7 @@ class _ImportRun:
 
 
 def _blocks(graphs: Iterable[Meant]) -> Iterator[list[Meant]]:
-    """Graphs in blocks: of very large ones there are few in each."""
+    """Yield the graphs in blocks. Large graphs make smaller blocks."""
     some: list[Meant] = []
     size = 0
     for graph in graphs:
@@ -298,27 +298,27 @@ def _losses(lost: dict[str, int]) -> list[Loss]:
     return [Loss(f"{what} cannot be kept", messages=often) for what, often in sorted(lost.items())]
 
 
-# Graphs that are understood as blocks of scene graphs ---------------------------------------------
+# Resolved graphs as blocks of scene graphs.
 
 _IS_IN: Final = RELATION_CODE["isIn"]
 _FOLLOWS: Final = RELATION_CODE["follows"]
 _LEADS: Final = RELATION_CODE["leads"]
 _LANE_COLUMNS: Final = ("overlap", "offset", "heading_error", "along")
 _OF_EDGES: Final = frozenset({"lane_dist"})
-"""Attributes that the graphs of this house give edges, and that follow from others."""
+"""Edge attributes of exported graphs that can be computed from others."""
 _LONGEST_VALUE: Final = 10_000
-"""Longest value of an attribute of a client's own, as JSON; characters."""
+"""Maximum length of a custom attribute value, as JSON; characters."""
 
 
 def parts_map(name: str, variant: str, parts: Mapping[Part, Mapping[str, Any]]) -> RoadMap:
-    """A road map of named parts, without any geometry and without edges: these are in the frames.
+    """Return a road map of named parts, without geometry. Edges between parts are in the frames.
 
     Parameters
     ----------
     name, variant : str
-        As :class:`sgstore.roads.RoadMap` has them; there is no text.
+        As in :class:`sgstore.roads.RoadMap`; the map has no text.
     parts : mapping
-        Kind and name of each part → what is known of it; ``off_road`` is the first.
+        Kind and name of each part → its known attributes; ``off_road`` is the first.
     """
     order = sorted(parts, key=lambda part: MAP_KINDS.index(part[0]))
     order.insert(0, order.pop(next(i for i, part in enumerate(order) if part[0] == "off_road")))
@@ -350,7 +350,7 @@ def parts_map(name: str, variant: str, parts: Mapping[Part, Mapping[str, Any]]) 
 
 
 class Blocks:
-    """Makes blocks of graphs, one after another; entities keep their node ids.
+    """Builder of graph blocks, one after another. Entities keep their node ids.
 
     Parameters
     ----------
@@ -358,15 +358,15 @@ class Blocks:
     road_map : RoadMap
         Of :func:`parts_map`.
     period_ns : int
-        Time from one graph to the next where the file does not tell it; ns.
+        Time between graphs, for files without times; ns.
     any_state : bool
-        Whether traffic lights may show what no vocabulary has.
+        True if traffic lights may have states outside the vocabulary.
 
     Attributes
     ----------
     own : list
-        Attributes of a client's own in the last block: frame, node, relation (-1: of the node) and other end,
-        name, value as JSON.
+        Custom attributes in the last block: frame, node, relation (-1 for an attribute of the node) and other
+        end, name, value as JSON.
     """
 
     def __init__(
@@ -383,7 +383,7 @@ class Blocks:
         self._seq = 0
 
     def block(self, graphs: Sequence[Meant]) -> GraphBlock:
-        """The next graphs as a block of frames; what cannot be kept is counted in each graph's ``lost``."""
+        """Return the next graphs as a block of frames. Losses are counted in ``lost`` of each graph."""
         new: list[tuple[GivenNode, LabelMeaning]] = []
         self.own = []
         first = len(self._entities)
@@ -430,7 +430,7 @@ class Blocks:
     def _keep(
         self, lost: dict[str, int], at: tuple[int, int, int, int], own: Mapping[str, Any]
     ) -> None:
-        """Take note of attributes of a client's own; what JSON cannot hold, or is very long, is lost."""
+        """Store custom attributes. Values that are too long or not JSON are counted as losses."""
         for name, value in own.items():
             if value is None or name in _OF_EDGES:
                 continue
@@ -445,7 +445,7 @@ class Blocks:
                 lost[what] = lost.get(what, 0) + 1
 
     def _ids(self, meant: Meant, new: list[tuple[GivenNode, LabelMeaning]]) -> dict[str, int]:
-        """Node ids of a graph by name."""
+        """Return the node ids of a graph by name, and add its new entities to ``new``."""
         found = {name: self._parts[part] for name, part in meant.parts.items()}
         for name, (node, meaning) in meant.entities.items():
             key = (name, meaning.kind)
@@ -472,7 +472,7 @@ class Blocks:
         return States.of(node=np.array(nodes, np.int64), **columns_of(rows))
 
     def _scenery(self, first: int, new: Sequence[tuple[GivenNode, LabelMeaning]]) -> States:
-        """Poses of new entities that never move."""
+        """Return the states of new static entities."""
         still = [(first + row, node) for row, (node, _) in enumerate(new) if node.static]
         rows = [
             state_of(self._path, node.where, node.attributes, {}, any_state=self._any_state)[0]
@@ -526,7 +526,7 @@ def _entities(first: int, new: Sequence[tuple[GivenNode, LabelMeaning]]) -> Enti
 
 
 def _lane_states(inside: Mapping[tuple[int, int, int], dict[str, float]]) -> LaneStates:
-    """Lanes of entities. A lane is the primary one if the file says so, or if it is the only one."""
+    """Return the lane states of entities. A lane is primary if the file marks it or it is the only one."""
     frame, node, lane = _whole(list(inside), 3)
     rows = list(inside.values())
     known = {
@@ -544,5 +544,5 @@ def _lane_states(inside: Mapping[tuple[int, int, int], dict[str, float]]) -> Lan
 
 
 def _whole(rows: Sequence[tuple[int, ...]], width: int) -> list[Ints]:
-    """Rows of whole numbers as columns."""
+    """Return integer rows as columns."""
     return list(np.array(rows, np.int64).reshape(-1, width).T.copy())
