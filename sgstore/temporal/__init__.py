@@ -1,4 +1,4 @@
-"""Temporal formulas (LTLf with past and bounds): over whole traces as columns, and frame by frame.
+"""Temporal formulas (LTLf with past and bounds), evaluated over whole traces or frame by frame.
 
 Both engines give the same answers: :func:`evaluate` at all frames of a trace at once,
 :class:`OnlineFormula` as the frames come, each as soon as it is known.

@@ -1,4 +1,4 @@
-"""The monitor of one ``CHECK``, frame by frame.
+"""Online monitor of one ``CHECK``, frame by frame.
 
 A check has a state for each binding, shared by all bindings in the same state. A state is made once and is
 compared by identity. What follows a state and a letter is remembered, where time does not matter in it, so most
@@ -89,7 +89,7 @@ Duties = tuple["frozenset[Term] | Term | None", ...]
 
 
 class ObligationState:
-    """State of a formula: its open obligations, and the memory of operators of the past.
+    """State of a formula: its open obligations, and the memory of its past operators.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class ObligationState:
 
     @property
     def terms(self) -> list[Term]:
-        """All that is open."""
+        """Return all open terms."""
         found = [term for term, _ in self.past]
         found += [term for _, entries in self.past for *_, term in entries]
         for duty in self.duties:
@@ -127,7 +127,7 @@ class ObligationState:
 
     @property
     def ended(self) -> bool:
-        """Tell whether the formula is true if no frame follows."""
+        """True if the formula holds when no frame follows."""
         if self.word in {"broken", "begins"}:
             return self.word == "begins"
         return all(term.ended for term in self._open)
@@ -137,7 +137,7 @@ class ObligationState:
         return [d for duty in self.duties if duty for d in _open(duty)]
 
     def at_end(self, end: str, tick: Tick) -> int:
-        """Return what is known if the frame of a tick is the last: ``VIOLATED``, ``PENDING`` or ``HOLDS``."""
+        """Return the verdict code if this frame is the last: ``VIOLATED``, ``PENDING`` or ``HOLDS``."""
         if self.ended or end == "weak":
             return HOLDS
         due = end == "pending" or (end == "bounded" and all(may_end(t, tick) for t in self._open))
@@ -164,7 +164,7 @@ class ObligationStep:
 
 
 class Automaton:
-    """A formula, what resets it, and conditions of single frames that are looked at beside it.
+    """Formula with its reset condition and its guards, which are conditions of single frames.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ class Automaton:
         return found
 
     def _until(self, state: ObligationState, tick: Tick) -> tuple[int, int]:
-        """Up to which time and number no bound that is open in a state begins or ends."""
+        """Return the time and frame number up to which no open time bound begins or ends."""
         bounds = [begun for term in state.terms for begun in term.bounds()]
         for part, (_, entries) in zip(self._progression.past, state.past, strict=True):
             if isinstance(part, Since):
@@ -297,7 +297,7 @@ class Automaton:
         return word == "kept" or (word == "broken" and self._reset is None)
 
     def final(self, state: ObligationState, counted: int) -> bool:
-        """Tell whether no frame changes a state any more, if so many guards were true in some frame."""
+        """True if no later frame can change the state. ``counted`` holds the guards that were true so far."""
         return self._lasts(state.word) and counted == (1 << len(self._guards)) - 1
 
     def _moved(self, state: ObligationState, frame: ProgressionFrame) -> tuple[str, Duties]:
@@ -335,7 +335,7 @@ def _conjuncts(formula: Formula) -> list[Formula]:
 
 
 def _part(formula: Formula) -> tuple[bool, Formula]:
-    """A formula as it is watched: what must be true at each frame, each by itself; or whole."""
+    """Split off ``ALWAYS``: return True and its bounded operand, or False and the whole formula."""
     body = always_true(formula)
     if body is None or not bounded(body):
         return False, formula
@@ -347,7 +347,7 @@ def _part(formula: Formula) -> tuple[bool, Formula]:
 
 @dataclass(frozen=True, slots=True)
 class _CheckEntry:
-    """Knowledge about one binding.
+    """Monitor data of one binding.
 
     Attributes
     ----------
@@ -378,7 +378,7 @@ class _CheckEntry:
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """The other evaluation of a binding, which an unknown condition has parted from the first.
+    """Second evaluation of a binding, which differs because of an unknown condition.
 
     Attributes
     ----------
@@ -411,7 +411,7 @@ def _same(one: _CheckEntry, other: _CheckEntry) -> bool:
 
 
 class CheckMonitor:
-    """A check, while a trace comes.
+    """Online monitor of a check over one trace.
 
     Parameters
     ----------
@@ -479,18 +479,18 @@ class CheckMonitor:
 
     @property
     def check(self) -> BoundCheck:
-        """The check."""
+        """Monitored check."""
         return self._check
 
     @property
     def name(self) -> str:
-        """Of the check."""
+        """Name of the check."""
         return self._check.name
 
     # Frame by frame
 
     def step(self, here: FrameTime) -> list[MonitorEvent]:
-        """A frame has come, and the questions were asked of it: what is known from it on."""
+        """Process the next frame after its queries, and return the new events."""
         if self._margins is not None:
             self._margins.step()
         self._count_full()
@@ -530,7 +530,6 @@ class CheckMonitor:
         return list(self._events(here, changed))
 
     def _with_unknown(self, letter: int, sign: str) -> int:
-        """A letter with the unknown propositions that count in one of the evaluations."""
         for bit, signed, _ in self._signed[sign]:
             if letter & bit:
                 letter |= signed
@@ -544,7 +543,7 @@ class CheckMonitor:
         letter: int,
         here: FrameTime,
     ) -> Doubt | None:
-        """What the other evaluation knows of a binding now; ``None``: the same as the first."""
+        """Return the second evaluation of a binding. ``None`` means that both evaluations agree."""
         old = before.doubt
         broken = step.started or (self._compat and not step.state.ended)
         own = entry.since is not None or len(entry.over) > len(before.over)
@@ -559,14 +558,13 @@ class CheckMonitor:
         return Doubt(step.state, counted, violated, name, here)
 
     def _count_full(self) -> None:
-        """Count the frames in which all entities are there that were met up to now."""
         questions = self._questions
         if self._kinds & questions.fresh:
             self._full = 0
         self._full += all(questions.here[k] == len(questions.met(k)) for k in self._kinds)
 
     def _return(self, grown: list[tuple[Partial, int]]) -> None:
-        """Work out what is returned of violations that ended with this frame, given how many had before."""
+        """Compute the returned values of the violations that ended with this frame."""
         self._values.step()
         for row, before in grown:
             entry = self._known.of(row)
@@ -578,7 +576,7 @@ class CheckMonitor:
         self._values.forget((self._pulse.tick.number, *since))
 
     def _values_of(self, key: Partial, span: Span) -> dict[str, Any]:
-        """Values that are returned of a violation."""
+        """Compute the returned values of a violation."""
         binding = dict(zip(self._variables, key, strict=True))
         start, end = (one.seq for one in span)
 
@@ -589,7 +587,7 @@ class CheckMonitor:
         return self._returned.told(part)
 
     def _violation(self, key: Partial, span: Span) -> dict[str, Any]:
-        """Values that are returned of a violation of a binding, also of one that has ended."""
+        """Return the values of a violation of a binding, also of an ended violation."""
         if not self._check.returns or span not in self._known.of(key).over:
             return self._values_of(key, span)
         wider = ((row, span) for row in self._known.lattice.wider(key))
@@ -598,7 +596,7 @@ class CheckMonitor:
     def _as_sgsm(
         self, entry: _CheckEntry, step: ObligationStep, here: FrameTime, memory: Memory
     ) -> _CheckEntry:
-        """Return the entry of a binding that is violated as long as the trace may not end."""
+        """Return the entry of a binding in SGSM mode: violated while the trace may not end."""
         since, over = entry.since, entry.over
         if not step.state.ended:
             since = since or here
@@ -615,7 +613,7 @@ class CheckMonitor:
     # What is known
 
     def _events(self, here: FrameTime, changed: list[Partial]) -> Iterator[MonitorEvent]:
-        """Return the events of bindings whose status has changed; of all bindings, if an entity is new."""
+        """Yield events of bindings with a new status. A new entity leads to events of all bindings."""
         rows = list(self._known.held) if self._kinds & self._questions.fresh else changed
         for row in rows:
             entry = self._known.of(row)
@@ -637,7 +635,7 @@ class CheckMonitor:
                         yield replace(event, values=values)
 
     def _covered(self, row: Partial, entry: _CheckEntry) -> Iterator[Key]:
-        """The bindings of entities that were met of which no more is known than this."""
+        """Yield the bindings of known entities that share this entry."""
         if None not in row:
             yield row  # type: ignore[misc]
             return
@@ -650,7 +648,7 @@ class CheckMonitor:
                 yield key  # type: ignore[misc]
 
     def _counts(self, key: Key, entry: _CheckEntry) -> bool:
-        """Tell whether a binding is one that the check is about."""
+        """True if the quantifiers of the check cover this binding."""
         if entry.counted != (1 << len(self._guards)) - 1:
             return False
         if any(n not in self._domains[v] for n, v in zip(key, self._variables, strict=True)):
@@ -661,7 +659,6 @@ class CheckMonitor:
 
     @property
     def _others(self) -> set[int]:
-        """Return the nodes that no quantifier binds: the egos."""
         rest = [n for n in self._domains if n not in self._variables]
         return {node for name in rest for node in self._domains[name]}
 
@@ -683,11 +680,11 @@ class CheckMonitor:
 
     @property
     def robustness(self) -> Robustness | None:
-        """Margin by which the check is met if the trace ends now; ``None``: it is not asked."""
+        """Robustness of the check if the trace ends now. ``None`` means that the check does not request it."""
         return None if self._margins is None else self._margins.told(self._levels(), self._domains)
 
     def status(self) -> str:
-        """The status of the check for the entities seen so far: one of ``STATUS``."""
+        """Return the status of the check for the entities seen so far: one of ``STATUS``."""
         levels = self._levels()
         bindings = innermost(levels)
         known = STATUS[self._folded_codes(levels, [self._of(key) for key in bindings.tolist()])]
@@ -696,7 +693,7 @@ class CheckMonitor:
         return known
 
     def _worst(self) -> int:
-        """What is known with no unknown condition in favour of the check, if the trace ends now."""
+        """Return the verdict code if the trace ends now and all unknown conditions count against the check."""
         levels = self._levels(doubted=True)
         codes = [self._code_at_end(self._of(key)) for key in innermost(levels).tolist()]
         return int(folded_values(levels, np.array(codes, np.int8), HOLDS)[0][0])
@@ -705,7 +702,7 @@ class CheckMonitor:
         return self._known.of(tuple(key))
 
     def _levels(self, *, doubted: bool = False, waiting: bool = False) -> list[Level]:
-        """The bindings of each quantifier.
+        """Return the bindings of each quantifier.
 
         ``doubted``: those of the other evaluation; ``waiting``: with those that ``FORSOME`` may be about later.
         """
@@ -732,7 +729,7 @@ class CheckMonitor:
         return int(folded_values(levels, codes, CERTAINLY_TRUE)[0][0])
 
     def _spans(self, entry: _CheckEntry, last: FrameTime) -> list[Span]:
-        """The violations of a binding in a trace that has ended."""
+        """Return the violations of a binding at the end of the trace."""
         found = list(entry.over)
         if entry.since is not None:
             found.append((entry.since, last))
@@ -745,7 +742,7 @@ class CheckMonitor:
         return HOLDS if self._compat else state.at_end(self._check.end, self._pulse.tick)
 
     def _code_at_end(self, entry: _CheckEntry) -> int:
-        """What is known of a binding in a trace that has ended."""
+        """Return the verdict code of a binding at the end of the trace."""
         own = self._ends(entry.state)
         if entry.since is not None or entry.over or own == VIOLATED:
             return VIOLATED
@@ -755,7 +752,7 @@ class CheckMonitor:
         return UNKNOWN if other == VIOLATED else other
 
     def finish(self, trace: str, last: FrameTime) -> tuple[Verdict, list[MonitorEvent]]:
-        """The trace has ended: the verdict, and what only the end makes known."""
+        """End the trace: return the verdict and the events that only the end decides."""
         levels = self._levels()
         bindings = innermost(levels)
         entries = [self._of(key) for key in bindings.tolist()]
@@ -792,7 +789,7 @@ class CheckMonitor:
         return found, list(self._at_end(last, holds=holds, bindings=bindings, spans=spans))
 
     def _waits(self, levels: list[Level]) -> bool:
-        """Tell whether a check that has failed so far waits for who comes later."""
+        """True if a failed check can still hold for entities that appear later."""
         if self._compat or not may_wait(self._check):
             return False
         wider = self._levels(waiting=True)
@@ -800,7 +797,7 @@ class CheckMonitor:
         return waits_for_newcomers(self._check, levels, wider, np.array(codes, np.int8))
 
     def _reason(self, trace: str) -> str:
-        """Why the verdict is unknown: the condition that decides, of whom, and in which frame."""
+        """Return the reason of an unknown verdict: the deciding condition, its entities and its frame."""
         for key in innermost(self._levels(doubted=True)).tolist():
             entry = self._of(key)
             if entry.doubt is not None and self._code_at_end(entry) == UNKNOWN:
@@ -813,7 +810,7 @@ class CheckMonitor:
     def _at_end(
         self, last: FrameTime, *, holds: bool, bindings: Keys, spans: list[list[Span]]
     ) -> Iterator[MonitorEvent]:
-        """Violations that were not told yet."""
+        """Yield the violations without an event so far."""
         if holds:
             return
         if not self._immediate:

@@ -1,4 +1,4 @@
-"""Plans of checks: what counts where an entity is absent, or too little is known of it.
+"""Plans of checks, with rules for absent entities and unknown values.
 
 A check is evaluated twice by the evaluators of two-valued formulas: once as if all unknown conditions were in
 its favour, and once as if none were. In the formula an unknown condition is a proposition of its own. Its name
@@ -65,7 +65,7 @@ _CONTRARY: Final = {"+": "-", "-": "+", "": "*", "*": ""}
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What counts at a place of a formula.
+    """Rules for unknown and absent values at one position of a formula.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class Reading:
 
     @property
     def contrary(self) -> Reading:
-        """The reading under a negation."""
+        """Reading under a negation."""
         absent = None if self.absent is None else not self.absent
         return Reading(_CONTRARY[self.unknown], not self.positive, absent)
 
@@ -99,13 +99,13 @@ CERTAIN: Final = Reading("", absent=False)
 
 
 def base_name(name: str) -> str:
-    """The name of a proposition without the sign of the evaluation that it counts in."""
+    """Return the name of a proposition without the sign of its evaluation."""
     return name.rstrip("+-")
 
 
 @dataclass(slots=True)
 class CheckPlan(Plan):
-    """Plan of a check.
+    """Evaluation plan of a check.
 
     Attributes
     ----------
@@ -142,7 +142,7 @@ class CheckPlan(Plan):
         return Plan._query(self, things | {ego}, (*where, *near))  # noqa: SLF001 - of the base class
 
     def formula(self, expression: b.Bound) -> f.Formula:
-        """The formula of a condition that must be known to be true, as within ``run_length``."""
+        """Return the formula for "the condition is known to be true", as inside ``run_length``."""
         match expression:
             case b.Operation(word=word, operands=(operand,)) if word == POSSIBLY:
                 return self.read(operand, Reading("*", absent=False))
@@ -150,7 +150,7 @@ class CheckPlan(Plan):
                 return self.read(expression, CERTAIN)
 
     def read(self, expression: b.Bound, reading: Reading) -> f.Formula:
-        """The formula of a condition in a reading."""
+        """Return the formula of a condition under a reading."""
         match expression:
             case b.Tense(word=word, operands=operands):
                 bound = f.Bound(expression.low, expression.high, expression.frames)
@@ -185,7 +185,7 @@ class CheckPlan(Plan):
                 return self.read(found, reading)
 
     def _guarded(self, expression: b.Bound) -> frozenset[str]:
-        """Return the nodes without which a pushed condition is false, where absence counts as false."""
+        """Return the nodes whose absence makes the condition false, where absence counts as false."""
         match expression:
             case b.Operation("AND", operands):
                 return frozenset().union(*map(self._guarded, operands))
@@ -195,7 +195,10 @@ class CheckPlan(Plan):
                 return self._things(expression)
 
     def _counted(self, things: frozenset[str], reading: Reading) -> bool | None:
-        """What a condition on some nodes is where any of them is absent; ``None``: it depends on which."""
+        """Return the truth value of a condition if one of its nodes is absent.
+
+        ``None`` means it depends on the node.
+        """
         if reading.absent is not None:
             return reading.absent
         words = {word for word, nodes in self._levels if nodes & things} or {self._levels[0][0]}
@@ -230,7 +233,7 @@ class CheckPlan(Plan):
         return self._joined_here(wanted, counted=counted, reading=reading)
 
     def _joined_here(self, wanted: b.Bound, *, counted: bool, reading: Reading) -> f.Formula:
-        """The formula of logic of one frame whose parts are about different entities."""
+        """Return the formula of a single-frame condition whose parts use different entities."""
         assert isinstance(wanted, b.Operation)  # noqa: S101 - a part of it is no logic
         inner = reading.contrary if counted else reading
         parts = self._merged(wanted.operands) if wanted.word == "AND" else wanted.operands
@@ -242,13 +245,12 @@ class CheckPlan(Plan):
         return reading.absent is None and bool(old & things)
 
     def _by_parts(self, expression: b.Bound, reading: Reading, things: frozenset[str]) -> f.Formula:
-        """The formula of a condition whose smallest parts are asked one by one."""
         if isinstance(expression, b.Operation) and expression.word in CONNECTIVES:
             return self._as_written(expression, reading)
         return self._by_levels(self._asked(expression, things, reading.unknown), things, reading)
 
     def _as_written(self, expression: b.Operation, reading: Reading) -> f.Formula:
-        """The formula of logic, part by part."""
+        """Return the formula of a logical operation, operand by operand."""
         match expression:
             case b.Operation("NOT", (operand,)):
                 return f.Not(self.read(operand, reading.contrary))
@@ -260,7 +262,7 @@ class CheckPlan(Plan):
                 return f.LOGIC[word](*(self.read(one, reading) for one in operands))
 
     def _by_levels(self, found: f.Formula, things: frozenset[str], reading: Reading) -> f.Formula:
-        """A formula that is false where something is absent, with what counts there: the outermost decides."""
+        """Extend a formula for absent entities. The outermost quantifier decides."""
         for word, nodes in reversed(self._levels):
             if nodes & things and word != "false" and (word == "FORALL") == reading.positive:
                 away = [f.Not(self.present(node)) for node in sorted(nodes & things)]
@@ -270,7 +272,7 @@ class CheckPlan(Plan):
         return found
 
     def _asked(self, wanted: b.Bound, things: frozenset[str], sign: str) -> f.Formula:
-        """That a pushed condition is true, or unknown in the evaluation of that sign."""
+        """Return the formula for "true", or for "true or unknown" in the evaluation with this sign."""
         if isinstance(wanted, b.Value) and not things:
             return f.TruthConstant(wanted.value is True)
         found = f.Proposition(self._ask(certain(wanted, decided=self._decided), things))
@@ -282,7 +284,7 @@ class CheckPlan(Plan):
         return f.Or((found, f.Proposition(name + sign.strip("*"))))
 
     def _ask(self, condition: b.Bound, things: frozenset[str]) -> str:
-        """The name of the atom of a condition that is asked as it stands."""
+        """Return the name of the atom for a condition. Add the atom if it is new."""
         key = unnumbered_text(condition) + f" of {sorted(things)}"
         name = self._names.get(key)
         if name is None:
@@ -294,7 +296,7 @@ class CheckPlan(Plan):
     # Conditions on several frames
 
     def _over_frames(self, expression: b.Bound, reading: Reading) -> f.Formula:
-        """The formula of a comparison, or another smallest condition, of values of several frames."""
+        """Return the formula of a comparison, or another simple condition, on values of several frames."""
         things = self._things(expression)
         counted = self._counted(things, reading)
         state = self._state(expression)
@@ -321,7 +323,7 @@ class CheckPlan(Plan):
         return name
 
     def _doubtful(self, expression: b.Bound, state: b.Bound) -> b.Bound | None:
-        """The condition that a smallest condition of several frames is unknown."""
+        """Return the condition under which a simple multi-frame condition is unknown."""
         ways: list[b.Bound] = []
         if any(self._may_be_unknown(part) for part in b.walk(state)):
             ways.append(b.Operation(">", (state, _number(0)), Type.boolean))
@@ -335,12 +337,11 @@ class CheckPlan(Plan):
         return ways[0] if ways else None
 
     def _open_runs(self, expression: b.Bound) -> bool:
-        """Tell whether an expression is about runs of conditions that may be unknown."""
         runs = [p for p in b.walk(expression) if isinstance(p, b.SignalCall) and p.word in _RUNS]
         return any(self._open(run.operand) for run in runs)
 
     def _open(self, condition: b.Bound) -> bool:
-        """Tell whether a condition within ``run_length`` may be unknown."""
+        """True if a condition inside ``run_length`` may be unknown."""
         return any(
             self._unknown(part) is not None
             for part in b.walk(condition)
@@ -349,7 +350,6 @@ class CheckPlan(Plan):
 
     @property
     def _decided(self) -> bool:
-        """Tell whether unknown values count as values that do not exist."""
         return self.whole.unknown_is_false
 
     def _unknown(self, value: b.Bound) -> b.Bound | None:
@@ -363,7 +363,7 @@ class CheckPlan(Plan):
         )
 
     def _state(self, expression: b.Bound) -> b.Bound:
-        """0 if the values in an expression are known, more if one is unknown; NULL if one is absent."""
+        """Return the state of an expression: 0 if all values are known, else more; NULL if one is absent."""
         parts = list(dict.fromkeys(self._states(expression)))
         now = [part for part in parts if isinstance(part, b.Operation) and part.word == STATE]
         rest = self._things(expression) - frozenset().union(*map(self._things, now))
@@ -435,7 +435,7 @@ class CheckPlan(Plan):
                 Plan._measure(self, expression, test)  # noqa: SLF001 - of the base class
 
     def presence(self, node: str) -> str:
-        """The name of the atom that says where a node is."""
+        """Return the name of the atom that is true where a node is present."""
         found = self.present(node)
         assert isinstance(found, f.Proposition)  # noqa: S101 - it is about a node
         return found.name
@@ -445,7 +445,7 @@ class CheckPlan(Plan):
     def margin(  # noqa: PLR0911 - a case each
         self, expression: b.Bound, reading: Reading
     ) -> f.Formula:
-        """The formula over margins of a condition in a reading; see :meth:`Plan.quantity`."""
+        """Return the formula over margins of a condition under a reading; see :meth:`Plan.quantity`."""
         match expression:
             case b.Tense(word=word, operands=operands):
                 bound = f.Bound(expression.low, expression.high, expression.frames)
@@ -466,7 +466,7 @@ class CheckPlan(Plan):
                 return self.read(expression, reading)
 
     def _margin(self, expression: b.Operation, reading: Reading) -> f.Formula:
-        """The margin of a comparison, with what counts where it has none."""
+        """Return the margin of a comparison, with a default for absent and unknown values."""
         difference = MARGINS[expression.word](*expression.operands)
         test = self.test(difference)
         self.margins.setdefault(test.name, expression)
@@ -500,7 +500,7 @@ _RUNS: Final = frozenset({"run_length", "since_true"})
 
 
 def _with_possible_runs(expression: b.Bound) -> b.Bound:
-    """An expression in which the conditions of runs are true where they may be."""
+    """Return the expression with run conditions that count unknown as true."""
     match expression:
         case b.SignalCall(word=word, operand=operand) if word in _RUNS:
             return replace(expression, operand=b.Operation(POSSIBLY, (operand,), Type.boolean))
@@ -521,7 +521,7 @@ def _case(condition: b.Bound, then: b.Bound, otherwise: b.Bound) -> b.Operation:
 
 
 def _contrary(condition: b.Bound) -> b.Bound:
-    """The condition that another one of several frames is false; a number of a pair may have no value."""
+    """Return the negation of a multi-frame condition. A pair value may have no value."""
     if not has_pairs(condition):
         return _case(condition, FALSE, TRUE)
     return _boolean("case", condition, FALSE, _boolean("IS NULL", condition), FALSE, TRUE)
@@ -536,13 +536,13 @@ PlannedCheck = tuple[CheckPlan, f.Formula, "f.Formula | None", dict[int, f.Formu
 
 
 def empty_plan(check: BoundCheck) -> CheckPlan:
-    """Return the plan of a check, without questions yet."""
+    """Return the plan of a check without queries."""
     words = tuple((q.word if q.absent else "false", frozenset(q.nodes)) for q in check.quantifiers)
     return CheckPlan(query_of_check(check), variables_of(check), words=words, limit=check.limit)
 
 
 def plan_of_check(check: BoundCheck, *, reset: bool = True) -> PlannedCheck:
-    """Return a check with the formulas that it is made of; ``reset``: whether what resets it matters."""
+    """Return the plan, formula, reset and guards of a check. ``reset=False`` leaves the reset out."""
     plan = empty_plan(check)
     formula = plan.read(check.formula, WHOLE)
     resets = plan.formula(check.reset) if reset and check.reset is not None else None
@@ -555,11 +555,11 @@ def plan_of_check(check: BoundCheck, *, reset: bool = True) -> PlannedCheck:
 
 
 def plan_of_margins(check: BoundCheck, reading: Reading = WHOLE) -> tuple[CheckPlan, f.Formula]:
-    """Return what a check is met by: the plan, and the formula over margins."""
+    """Return the robustness plan of a check, and its formula over margins."""
     plan = empty_plan(check)
     return plan, plan.margin(check.formula, reading)
 
 
 def misses_absent(check: BoundCheck) -> bool:
-    """Tell whether a check is false where an entity is absent."""
+    """True if an absent entity can make the check false."""
     return any(one.word == "FORSOME" and one.absent for one in check.quantifiers)

@@ -1,4 +1,4 @@
-"""``CHECK`` over a store: verdicts, violations and quantifiers.
+"""Evaluation of ``CHECK`` over a store: verdicts, violations and quantifiers.
 
 A trace that lacks what a check needs has the verdict ``unknown``, with the reason.
 """
@@ -95,7 +95,7 @@ NEWCOMER: Final = -(1 << 60)
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """The bindings up to one quantifier.
+    """Bindings of the variables up to one quantifier.
 
     Attributes
     ----------
@@ -113,7 +113,7 @@ class Level:
 
 
 def innermost(levels: Sequence[Level]) -> Keys:
-    """(B, n): the bindings of all variables; without quantifiers the one of none."""
+    """Return the bindings of all variables, shape (B, n). Without quantifiers, return one empty binding."""
     return levels[-1].bindings if levels else np.zeros((1, 0), np.int64)
 
 
@@ -124,7 +124,7 @@ def levels_of(
     apart: Ints | None,
     counts: Callable[[BoundQuantifier, tuple[str, ...], Keys], Bools],
 ) -> list[Level]:
-    """The bindings of each quantifier, as they go on from one another.
+    """Return the bindings of each quantifier, each extended from the bindings before.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def levels_of(
 
 
 def newcomers(check: BoundCheck, domains: Mapping[str, Ints]) -> dict[str, Ints]:
-    """Return the domains of a check, with one who is yet to come for each variable of ``FORSOME``."""
+    """Return the domains of a check, plus one future entity for each variable of ``FORSOME``."""
     some = [node for q in check.quantifiers if q.word == "FORSOME" for node in q.nodes]
     return {
         node: np.append(domain, NEWCOMER + some.index(node)) if node in some else domain
@@ -178,7 +178,7 @@ def newcomers(check: BoundCheck, domains: Mapping[str, Ints]) -> dict[str, Ints]
 def waits_for_newcomers(
     check: BoundCheck, levels: Sequence[Level], wider: Sequence[Level], codes: Codes
 ) -> bool:
-    """Tell whether a check that has failed may still hold, as ``FORSOME`` is about who comes later, too.
+    """True if a failed check can still hold, because ``FORSOME`` includes entities that appear later.
 
     Parameters
     ----------
@@ -199,14 +199,14 @@ def waits_for_newcomers(
 
 
 def may_wait(check: BoundCheck) -> bool:
-    """Tell whether a check that has failed so far may be fulfilled by who comes later."""
+    """True if entities that appear later can fulfil a failed check."""
     return check.end in {"bounded", "pending"} and any(
         q.word == "FORSOME" for q in check.quantifiers
     )
 
 
 def folded_values(levels: Sequence[Level], values: Array, most: int = 1) -> list[Array]:
-    """Return the values of the bindings of each level, outermost first; the empty binding comes before.
+    """Combine values of bindings by quantifier. Return the values of each level, outermost first.
 
     Parameters
     ----------
@@ -228,7 +228,7 @@ def folded_values(levels: Sequence[Level], values: Array, most: int = 1) -> list
 
 
 def folded_margins(levels: Sequence[Level], values: Floats) -> tuple[float, int | None]:
-    """The margin of a check, given those of its bindings, and the binding that decides (``None``: none).
+    """Return the margin of a check, and the deciding binding. ``None`` means no binding decides.
 
     Parameters
     ----------
@@ -257,7 +257,7 @@ def folded_margins(levels: Sequence[Level], values: Floats) -> tuple[float, int 
 
 @dataclass(frozen=True, slots=True)
 class Witness:
-    """Entities that a verdict is due to: of ``FORALL`` those that violate it, of ``FORSOME`` those that do not.
+    """Entities that decide a verdict: violating ones for ``FORALL``, fulfilling ones for ``FORSOME``.
 
     Attributes
     ----------
@@ -277,7 +277,7 @@ class Witness:
 
 
 def unknown_notes(told: Iterable[tuple[str, str, str]]) -> list[str]:
-    """Return what to say of traces that cannot answer, those with the same reason in one line.
+    """Return notes on traces with unknown verdicts, one line per reason.
 
     Parameters
     ----------
@@ -295,13 +295,13 @@ def unknown_notes(told: Iterable[tuple[str, str, str]]) -> list[str]:
 
 
 def doubt_text(condition: Bound, who: Sequence[str], frame: str) -> str:
-    """Text of the condition that is unknown, of whom, and in which frame."""
+    """Return the text that names an unknown condition, its entities and its frame."""
     written = value_text(condition).removeprefix("(").removesuffix(")")
     return f"{written} is unknown{' of ' * bool(who)}{', '.join(who)} in {frame}"
 
 
 def absence_text(frames: int) -> str:
-    """Text of the number of frames in which an entity is absent."""
+    """Return the text that gives the number of frames with an absent entity."""
     return f"an entity is absent in {frames} frame{'s' * (frames != 1)}"
 
 
@@ -350,7 +350,7 @@ class Verdict:
         return f"<Verdict {self.check!r} of {self.trace!r}: {self.verdict}{more}{why}{away}>"
 
     def _repr_html_(self) -> str:
-        """The verdict with its violations as a table, for notebooks."""
+        """Return the verdict with its violations as an HTML table, for notebooks."""
         from sgstore.display import html_table
 
         margin = self.robustness is not None
@@ -361,17 +361,17 @@ class Verdict:
 
     @property
     def first_violation(self) -> Interval | None:
-        """The first violation; ``None``: there is none."""
+        """First violation, or ``None``."""
         return self.violations[0] if self.violations else None
 
     @property
     def violated(self) -> bool:
-        """Tell whether the trace is known to violate the check."""
+        """True if the trace certainly violates the check."""
         return self.verdict == "false"
 
     @property
     def statuses(self) -> tuple[str, ...]:
-        """The status at each frame in words, if it was asked for."""
+        """Status of each frame as a word, if requested."""
         return tuple(STATUS[code] for code in self.status) if self.status is not None else ()
 
 
@@ -380,7 +380,7 @@ _MARGIN_COLUMNS: Final = ("robustness", "decided by", "in")
 
 
 def within_range(found: Verdict, short: ShortRange) -> Verdict:
-    """A verdict of what is known as one of the whole world: unknown, if too little is known for it."""
+    """Return the verdict for the whole world. It is unknown if the stored range is too short."""
     if found.verdict not in {"true", "false"}:
         return found
     reason = short.of(holds=found.verdict == "true")
@@ -391,7 +391,7 @@ def within_range(found: Verdict, short: ShortRange) -> Verdict:
 
 
 def verdict_columns(*, margin: bool = False, returned: Sequence[str] = ()) -> tuple[str, ...]:
-    """Columns of verdicts for people.
+    """Return the column names of readable verdict rows.
 
     Parameters
     ----------
@@ -406,7 +406,7 @@ def verdict_columns(*, margin: bool = False, returned: Sequence[str] = ()) -> tu
 def verdict_rows(
     verdict: Verdict, *, margin: bool = False, returned: Sequence[str] = ()
 ) -> Iterator[tuple[Any, ...]]:
-    """A verdict for people, as rows of :func:`verdict_columns`: one, or one for each violation."""
+    """Yield readable rows of a verdict for :func:`verdict_columns`: one row per violation, at least one."""
     head = verdict.check, verdict.trace, verdict.verdict
     tail = margin_cells(verdict) if margin else ()
     nothing = [("",) * (4 + len(returned))]
@@ -422,7 +422,10 @@ def verdict_rows(
 
 
 def margin_cells(verdict: Verdict) -> tuple[str, str, str]:
-    """By how much a check is met: the number, the condition and who, and the frame; empty: not known."""
+    """Return table cells of the robustness: value, deciding condition with entities, frame.
+
+    Empty means unknown.
+    """
     found = verdict.robustness
     if found is None:
         return "", "", ""
@@ -446,17 +449,17 @@ def _times(violations: tuple[Interval, ...], returned: Sequence[str]) -> list[tu
 
 
 def returned_by(checks: Iterable[BoundCheck]) -> dict[str, tuple[str, ...]]:
-    """Names of the values that each of some checks returns of its violations."""
+    """Return the names of the values that each check returns for its violations."""
     return {check.name: tuple(column.name for column in check.returns) for check in checks}
 
 
 def columns_returned(returned: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
-    """Names of the values that some checks return, each once."""
+    """Return the distinct names of the values that some checks return."""
     return tuple(dict.fromkeys(name for names in returned.values() for name in names))
 
 
 def cell_of(value: Any) -> str:
-    """A value that was returned, as a person reads it."""
+    """Format a returned value for readers."""
     if value is None:
         return "unknown"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
@@ -471,7 +474,9 @@ def verdict_of(
     violations: Callable[[int, Mapping[str, str]], tuple[Interval, ...]],
     last: Interval,
 ) -> Verdict:
-    """A verdict with its violations and witnesses: those of the outermost quantifiers of one word.
+    """Return the verdict with violations and witnesses.
+
+    Witnesses bind the outermost quantifiers of one kind.
 
     Parameters
     ----------
@@ -508,7 +513,7 @@ def verdict_of(
 
 
 class CheckRun:
-    """The checks of a text, ready to be asked of a store. Iterating asks: verdicts trace by trace.
+    """Compiled checks of a text. Iteration evaluates them on a store, trace by trace.
 
     Parameters
     ----------
@@ -550,7 +555,7 @@ class CheckRun:
         return f"<CheckRun of {', '.join(self.names)}>"
 
     def _repr_html_(self) -> str:
-        """The verdicts and the first violations as a table, for notebooks: the checks are asked."""
+        """Evaluate the checks, and return verdicts and first violations as an HTML table for notebooks."""
         from sgstore.display import html_table
 
         found = list(self)
@@ -566,27 +571,30 @@ class CheckRun:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the checks, in order."""
+        """Names of the checks in order."""
         return tuple(one.check.name for one in self._checks)
 
     @property
     def quantitative(self) -> bool:
-        """Tell whether it is asked of some check by how much it is met."""
+        """True if a check requests its robustness."""
         return any(one.check.robustness for one in self._checks)
 
     @property
     def lasting(self) -> bool:
-        """Tell whether each check says what is always true, of everybody: then frames have margins, too."""
+        """True if each check is a condition that must always hold for all entities.
+
+        Frames then have margins.
+        """
         return all(kept_throughout(one.check) is not None for one in self._checks)
 
     @property
     def returned(self) -> dict[str, tuple[str, ...]]:
-        """Names of the values that each check returns of its violations."""
+        """Names of the values that each check returns for its violations."""
         return returned_by(one.check for one in self._checks)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on likely mistakes, such as texts that are compared with names and that no name is equal to."""
+        """Notes on likely mistakes, such as a text that equals no name in the store."""
         with self._file.snapshot():
             compared = [pair for one in self._checks for pair in compared_in_check(one.check)]
             found = dict.fromkeys(compared)
@@ -594,7 +602,7 @@ class CheckRun:
 
     @property
     def scope(self) -> dict[str, Any]:
-        """What settings left out of the traces that are asked; see :func:`sgstore.store.scope_of`."""
+        """Data that the settings excluded from the checked traces; see :func:`sgstore.store.scope_of`."""
         world = any(one.check.world for one in self._checks)
         with self._file.snapshot():
             return scope_of((one.report for one in self._file.traces()), world=world)
@@ -606,13 +614,13 @@ class CheckRun:
                 yield from check.verdicts()
 
     def unknown(self) -> Iterator[Verdict]:
-        """The verdicts of the traces that cannot answer; no other trace is asked."""
+        """Yield the verdicts of the traces without the needed data. Other traces are not evaluated."""
         with self._file.snapshot():
             for one in compile_checks(self._text, self._catalog(), self._parameters):
                 yield from StoreCheck(self._file, one, compat=False, status=False).unknown()
 
     def margins(self) -> Iterator[tuple[Ints, Floats]]:
-        """Margins by which traces meet the one check, as :meth:`StoreCheck.margins` tells them.
+        """Yield frame ids and margins of each trace for the only check; see :meth:`StoreCheck.margins`.
 
         Yields
         ------
@@ -637,7 +645,7 @@ class CheckRun:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
-    """What is known of bindings.
+    """Verdict codes of bindings.
 
     Attributes
     ----------
@@ -658,7 +666,7 @@ _BindingVerdict = tuple[tuple[Violation, ...], "Statuses | None"]
 
 
 class StoreCheck:
-    """One check, while a store is asked.
+    """Evaluation of one check on a store.
 
     Parameters
     ----------
@@ -702,7 +710,7 @@ class StoreCheck:
 
     @cached_property
     def _lacks(self) -> dict[int, str]:
-        """The traces that do not know what the check needs, with the reason."""
+        """Return the traces without data for the check: trace id → reason."""
         found = lacking(self._file, self._catalog, of_check(self._check))
         for facts in self._catalog.traces:
             reasons = not_computed(self._check, facts), found.get(facts.trace_id, "")
@@ -712,7 +720,6 @@ class StoreCheck:
 
     @cached_property
     def _short(self) -> Mapping[int, ShortRange]:
-        """The traces that know less of the world around than the check looks."""
         return short_ranges(self._file, self._catalog, self._check)
 
     @cached_property
@@ -720,7 +727,7 @@ class StoreCheck:
         return replace(self._catalog, unknowing=frozenset(self._lacks))
 
     def text(self) -> str:
-        """The check as it is asked."""
+        """Return the plan of the check as text."""
         head = [f"---- {self._check.name}"]
         head += [f"{q.word} {', '.join(q.nodes)}" for q in self._check.quantifiers]
         plan = plan_text(self._plan, self._formula, self._reset, self._catalog)
@@ -729,30 +736,30 @@ class StoreCheck:
         return "\n".join([*head, plan, *quantity, *returned])
 
     def verdicts(self) -> Iterator[Verdict]:
-        """The verdict of each trace, by name of the trace."""
+        """Yield the verdict of each trace, ordered by trace name."""
         known = (self._verdict(trace) for trace in self.readers() if len(trace))
         yield from merge(known, self.unknown(), key=lambda verdict: natural(verdict.trace))
 
     def readers(self, within: Window | None = None) -> Iterator[TraceReader]:
-        """The traces that can answer, of a window of whole traces, with all that the check needs of them."""
+        """Yield the answerable traces of a window, loaded with the data that the check needs."""
         gaps = "bridge" if self._check.gaps == "bridge" else "break"
         self._read_people()
         asks = self._plan.asks | self._values.asks
         yield from traces(self._file, self._knowing, self._whole, asks, gaps=gaps, within=within)
 
     def unknown(self) -> Iterator[Verdict]:
-        """The verdicts of the traces that cannot answer."""
+        """Yield the verdicts of the traces without the needed data."""
         yield from self._unknown(self._knowing, self._lacks)
 
     def watched(self) -> dict[str, str]:
-        """Names of the propositions that say where the entities of each variable are; asked from now on."""
+        """Return for each variable the proposition of its presence. It is queried from now on."""
         found = (
             (node, self._plan.present(node)) for q in self._check.quantifiers for node in q.nodes
         )
         return {node: one.name for node, one in found if isinstance(one, Proposition)}
 
     def violated(self, trace: TraceReader, present: Mapping[str, str]) -> bool:
-        """Tell whether some frames of a trace violate the check, as if they were all.
+        """True if the selected frames of a trace violate the check, taken as a whole trace.
 
         Parameters
         ----------
@@ -773,7 +780,7 @@ class StoreCheck:
             self._people[trace.trace_id] = everybody
 
     def _unknown(self, catalog: Catalog, lacks: Mapping[int, str]) -> Iterator[Verdict]:
-        """The verdicts of the traces that cannot answer."""
+        """Yield the verdicts of the traces without the needed data."""
         _, left = traces_of(self._whole, catalog)
         for facts in catalog.traces:
             if facts.trace_id in left and self._check.ego in {None, facts.ego}:
@@ -782,7 +789,7 @@ class StoreCheck:
 
     @cached_property
     def _absences(self) -> dict[int, int]:
-        """The number of frames of each trace in which an entity that the check is about is absent."""
+        """Return, for each trace, the number of frames in which an entity of the check is absent."""
         frames = frame_times(self._file, None)["frame_id"]
         full = np.ones(len(frames), np.bool_)
         owners = trace_of(frames)
@@ -804,7 +811,6 @@ class StoreCheck:
         return dict(zip(traces.tolist(), number.tolist(), strict=True))
 
     def _read_people(self) -> None:
-        """The entities that variables may be, with their names, by trace."""
         for node in self._check.scope.nodes:
             statement = entities(self._whole, node, self._catalog, None)
             for trace, number, name in self._file.rows(statement.sql, statement.values).values:
@@ -847,7 +853,7 @@ class StoreCheck:
         return replace(found, robustness=robustness)
 
     def _judged(self, trace: TraceReader, levels: Sequence[Level]) -> Judged:
-        """What is known of each binding of the last level."""
+        """Return the verdict codes of all bindings of the last level."""
         kinds, members = self._alike(trace, innermost(levels))
         codes = np.zeros(len(kinds), np.int8)
         told: list[_BindingVerdict] = [((), None)] * len(kinds)
@@ -864,13 +870,12 @@ class StoreCheck:
         return Judged(codes[members], told, in_gap[members])
 
     def _doubts_guards(self, trace: TraceReader) -> bool:
-        """Tell whether it is unknown of somebody whether a quantifier is about them."""
         names = {n for guard in self._guards.values() for n in propositions(guard)}
         doubts = {base_name(name) for name in names if name[-1] in SIGNS}
         return any(len(trace.relations[name].frames) for name in doubts)
 
     def _reason(self, trace: TraceReader, levels: Sequence[Level], judged: Judged) -> str:
-        """Why the verdict is unknown: the condition that decides, of whom, and in which frame."""
+        """Return the reason of an unknown verdict: the deciding condition, its entities and its frame."""
         rows = np.flatnonzero(judged.codes == UNKNOWN)
         if not len(rows):
             return "it is unknown whether a quantifier is about an entity"
@@ -887,7 +892,7 @@ class StoreCheck:
         return doubt_text(self._plan.doubts[name], who, f"{trace.name}#{trace.numbers[frame]}")
 
     def _decisive_doubt(self, trace: TraceReader, binding: Keys) -> tuple[str, int] | None:
-        """The unknown proposition that decides the verdict of a binding, and its frame."""
+        """Return the unknown proposition that decides the verdict of a binding, and its frame."""
         values = PlanValues(self._plan, trace, self._variables, binding)
         columns: dict[str, Floats] = {}
         for name in propositions(self._formula):
@@ -906,7 +911,7 @@ class StoreCheck:
         return None
 
     def _robustness(self, quantity: Formula, trace: TraceReader, levels: list[Level]) -> Robustness:
-        """Margin by which a trace meets the check, at least and at most."""
+        """Return the lower and upper robustness of the check on a trace."""
         kinds, members = self._alike(trace, innermost(levels))
         ends: list[tuple[float, int | None]] = []
         for sign in (UNFAVOURABLE, FAVOURABLE):
@@ -935,7 +940,7 @@ class StoreCheck:
         return Robustness(value, condition_text(self._plan, name), *when, nodes, called, upper)
 
     def margins(self, trace: TraceReader) -> Floats:
-        """Margins by which a trace meets the check; NaN where only numbers that are not known decide.
+        """Return the margins of the check on a trace. NaN means that only unknown numbers decide.
 
         Of a check that says what is ``ALWAYS`` true, of everybody: (F,), that of each frame. What is not known
         of somebody, or in some frame, does not count. Of any other check: (1,), that of the whole trace.
@@ -975,7 +980,7 @@ class StoreCheck:
         return MarginTable(columns, trace.clock.times, trace.clock.tolerance)
 
     def _bounds(self, trace: TraceReader, bindings: Keys) -> tuple[Bools, Bools]:
-        """The verdict of some bindings, at least and at most, whatever happened in the gaps."""
+        """Return the lower and upper verdict of bindings over all possible events in recording gaps."""
         parts: list[tuple[Bools, Bools]] = []
         for low in range(0, len(bindings), trace.together):
             some = bindings[low : low + trace.together]
@@ -991,7 +996,7 @@ class StoreCheck:
     def _levels(
         self, trace: TraceReader, counted: str = FAVOURABLE, *, waiting: bool = False
     ) -> list[Level]:
-        """The bindings of each quantifier; ``waiting``: with those that ``FORSOME`` may be about later."""
+        """Return the bindings of each quantifier. ``waiting`` adds future bindings of ``FORSOME``."""
         people = self._people.get(trace.trace_id, {})
         domains = {
             node: np.array(sorted(people.get(node, ())), np.int64)
@@ -1020,7 +1025,7 @@ class StoreCheck:
         )
 
     def _alike(self, trace: TraceReader, bindings: Keys) -> tuple[Keys, Ints]:
-        """Bindings of which the same is true in every frame need but one evaluation.
+        """Group bindings with equal truth values in all frames. One evaluation per group is enough.
 
         Returns one binding of each sort, and the sort of each binding.
         """
@@ -1037,7 +1042,7 @@ class StoreCheck:
         return bindings[first], members.reshape(-1)
 
     def _evaluated(self, trace: TraceReader, bindings: Keys) -> tuple[Codes, list[_BindingVerdict]]:
-        """What is known of some bindings, and more of those that the verdict is due to."""
+        """Return the codes of bindings, and details of the bindings behind the verdict."""
         values = PlanValues(self._plan, trace, self._variables, bindings)
         codes, told = self._in_evaluation(trace, values, len(bindings))
         doubts = [name for name in propositions(self._formula) if name[-1] in SIGNS]
@@ -1055,7 +1060,7 @@ class StoreCheck:
     def _in_evaluation(
         self, trace: TraceReader, values: PlanValues, rows: int, among: Bools | None = None
     ) -> tuple[Codes, list[_BindingVerdict]]:
-        """What one of the two evaluations says of some bindings; ``among``: those that are wanted."""
+        """Return the result of one of the two evaluations for the bindings in ``among``."""
         columns = values.columns(self._formula)
         truths = values.formula(self._formula)[:, 0]
         resets = values.formula(self._reset) if self._reset is not None else None
@@ -1104,7 +1109,7 @@ class StoreCheck:
     def _values_of(
         self, trace: TraceReader, binding: Keys, spans: Sequence[Violation]
     ) -> list[dict[str, Any]]:
-        """Values that are returned of the violations of a binding."""
+        """Return the returned values of each violation of a binding."""
         if not self._returned.parts:
             return [self._returned.told(lambda _: None) for _ in spans]
         values = PlanValues(self._values, trace, self._variables, binding)
@@ -1123,7 +1128,7 @@ class StoreCheck:
     def _joined(
         self, levels: Sequence[Level], told: list[_BindingVerdict], frames: int
     ) -> Statuses | None:
-        """The status of the whole check at each frame, of those of its bindings."""
+        """Combine the statuses of the bindings to the status of the check at each frame."""
         if not self._want_status:
             return None
         rows = [status for _, status in told if status is not None]

@@ -1,4 +1,4 @@
-"""The monitor of an expression of steps: ``A THEN (B | C)``, ``(A THEN B){2,3}``, frame by frame.
+"""Online monitor of a step expression: ``A THEN (B | C)``, ``(A THEN B){2,3}``.
 
 It stands for several sequences. Of all their matches that begin in one run of one step, with one binding, one
 counts: so a match is told as soon as no sequence can bring forth a better one.
@@ -32,13 +32,13 @@ _ANY = -1
 def sequence_monitor(
     name: str, query: Query, questions: QueryCache, pulse: StreamClock
 ) -> SequenceMonitor:
-    """Return the monitor of a pattern, a sequence, or an expression of steps."""
+    """Return the monitor of a pattern, a sequence, or a step expression."""
     kind = ExpressionMonitor if query.alternatives else SequenceMonitor
     return kind(name, query, questions, pulse)
 
 
 class ExpressionMonitor(SequenceMonitor):
-    """An expression of steps, while a trace comes; see :class:`SequenceMonitor`."""
+    """Online monitor of a step expression over one trace; see :class:`SequenceMonitor`."""
 
     def __init__(self, name: str, query: Query, questions: QueryCache, pulse: StreamClock) -> None:
         super().__init__(name, query, questions, pulse)
@@ -65,7 +65,7 @@ class ExpressionMonitor(SequenceMonitor):
         return way.steps[0], told, run
 
     def _see(self, way: StepWay, binding: Binding) -> None:
-        """Take note of the matches of a sequence with a binding, of each run the best one."""
+        """Record the matches of a sequence with a binding. Keep the best match of each run."""
         held, seen = self._of(way.steps[0], binding), set[int]()
         for place in held.places if held is not None else ():
             run = place.run.number
@@ -81,7 +81,7 @@ class ExpressionMonitor(SequenceMonitor):
                     self._best[group] = found
 
     def _better(self, one: FoundMatch, other: FoundMatch) -> bool:
-        """Tell whether a match counts rather than another: of the same frames, that written before."""
+        """True if the first match wins. For equal frames, the alternative written first wins."""
         frames, known = _frames(one), _frames(other)
         place, written = self._written[one[0]], self._written[other[0]]
         if self.query.policy == "longest" and frames[0] == known[0]:
@@ -89,7 +89,7 @@ class ExpressionMonitor(SequenceMonitor):
         return (frames, place) < (known, written)
 
     def _decided(self, group: _Group, found: FoundMatch) -> bool:
-        """Tell whether nothing can come that counts rather than a match."""
+        """True if no future match can win over this match."""
         step, told, run = group
         bound, frames = dict(zip(self._named, told, strict=True)), _frames(found)
         for way in self._asked:
@@ -109,10 +109,6 @@ class ExpressionMonitor(SequenceMonitor):
         return True
 
     def _may_win(self, standing: _Standing, frames: tuple[int, ...], *, before: bool) -> bool:
-        """Tell whether a match that begins in a place may come, and count rather than one with these frames.
-
-        It counts, too, with the same frames, if its sequence is written ``before``.
-        """
         if self.query.policy == "longest":
             return self._alive(*standing)
         return self._overtakes(standing, frames, before=before)
@@ -126,7 +122,7 @@ class ExpressionMonitor(SequenceMonitor):
     def _may_be_earlier(
         self, standing: _Standing, frames: tuple[int, ...], *, before: bool
     ) -> bool:
-        """Tell whether what follows a place may yet come earlier than frames, the first of which is its own."""
+        """True if a match from this standing can still have earlier frames than the given ones."""
         way, at, binding, place = standing
         if at == len(way.links):
             return False  # what has ended is known
@@ -154,7 +150,7 @@ class ExpressionMonitor(SequenceMonitor):
     def _next_step(
         self, way: StepWay, at: int, binding: Binding, place: StepFrame
     ) -> tuple[int, StepLink, bool]:
-        """The next step that happens, the link to it, and whether it is open what is absent between."""
+        """Return the next step that must occur, its link, and True if an absent step between is undecided."""
         following, link = at + 1, way.links[at]
         if not self._steps[way.steps[following]].absent:
             return following, link, False
@@ -168,7 +164,7 @@ class ExpressionMonitor(SequenceMonitor):
     # What is kept
 
     def _forget(self) -> None:
-        """Let go of the places that no match can have any more."""
+        """Drop the step frames that no match can use any more."""
         firsts = {way.steps[0] for way in self._asked}
         alive = {
             n: {key: self._followed(n, key, one.places) for key, one in self._held[n].items()}
@@ -198,7 +194,7 @@ class ExpressionMonitor(SequenceMonitor):
                 one.places = [p for p in one.places if p.number >= low or id(p) in own_ids]
 
     def _since(self, first: int, n: int, key: Key, begun: dict[int, dict[Key, int]]) -> int:
-        """The first frame in which a match that a step with a binding is part of may begin."""
+        """Return the first frame in which a match with this step and binding can begin."""
         names, columns = self._columns[first], self._columns[n]
         own = {name: node for name, node in zip(columns, key, strict=True) if name in names}
         places = [(names.index(name), node) for name, node in own.items()]
@@ -210,7 +206,7 @@ class ExpressionMonitor(SequenceMonitor):
         return min(found, default=NEVER)
 
     def _followed(self, n: int, key: Key, places: list[StepFrame]) -> list[StepFrame]:
-        """The places of a step with which matches may begin that have not come yet."""
+        """Return the frames of a step with which future matches can begin."""
         binding = dict(zip(self._columns[n], key, strict=True))
         ways = [way for way in self._asked if way.steps[0] == n]
         found: list[StepFrame] = []
@@ -223,7 +219,7 @@ class ExpressionMonitor(SequenceMonitor):
         return found
 
     def _open_ended(self, way: StepWay) -> bool:
-        """Tell whether whatever follows a later frame of a run of the first step follows its first one."""
+        """True if each continuation of a later frame of the first step also continues its first frame."""
         if not way.links:
             return False
         link = way.links[0]

@@ -1,4 +1,4 @@
-"""The last graphs of a run, and what is followed in them: parts of a match, numbers of entities."""
+"""Recent graphs of an online run, and the matches and curves followed in them."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ W = TypeVar("W", "FollowedMatch", "FollowedCurve")
 
 
 class NotKeptError(SgstoreError):
-    """A part asks for what was known of a frame only while it was the last one: its class, roles of lanes."""
+    """A query needs the class or the lane roles of a past frame, which the monitor does not keep."""
 
 
 class FollowedMatch:
-    """Parts of a pattern for the nodes of a match, frame by frame.
+    """Truth of each part of a pattern for one binding, frame by frame.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class FollowedMatch:
         self.begun = self.seen = -1
 
     def look(self, views: Iterable[FrameView]) -> None:
-        """Look at the frames that were not looked at yet."""
+        """Evaluate the new frames."""
         for view in views:
             seq = view.frame["seq"]
             if seq <= self.seen:
@@ -93,7 +93,7 @@ class FollowedMatch:
                     spans.append((seq, seq))
 
     def lanes(self, trace: str, first: int) -> TruthLanes:
-        """Lanes of truth from a frame on, as :meth:`sgstore.Store.parts` gives them of a whole trace."""
+        """Return the truth lanes from a frame on, in the format of :meth:`sgstore.Store.parts`."""
         lanes = (
             TruthLane(part, (), ("what is asked of other frames",))
             if search is None
@@ -104,7 +104,7 @@ class FollowedMatch:
 
 
 class FollowedCurve:
-    """An attribute of an entity, or a number of two, frame by frame.
+    """Attribute of an entity, or value of a pair, frame by frame.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ class FollowedCurve:
         self._seen = -1
 
     def look(self, views: Iterable[FrameView]) -> None:
-        """Look at the frames that were not looked at yet."""
+        """Read the value in the new frames."""
         for view in views:
             seq, about = view.frame["seq"], view.nodes.get(self._node)
             if seq <= self._seen or about is None:
@@ -142,14 +142,14 @@ class FollowedCurve:
             self._told.append((seq, view.frame["t"], math.nan if value is None else float(value)))
 
     def columns(self) -> dict[str, Any]:
-        """Numbers of frames, their times (s), values; as :meth:`sgstore.store.StoreFile.series` has them."""
+        """Return frame numbers, times (s) and values, as :meth:`sgstore.store.StoreFile.series` does."""
         types = {"seq": np.uint32, "t": np.float64, "value": np.float32}
         told = zip(*self._told, strict=True) if self._told else ((), (), ())
         return {name: np.array(c, types[name]) for name, c in zip(types, told, strict=True)}
 
 
 class RecentGraphs:
-    """The last graphs of a run; what is followed in them goes on with each that comes.
+    """Most recent graphs of a run. Followed matches and curves are updated with each new graph.
 
     Memory is bounded: at most :data:`MOST_EDGES` edges, or one graph, and :data:`MOST_FOLLOWED` matches and
     curves. For one thread at a time.
@@ -161,7 +161,7 @@ class RecentGraphs:
         self._followed: OrderedDict[tuple[Any, ...], FollowedMatch | FollowedCurve] = OrderedDict()
 
     def add(self, here: FrameTime, graph: SceneGraph, trace: str) -> None:
-        """Take the graph of the next frame."""
+        """Add the graph of the next frame."""
         frame = {"id": here.seq, "seq": here.seq, "time_ns": here.time_ns, "t": here.t}
         view = FrameView(graph, frame, {"id": 0, "name": trace}, _not_kept, _not_kept)
         self._views.append(view)
@@ -172,7 +172,7 @@ class RecentGraphs:
             one.look([view])
 
     def view(self, seq: int) -> FrameView:
-        """A frame that is kept.
+        """Return a stored frame.
 
         Raises
         ------
@@ -186,11 +186,11 @@ class RecentGraphs:
         raise StoreError(f"the graph of frame #{seq} is not kept; those from #{first} on are")
 
     def match(self, name: str, query: Query, nodes: Mapping[str, int]) -> FollowedMatch:
-        """What is known of a match, which is followed from now on; raises what :class:`FollowedMatch` does."""
+        """Return the truth of a match so far, and follow it from now on. Errors: see :class:`FollowedMatch`."""
         return self._follow((name, *sorted(nodes.items())), partial(FollowedMatch, query, nodes))
 
     def curve(self, attribute: str, node: int, other: int | None = None) -> FollowedCurve:
-        """A curve, which is followed from now on; raises what :class:`FollowedCurve` does."""
+        """Return a curve so far, and follow it from now on. Errors: see :class:`FollowedCurve`."""
         key = attribute, node, other
         return self._follow(key, partial(FollowedCurve, *key))
 

@@ -1,4 +1,4 @@
-"""Temporal formulas over named propositions: the one form that both engines evaluate.
+"""Temporal formulas over named propositions, for the offline and the online engine.
 
 Time is pointwise over frames. A formula is true or false at a frame of a finite trace: ``NEXT`` is false at
 the last frame and ``WEAKNEXT`` true, ``PREVIOUS`` is false at the first (LTLf). Bounds of time compare time
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """From when to when an operator looks, counted from where it stands, away from it in its direction.
+    """Time or frame range of an operator, measured from its frame in its direction.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class Bound:
     frames: bool = False
 
     def widened(self, by: int) -> Bound:
-        """The same with a tolerance at both ends, if it is one of time; ns."""
+        """Return a time range extended by a tolerance at both ends; ns. Frame ranges do not change."""
         if self.frames or not by:
             return self
         return Bound(max(self.low - by, 0), None if self.high is None else self.high + by)
@@ -46,14 +46,14 @@ WHOLE: Final = Bound()
 
 @dataclass(frozen=True, slots=True)
 class TruthConstant:
-    """True, or false."""
+    """Constant true or false."""
 
     value: bool
 
 
 @dataclass(frozen=True, slots=True)
 class Proposition:
-    """Proposition: true or false at each frame by itself."""
+    """Named proposition. It is true or false at each single frame."""
 
     name: str
 
@@ -81,7 +81,7 @@ class Or:
 
 @dataclass(frozen=True, slots=True)
 class Next:
-    """The operand at the next frame; at the last frame, what ``weak`` says."""
+    """Operator: the operand holds at the next frame. At the last frame, the value is ``weak``."""
 
     operand: Formula
     weak: bool = False
@@ -89,14 +89,14 @@ class Next:
 
 @dataclass(frozen=True, slots=True)
 class Previous:
-    """The operand at the frame before; false at the first."""
+    """Operator: the operand holds at the previous frame. At the first frame, it is false."""
 
     operand: Formula
 
 
 @dataclass(frozen=True, slots=True)
 class Until:
-    """``right`` at some frame within the bound, and ``left`` at all frames from here to before it."""
+    """Operator: ``right`` holds at a later frame within the bound, and ``left`` at all frames before it."""
 
     left: Formula
     right: Formula
@@ -105,7 +105,7 @@ class Until:
 
 @dataclass(frozen=True, slots=True)
 class Since:
-    """``right`` at some frame back within the bound, and ``left`` at all frames after it up to here."""
+    """Operator: ``right`` holds at an earlier frame within the bound, and ``left`` at all frames after it."""
 
     left: Formula
     right: Formula
@@ -118,33 +118,33 @@ TRUE: Final = TruthConstant(value=True)
 
 
 def eventually(operand: Formula, bound: Bound = WHOLE) -> Formula:
-    """At some frame from here on."""
+    """Return the formula: the operand holds at this frame or a later one."""
     return Until(TRUE, operand, bound)
 
 
 def always(operand: Formula, bound: Bound = WHOLE) -> Formula:
-    """At all frames from here on."""
+    """Return the formula: the operand holds at this frame and all later ones."""
     return Not(eventually(Not(operand), bound))
 
 
 def once(operand: Formula, bound: Bound = WHOLE) -> Formula:
-    """At some frame up to here."""
+    """Return the formula: the operand holds at this frame or an earlier one."""
     return Since(TRUE, operand, bound)
 
 
 def historically(operand: Formula, bound: Bound = WHOLE) -> Formula:
-    """At all frames up to here."""
+    """Return the formula: the operand holds at this frame and all earlier ones."""
     return Not(once(Not(operand), bound))
 
 
 def release(left: Formula, right: Formula, bound: Bound = WHOLE) -> Formula:
-    """``right`` until and with ``left``, or for ever."""
+    """Return the formula: ``right`` holds up to and including the first ``left``, or for ever."""
     return Not(Until(Not(left), Not(right), bound))
 
 
 @lru_cache(maxsize=256)
 def tolerant(formula: Formula, by: int) -> Formula:
-    """A formula whose bounds of time let in what misses them by no more than a tolerance; ns."""
+    """Return the formula with all time bounds extended by a tolerance; ns."""
     found = with_operands(formula, lambda operand: tolerant(operand, by))
     if isinstance(found, Until | Since):
         return replace(found, bound=found.bound.widened(by))
@@ -152,19 +152,19 @@ def tolerant(formula: Formula, by: int) -> Formula:
 
 
 def propositions(formula: Formula) -> frozenset[str]:
-    """Names of the propositions in a formula."""
+    """Return the names of the propositions in a formula."""
     return frozenset(part.name for part in walk(formula) if isinstance(part, Proposition))
 
 
 def walk(formula: Formula) -> Iterator[Formula]:
-    """A formula and all its parts, parts first; equal ones as often as they stand there."""
+    """Yield a formula and all its parts, parts first. Equal parts may repeat."""
     for operand in operands_of(formula):
         yield from walk(operand)
     yield formula
 
 
 def operands_of(formula: Formula) -> tuple[Formula, ...]:
-    """The parts that an operator joins."""
+    """Return the direct operands of a formula."""
     match formula:
         case And(operands=operands) | Or(operands=operands):
             return operands
@@ -177,7 +177,7 @@ def operands_of(formula: Formula) -> tuple[Formula, ...]:
 
 
 def with_operands(formula: Formula, change: Callable[[Formula], Formula]) -> Formula:
-    """A formula with a change made to each of its :func:`operands_of`."""
+    """Apply a function to each of the :func:`operands_of` a formula."""
     match formula:
         case And() | Or():
             return replace(formula, operands=tuple(map(change, formula.operands)))
@@ -190,7 +190,7 @@ def with_operands(formula: Formula, change: Callable[[Formula], Formula]) -> For
 
 
 def looks_ahead(formula: Formula) -> bool:
-    """Tell whether a formula depends on later frames."""
+    """True if the formula depends on later frames."""
     return any(isinstance(part, Next | Until) for part in walk(formula))
 
 
@@ -246,7 +246,7 @@ TEMPORAL: Final[dict[str, Callable[..., Formula]]] = {
 
 
 def formula_text(formula: Formula) -> str:  # noqa: C901, PLR0911 - a case each
-    """A formula as one would write it, with the names of its propositions."""
+    """Return a formula as text, with the names of its propositions."""
     match formula:
         case TruthConstant(value=value):
             return str(value).upper()
@@ -271,7 +271,7 @@ def formula_text(formula: Formula) -> str:  # noqa: C901, PLR0911 - a case each
 
 
 def bound_text(bound: Bound) -> str:
-    """A bound; nothing for one that is none."""
+    """Return a bound as text. An unlimited bound gives an empty text."""
     if bound == Bound():
         return ""
     ends = [_length(bound.low, bound), "INF" if bound.high is None else _length(bound.high, bound)]
@@ -294,7 +294,7 @@ def _length(amount: int, bound: Bound) -> str:
 
 
 class Term:
-    """A combination of duties; equal ones are the same object.
+    """Combination of obligations. Equal terms are one object.
 
     Attributes
     ----------
@@ -340,7 +340,7 @@ class Term:
             self.begins = tuple(since for operand in operands for since in operand.begins)
 
     def bounds(self) -> Iterator[tuple[Bound, int]]:
-        """The bounds that have begun in it, and from where each counts."""
+        """Yield the bounds that have begun in the term, and the start of each."""
         if self.word == "duty":
             if self.timed:
                 yield self.operands[0].bound, self.operands[1]
@@ -349,13 +349,13 @@ class Term:
                 yield from operand.bounds()
 
     def implies(self, other: Term) -> bool:
-        """Tell whether it makes another one of its shape true; both of sense 1, or -1."""
+        """True if the term implies another term of the same shape. Both must have sense 1 or -1."""
         pairs = zip(self.begins, other.begins, strict=True)
         return all((a <= b) if self.sense > 0 else (a >= b) for a, b in pairs)
 
     @property
     def ended(self) -> bool:
-        """Its value if no frame follows."""
+        """Value of the term if no frame follows."""
         match self.word:
             case "true" | "false":
                 return self.word == "true"
@@ -370,7 +370,7 @@ class Term:
 
 
 def may_end(term: Term, tick: Tick) -> bool:  # noqa: PLR0911 - a case each
-    """Tell whether a combination is true, or still due, if the frame of a tick is the last.
+    """True if the term is true or still open when this frame is the last.
 
     An operator that looks ahead is due if its bound is not over, and so is ``NEXT``. One without an upper bound
     has failed.
@@ -398,7 +398,7 @@ def may_end(term: Term, tick: Tick) -> bool:  # noqa: PLR0911 - a case each
 
 
 class Terms:
-    """All combinations that are in use."""
+    """Table of all terms in use."""
 
     def __init__(self) -> None:
         self._known: WeakValueDictionary[tuple[Any, ...], Term] = WeakValueDictionary()
@@ -416,11 +416,11 @@ class Terms:
         return term
 
     def constant(self, value: bool) -> Term:  # noqa: FBT001 - it is the value
-        """Return the term of a known value."""
+        """Return the term of a constant truth value."""
         return self.true if value else self.false
 
     def duty(self, formula: Formula, since: int | None, *, weak: bool) -> Term:
-        """Return the obligation on the next frame; ``since``: the start of its bound, if that has begun.
+        """Return the obligation on the next frame. ``since`` is the start of its bound, if begun.
 
         The formula is told by identity: equal parts of a formula are to be one object.
         """
@@ -435,7 +435,7 @@ class Terms:
         return self._made("not", (term,), (id(term),))
 
     def joined(self, word: str, terms: Iterable[Term]) -> Term:
-        """``and`` or ``or`` of some terms, without what does not matter.
+        """Return the conjunction or disjunction of terms, without redundant terms.
 
         Something and its contrary are left to be told by the frames that follow: verdicts over columns
         (:mod:`sgstore.temporal._verdicts`) do not look for them either, and both are to know the same.
@@ -458,7 +458,7 @@ class Terms:
 
 
 def least(terms: Iterable[Term], word: str = "and") -> list[Term]:
-    """Of some terms that are joined those that matter: without what another one makes true, or false, anyway.
+    """Remove redundant terms from a conjunction or disjunction.
 
     So what an ``ALWAYS`` owes since many frames is owed once.
     """
@@ -487,7 +487,7 @@ Past = tuple[tuple[Term, tuple[Entry, ...]], ...]
 
 
 class Progression:
-    """A formula, ready to be told frame after frame.
+    """Formula prepared for frame-by-frame evaluation.
 
     Parameters
     ----------
@@ -517,7 +517,7 @@ class Progression:
 
     @property
     def untimed(self) -> bool:
-        """Tell whether time stamps do not matter."""
+        """True if the formula has no bounds, so timestamps do not matter."""
         return not any(
             isinstance(p, Until | Since) and (p.bound.low or p.bound.high is not None)
             for p in walk(self.formula)
@@ -525,7 +525,7 @@ class Progression:
 
 
 def interned(formula: Formula, known: dict[Formula, Formula] | None = None) -> Formula:
-    """A formula of which equal parts are one object."""
+    """Return a copy of a formula in which equal parts are one object."""
     known = {} if known is None else known
     if formula not in known:
         known[formula] = with_operands(formula, lambda part: interned(part, known))
@@ -534,7 +534,7 @@ def interned(formula: Formula, known: dict[Formula, Formula] | None = None) -> F
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """The time of a frame.
+    """Time and number of a frame.
 
     Attributes
     ----------
@@ -551,18 +551,18 @@ class Tick:
     tolerance: int = 0
 
     def begun(self, bound: Bound, age: int) -> bool:
-        """Tell whether what is so old (ns, or frames) lies behind the lower end of a bound."""
+        """True if an age (ns or frames) has reached the lower end of a bound."""
         return age >= bound.low - (0 if bound.frames else self.tolerance)
 
     def over(self, bound: Bound, age: int) -> bool:
-        """Tell whether it lies behind the upper end, too."""
+        """True if an age (ns or frames) is past the upper end of a bound."""
         if bound.high is None:
             return False
         return age > bound.high + (0 if bound.frames else self.tolerance)
 
 
 class ProgressionFrame:
-    """One frame while it is told.
+    """Evaluation of a formula at one frame.
 
     Parameters
     ----------
@@ -589,7 +589,10 @@ class ProgressionFrame:
             self._entries.append(kept)
 
     def now(self, formula: Formula, since: int | None = None) -> Term:
-        """A formula at this frame; ``since``: from where the bound of an *until* counts, if not from here."""
+        """Return the term of a formula at this frame.
+
+        ``since`` is the start of an *until* bound, by default here.
+        """
         if since is None:
             counted = isinstance(formula, Until) and formula.bound.frames
             since = self._tick.number if counted else self._tick.time
@@ -633,7 +636,7 @@ class ProgressionFrame:
         return terms.joined("or", (right, terms.joined("and", (left, later))))
 
     def resolved(self, term: Term) -> Term:
-        """A combination of the frame before, with what this frame shows of its duties."""
+        """Resolve the obligations in a term of the previous frame."""
         if term not in self._resolved:
             self._resolved[term] = self._resolve(term)
         return self._resolved[term]
@@ -653,7 +656,7 @@ class ProgressionFrame:
     def _of_past(
         self, part: Formula, before: Term, entries: tuple[Entry, ...]
     ) -> tuple[Term, tuple[Entry, ...]]:
-        """Return the value of an operator of the past at this frame, and the entries that it keeps."""
+        """Return the value of a past operator at this frame, and the entries for the next frame."""
         terms, before = self._terms, self.resolved(before)
         if isinstance(part, Previous):
             return before, ()
@@ -669,7 +672,7 @@ class ProgressionFrame:
     def _known_past(
         self, part: Since, entries: tuple[Entry, ...], right: Term
     ) -> tuple[Term, tuple[Entry, ...]]:
-        """A *since* whose sides are known: its entries are the frames at which the right side was true."""
+        """Evaluate a *since* with known sides. Its entries are the frames in which the right side was true."""
         bound = part.bound
         if right is self._terms.true:
             # Without a lower bound the latest of them is as good as any before it.
@@ -712,7 +715,7 @@ class ProgressionFrame:
         return self._tick.time - entry[0]
 
     def past(self) -> Past:
-        """Return the memory of operators of the past for the next frame."""
+        """Return the memory of past operators for the next frame."""
         return tuple(
             (self.now(p.operand) if isinstance(p, Previous) else self._present[id(p)], entries)
             for p, entries in zip(self._parts, self._entries, strict=True)

@@ -1,4 +1,4 @@
-"""What a trace knows around its ego, against what a check needs to know."""
+"""Comparison of the stored range around the ego with the range that a check needs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SELECT frame_id >> 24 AS trace_id, max(speed) AS speed FROM known_state GROUP BY
 
 @dataclass(frozen=True, slots=True)
 class ShortRange:
-    """Why a trace that knows too little cannot tell that a check is true, or false; empty: it can.
+    """Reasons why a trace with a short range cannot prove a check true, or false. Empty means that it can.
 
     Attributes
     ----------
@@ -34,16 +34,16 @@ class ShortRange:
     false: str = ""
 
     def of(self, *, holds: bool) -> str:
-        """The reason why a verdict is unknown that were true, or false, of what is known."""
+        """Return the reason against a true or a false verdict, or an empty string."""
         return self.true if holds else self.false
 
     def or_else(self, other: ShortRange) -> ShortRange:
-        """The same where another trace could tell no more, or else what the other could not tell."""
+        """Return these reasons, completed by the reasons of another range."""
         return ShortRange(self.true or other.true, self.false or other.false)
 
 
 def short_ranges(file: StoreFile, catalog: Catalog, check: BoundCheck) -> Mapping[int, ShortRange]:
-    """The traces that know less of the world around than a check needs, by id.
+    """Return the traces whose stored range is too short for a check: trace id → reasons.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def _any_short(needed: Horizon, known: list[float]) -> bool:
 
 
 def short_range(needed: Horizon, known: float) -> ShortRange:
-    """Return what a trace that knows so much around its ego cannot tell.
+    """Return the reasons for a stored range of this many metres.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def short_range(needed: Horizon, known: float) -> ShortRange:
 
 
 def without_kinds(check: BoundCheck, excluded: frozenset[str]) -> ShortRange:
-    """Return what a trace cannot tell whose settings exclude some kinds.
+    """Return the reasons for a trace whose settings exclude some kinds.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def without_kinds(check: BoundCheck, excluded: frozenset[str]) -> ShortRange:
 
 @dataclass(slots=True)
 class SeenRange:
-    """What a monitor has seen of the world around an ego, out to a distance.
+    """Range around the ego that a monitor has seen.
 
     Attributes
     ----------
@@ -137,14 +137,14 @@ class SeenRange:
     fastest: float = 0.0
 
     def see(self, view: FrameView) -> None:
-        """Take note of a frame."""
+        """Add a frame."""
         self.cut = self.cut or view.graph.out_of_world > 0
         self.excluded |= view.graph.excluded
         speeds = (about.get("speed", 0.0) for about in view.nodes.values())
         self.fastest = max(self.fastest, *speeds, 0.0)
 
     def short(self, check: BoundCheck) -> ShortRange:
-        """Why it cannot be told that a check is true, or false, of what was seen."""
+        """Return the reasons why the seen frames cannot prove a check true, or false."""
         if not check.world or check.unknown_is_false:
             return ShortRange()
         found = ShortRange()

@@ -1,4 +1,4 @@
-"""Numbers over the frames of a match: the least, the greatest, the average, the first, and when it was so.
+"""Aggregates over the frames of a match: minimum, maximum, mean, first, and their times.
 
 Over columns a match is a row of bindings and the frames from one to another; frame by frame a :class:`Fold` is
 what is known of such a stretch, and two that follow one another are joined.
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class ReturnedValues:
-    """Values that are returned of a match, made of values over it and of times of its steps.
+    """Returned values of a match, computed from aggregates and step times.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class ReturnedValues:
         part: Callable[[b.OverMatch], Any],
         seconds: Callable[[int], float | None] | None = None,
     ) -> dict[str, Any]:
-        """The values by the names of their columns.
+        """Return the values: column name → value.
 
         Parameters
         ----------
@@ -98,7 +98,7 @@ AT_FRAME: Final = -1
 
 @dataclass(frozen=True, slots=True)
 class Stretches:
-    """Stretches of frames, each of some binding.
+    """Frame intervals, each with its binding.
 
     Attributes
     ----------
@@ -113,7 +113,7 @@ class Stretches:
     last: Ints
 
     def told(self, word: str, column: Column, at: Column | None = None) -> Objects:
-        """(M,) the number that each stretch makes of a value; ``None``: nothing is known.
+        """Return the aggregate of a value over each interval, shape (M,). ``None`` means unknown.
 
         Parameters
         ----------
@@ -138,7 +138,7 @@ class Stretches:
 
 
 def over_rows(word: str, column: Column, starts: Ints, at: Column | None = None) -> Objects:
-    """The number that each part of some rows makes of a value; ``None``: nothing is known.
+    """Return the aggregate of a value over each group of rows. ``None`` means unknown.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ def over_rows(word: str, column: Column, starts: Ints, at: Column | None = None)
 
 
 def picked(column: Column, rows: Ints, frames: Ints) -> Objects:
-    """Values at some places as Python has them; ``None`` where they are unknown.
+    """Return values at some positions as Python objects. ``None`` means unknown.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ def _told(values: Any, known: Any, places: Any) -> Objects:
 
 
 def _at(column: Column, rows: Ints, frames: Ints) -> tuple[Any, Bools]:
-    """Values at some places, and whether they are known; a column may be the same for all rows, or frames."""
+    """Return values at some positions, and a mask of the known ones. Columns may broadcast."""
 
     def some(array: Any) -> Any:
         array = np.atleast_2d(array)
@@ -226,7 +226,7 @@ def _summed(word: str, values: Any, known: Bools, starts: Ints) -> Objects:
 
 @dataclass(frozen=True, slots=True)
 class Fold:
-    """Knowledge of a value over frames that follow one another.
+    """Running aggregate of a value over consecutive frames.
 
     Attributes
     ----------
@@ -255,7 +255,7 @@ class Fold:
 
     @classmethod
     def of(cls, word: str, frame: int, value: Any, at: Any) -> Fold | None:
-        """From one frame; ``None``: the value is not known there, or does not count."""
+        """Return the aggregate of one frame. ``None`` means an unknown or ignored value."""
         if value is None:
             return None
         if word in {"first", "last"}:
@@ -270,7 +270,7 @@ class Fold:
         return cls(frame, frame, value, value, best, at)
 
     def joined(self, later: Fold) -> Fold:
-        """With one of later frames; of equal values the earlier one is told of."""
+        """Combine with the aggregate of later frames. The earlier of two equal values wins."""
         better = self if self.best <= later.best else later
         total, count = self.total + later.total, self.count + later.count
         return Fold(
@@ -278,7 +278,7 @@ class Fold:
         )
 
     def told(self, word: str, start: int, end: int) -> Any:
-        """The number that the frames from one to another make of the value; see :meth:`Stretches.told`."""
+        """Return the aggregate over a range of frames; see :meth:`Stretches.told`."""
         match word:
             case "first":
                 return self.first if self.start == start else None

@@ -1,4 +1,4 @@
-"""Values over matches, frame by frame.
+"""Online aggregates over matches, frame by frame.
 
 Of each value that a match may be asked for, the frames since the first one that is still needed are kept as few
 stretches: those between frames at which a match may begin or end are joined, so what is kept grows with the
@@ -32,7 +32,7 @@ Span = tuple[int, int]
 
 
 class _Course:
-    """One value, as long as matches may be asked for it."""
+    """History of one value, kept while a match may need it."""
 
     def __init__(
         self,
@@ -52,7 +52,7 @@ class _Course:
         self._known: BindingTable[Entry] = BindingTable(self._valuation.lattice, begun)
 
     def step(self) -> None:
-        """A frame has come, and the questions were asked of it."""
+        """Process the next frame after its queries."""
         known, word, number = self._known, self._word, self._pulse.tick.number
         letters, memories = self._valuation.read(known.held, lambda row: known.of(row)[0])
         values = self._told(self._test, len(letters))
@@ -71,14 +71,14 @@ class _Course:
         return [value if there else None for value, there in zip(values, known, strict=True)]
 
     def value(self, binding: Mapping[str, int | None], span: Span) -> Any:
-        """The value of a binding over some frames."""
+        """Return the aggregate of a binding over a range of frames."""
         start, end = span
         _, folds = self._known.of(tuple(binding.get(name) for name in self._variables))
         inside = [fold for fold in folds if start <= fold.start and fold.end <= end]
         return reduce(Fold.joined, inside).told(self._word, start, end) if inside else None
 
     def forget(self, kept: Sequence[int]) -> None:
-        """Let go of what nothing is asked of any more; ``kept``: where it may begin or end, ascending."""
+        """Merge old frames. ``kept`` holds the ascending frames at which a later range may begin or end."""
         held = {
             row: (memory, _merged(folds, kept)) for row, (memory, folds) in self._known.held.items()
         }
@@ -99,7 +99,7 @@ def _merged(folds: tuple[Fold, ...], kept: Sequence[int]) -> tuple[Fold, ...]:
 
 
 class MatchValues:
-    """Values over matches, while a trace comes.
+    """Online aggregates over the matches of one trace.
 
     Parameters
     ----------
@@ -135,12 +135,12 @@ class MatchValues:
                 self._courses[course] = made
 
     def step(self) -> None:
-        """A frame has come, and the questions were asked of it."""
+        """Process the next frame after its queries."""
         for course in self._courses.values():
             course.step()
 
     def forget(self, kept: Iterable[int]) -> None:
-        """Let go of what no match needs any more.
+        """Drop the values that no match needs any more.
 
         Parameters
         ----------
@@ -152,7 +152,7 @@ class MatchValues:
             course.forget(ordered)
 
     def value(self, part: b.OverMatch, binding: Mapping[str, int | None], span: Span) -> Any:
-        """The value of a part of a match; ``None``: it is not known.
+        """Return an aggregate over a part of a match. ``None`` means unknown.
 
         Parameters
         ----------

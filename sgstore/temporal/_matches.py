@@ -1,4 +1,4 @@
-"""Matches of a query over single frames or several, and the traces that do not know what it needs."""
+"""Matches of single-frame and multi-frame queries, and the traces without the needed data."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 def lacking(file: StoreFile, catalog: Catalog, needs: Iterable[Need]) -> dict[int, str]:
-    """The traces that do not know what is needed, by id, with the reason; what was found is remembered.
+    """Return the traces without needed data: trace id → reason. Results are cached in the catalog.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def lacking(file: StoreFile, catalog: Catalog, needs: Iterable[Need]) -> dict[in
 
 
 def _knowing(file: StoreFile, every: frozenset[int], need: Need) -> frozenset[int]:
-    """The traces that know it, or have nothing of which it could be known."""
+    """Return the traces that have the needed data, or have no entities that need it."""
     if need.event:
         return frozenset(trace for (trace,) in file.rows(told_events(need.event)).values)
     if need.lanes:
@@ -76,7 +76,7 @@ def _has_braces(query: Query) -> bool:
 
 
 class TemporalMatches(Matches):
-    """Matches of a query over single frames or several; see :class:`sgstore.matches.Matches`.
+    """Matches of a single-frame or multi-frame query; see :class:`sgstore.matches.Matches`.
 
     A match of a sequence is told once: its frame is that in which its last step is found, its interval goes
     from the frame of its first step to that one (to the end of its run, if the last step has a duration).
@@ -84,7 +84,7 @@ class TemporalMatches(Matches):
 
     @property
     def of_match(self) -> bool:  # type: ignore[override]
-        """Tell whether one value is returned, and that is of each match as a whole."""
+        """True if the query returns a single value that describes a whole match."""
         values = self._ready.query.result.columns if len(self.columns) == 1 else ()
         return any(isinstance(part, OverMatch) for one in values for part in walk(one.value))
 
@@ -102,7 +102,7 @@ class TemporalMatches(Matches):
 
     @contextmanager
     def asked(self) -> Generator[Compiled]:
-        """The query as a store is asked; the store stays as it is until this is left."""
+        """Yield the query compiled for the store. The store cannot change inside the block."""
         with self._compiled() as compiled:
             yield compiled
 
@@ -112,7 +112,7 @@ class TemporalMatches(Matches):
 
     @property
     def reasons(self) -> dict[str, str]:
-        """The reason for each of the traces in :attr:`left_out`, by name."""
+        """Reasons for the skipped traces in :attr:`left_out`: trace name → reason."""
         found = super().reasons
         with super()._compiled() as compiled:
             lacks = self._lacking(compiled)
@@ -123,11 +123,10 @@ class TemporalMatches(Matches):
         return found
 
     def _lacking(self, compiled: Compiled) -> dict[int, str]:
-        """The traces that do not know what the query needs, and why."""
         return lacking(self._file, compiled.catalog, of_query(compiled.bound))
 
     def explain(self) -> str:
-        """Explain the query stage by stage; of one over several frames also the questions about each frame."""
+        """Explain the query stage by stage. For a multi-frame query, add the queries of single frames."""
         with self._compiled() as compiled:
             text = compiled.stages()
             if not compiled.query.steps:

@@ -1,4 +1,4 @@
-"""The online monitor, and its sources of frames.
+"""Online monitor, and its sources of frames.
 
 Frames come from a recording, as if it were live, or from a running CARLA.
 """
@@ -64,7 +64,7 @@ PORT: Final = 2000
 
 @dataclass(slots=True)
 class FrameSource:
-    """Frames one after the other, and the map that they lie on.
+    """Source of consecutive frames and their road map.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ def opened(
     ego: str = "",
     sensors: Sequence[Sensor] = (),
 ) -> Generator[FrameSource]:
-    """A recording, or ``carla://host:port``.
+    """Open a frame source: a recording, or ``carla://host:port``.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ def opened(
 
 
 def paced(frames: Iterable[Frame]) -> Iterator[Frame]:
-    """Frames of a recording as they would come from a running world: each in its time."""
+    """Yield recorded frames in real time."""
     begun = first = None
     for frame in frames:
         if begun is None or first is None:
@@ -198,7 +198,7 @@ def _live(source: str, ego: str, sensors: Sequence[Sensor]) -> Generator[FrameSo
 
 
 class Monitor:
-    """Checks and patterns over one trace that is going on.
+    """Online monitor of checks and patterns on a running trace.
 
     Parameters
     ----------
@@ -297,7 +297,7 @@ class Monitor:
         return f"<Monitor of {', '.join(self.names)} after {seen} frames>"
 
     def _of_scope(self, ego: str | None, *, world: bool) -> tuple[int, QueryCache]:
-        """The number of an ego's graphs, alone or with the world around, and what is asked of them."""
+        """Return the index and the queries of a graph scope: an ego, with or without the world around."""
         if (ego or "") not in self._egos:
             self._egos.append(ego or "")
         scope = self._egos.index(ego or ""), world
@@ -309,7 +309,7 @@ class Monitor:
         return number, self._questions[number]
 
     def step(self, frame: Frame) -> tuple[MonitorEvent, ...]:
-        """The next frame: what is known from it on.
+        """Process the next frame, and return the new events.
 
         Raises
         ------
@@ -326,7 +326,7 @@ class Monitor:
     def look(
         self, graphs: Sequence[SceneGraph], *, classed: bool = False
     ) -> tuple[MonitorEvent, ...]:
-        """The graphs of the next frame, of whoever makes them: what is known from it on.
+        """Process graphs of the next frame made by the caller, and return the new events.
 
         Parameters
         ----------
@@ -344,7 +344,7 @@ class Monitor:
     def _ask(
         self, graphs: Sequence[SceneGraph], *, classed: bool = False
     ) -> tuple[FrameTime, list[NodeNames]]:
-        """Ask all questions of the graphs of a frame."""
+        """Evaluate all queries on the graphs of a frame."""
         self._pulse.step(graphs[0].time_ns)
         tick, time = self._pulse.tick, self._pulse.told(self._pulse.tick.time)
         here = FrameTime(tick.number, time, seconds_of(time - self._pulse.start))
@@ -360,7 +360,7 @@ class Monitor:
         return here, people
 
     def _tell(self, here: FrameTime, people: list[NodeNames]) -> tuple[MonitorEvent, ...]:
-        """Tell checks and patterns the answers."""
+        """Update checks and patterns with the results of a frame."""
         self._last = here
         found: list[MonitorEvent] = []
         for ego, watch, waiting in self._watches:
@@ -385,17 +385,19 @@ class Monitor:
 
     @property
     def egos(self) -> tuple[str, ...]:
-        """The ids of the egos whose graphs are looked at; empty: the ego of the frame."""
+        """Ids of the monitored egos. An empty id means the ego of the frame."""
         return tuple(self._egos)
 
     @property
     def patterns(self) -> dict[str, Query]:
-        """The patterns that are looked for, by name, as they are bound."""
+        """Bound patterns by name."""
         return {follow.name: follow.query for _, follow, _ in self._follows}
 
     @property
     def status(self) -> dict[str, str]:
-        """The status of each check so far: ``true``, ``false``, ``presumably_true``, ``presumably_false``.
+        """Return the status of each check: ``true``, ``false``, ``presumably_true`` or ``presumably_false``.
+
+        ``true``, ``false``, ``presumably_true``, ``presumably_false``.
 
         The latter are what the verdict would be if the trace ended now. ``unknown``: it cannot be told.
         """
@@ -407,7 +409,7 @@ class Monitor:
 
     @property
     def robustness(self) -> dict[str, Robustness]:
-        """Margin by which each check with ``ROBUSTNESS`` is met if the trace ends now."""
+        """Return the robustness of each check with ``ROBUSTNESS``, if the trace ends now."""
         watches = self._watches if self._last is not None else []
         told = ((w.name, w.robustness) for _, w, waiting in watches if not waiting.reason)
         return {name: one for name, one in told if one is not None}
@@ -415,7 +417,7 @@ class Monitor:
     def run(
         self, frames: Iterable[Frame], *, duration_s: float | None = None
     ) -> tuple[Verdict, ...]:
-        """Watch frames one after the other, until they end, or Ctrl-C ends it: the verdicts.
+        """Process frames until they end or Ctrl-C is pressed, and return the verdicts.
 
         Parameters
         ----------
@@ -433,7 +435,7 @@ class Monitor:
         return self.finish()
 
     def finish(self) -> tuple[Verdict, ...]:
-        """The trace has ended: the verdicts of all checks, as a store has them of the recorded trace."""
+        """End the trace, and return the verdicts. They equal the verdicts of a store with the same trace."""
         if self._last is None:
             return ()
         verdicts: list[Verdict] = []
@@ -455,7 +457,7 @@ class Monitor:
 
 
 class _PendingEvents:
-    """Events that wait until the trace has shown what they need: till then they may be of what nobody knows.
+    """Events held back until the trace has provided the data they need.
 
     Parameters
     ----------
@@ -476,7 +478,7 @@ class _PendingEvents:
     def passed(
         self, found: list[MonitorEvent], here: FrameTime, people: NodeNames
     ) -> list[MonitorEvent]:
-        """Return the events of a frame, of what was found up to it."""
+        """Return the events to report at this frame, including released earlier events."""
         if not self._open:
             return found
         self._open = [need for need in self._open if not self._told(need, people)]
@@ -508,7 +510,7 @@ class _PendingEvents:
 
 
 def _names(called: str | Sequence[str], count: int) -> Sequence[str]:
-    """Return names for so many patterns."""
+    """Return a name for each pattern."""
     if isinstance(called, str):
         return [called] if count == 1 else [f"{called} {i + 1}" for i in range(count)]
     if len(called) != count:
@@ -519,7 +521,7 @@ def _names(called: str | Sequence[str], count: int) -> Sequence[str]:
 def _bound(
     text: str, catalog: Catalog, parameters: Mapping[str, Any]
 ) -> tuple[list[BoundCheck], list[Query]]:
-    """The checks and the patterns of a text."""
+    """Return the bound checks and patterns of a text."""
     statements = [*each_match(parse(text))]
     written = [one for one in statements if not isinstance(one, MatchClause)]
     named = {name for one in statements for name in _parameters(one)}
@@ -550,7 +552,7 @@ def _bound(
 
 
 def _parameters(part: object) -> Iterator[str]:
-    """The names of the parameters in a part of a text."""
+    """Yield the parameter names in a part of a text."""
     if isinstance(part, Parameter):
         yield part.name
     elif isinstance(part, tuple | list):

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class TimedRelation:
-    """Bindings and frames.
+    """Table of bindings and the frames in which each holds.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class TimedRelation:
 
     @classmethod
     def of(cls, frames: Ints, keys: Keys, values: Sequence[Any] = ()) -> TimedRelation:
-        """From rows in any order; of rows with the same binding and frame one is kept.
+        """Build the table from unsorted rows. One row per binding and frame is kept.
 
         Parameters
         ----------
@@ -95,7 +95,7 @@ class TimedRelation:
         return cls(keys[first], starts, frames, tuple(value[order] for value in values))
 
     def between(self, first: int, last: int) -> TimedRelation:
-        """The same in the frames from one to another, both included, as if there were no others."""
+        """Return the part in a range of frames (ends included), numbered from 0."""
         rows = np.flatnonzero((self.frames >= first) & (self.frames <= last))
         owners = np.searchsorted(self.starts, rows, "right") - 1
         new = np.flatnonzero(np.diff(owners, prepend=-1))
@@ -104,7 +104,7 @@ class TimedRelation:
         return TimedRelation(keys, starts, self.frames[rows] - first, values)
 
     def find(self, wanted: Keys) -> Ints:
-        """(B,) the place of each of some bindings (B, n) among the keys; -1: it is not there."""
+        """Return the index of each binding (B, n) in the table, shape (B,). -1 means not found."""
         if not len(self.keys) or not len(wanted):
             return np.full(len(wanted), -1)
         if not wanted.shape[1]:
@@ -117,7 +117,7 @@ class TimedRelation:
         return place[codes[len(self.keys) :]]
 
     def rows_of(self, places: Ints) -> tuple[Ints, Ints]:
-        """The rows of some keys: for each, which of the places it belongs to, and its number here."""
+        """Return the rows of some keys: for each row, the position of its key in ``places``, and its index."""
         known = np.flatnonzero(places >= 0)
         first, end = self.starts[places[known]], self.starts[places[known] + 1]
         counts = end - first
@@ -126,14 +126,14 @@ class TimedRelation:
         return owner, np.repeat(first, counts) + offset
 
     def flags(self, places: Ints, length: int) -> Bools:
-        """(B, length) in which frames each of some keys holds; -1 holds in none."""
+        """Return a mask (B, length) of the frames in which each key holds. Key -1 never holds."""
         found = np.zeros((len(places), length), np.bool_)
         owner, rows = self.rows_of(places)
         found[owner, self.frames[rows]] = True
         return found
 
     def column(self, places: Ints, length: int, number: int = 0) -> Column:
-        """A value in each frame for some keys."""
+        """Return the value of each key in each frame."""
         told = self.values[number]
         plain = np.ma.getdata(told)
         kind = np.float64 if plain.dtype.kind in "iuf" else plain.dtype
@@ -151,7 +151,7 @@ class TimedRelation:
 
 
 def refuse_many(bindings: int, told: str) -> None:
-    """Refuse to make too many combinations of nodes.
+    """Raise an error if there are too many combinations of nodes.
 
     Raises
     ------
@@ -170,7 +170,7 @@ def refuse_many(bindings: int, told: str) -> None:
 
 
 def words() -> NDArray[np.str_]:
-    """Return all relations in alphabetical order."""
+    """Return all relation names in alphabetical order."""
     return np.array(sorted(RELATIONS))
 
 
@@ -197,7 +197,7 @@ NODES_NAMED: Final = 1_000
 
 @dataclass(slots=True)
 class TraceReader:
-    """One trace while it is looked at.
+    """Data of one trace during evaluation.
 
     Attributes
     ----------
@@ -225,7 +225,7 @@ class TraceReader:
         return len(self.frame_ids)
 
     def between(self, first: int, last: int) -> TraceReader:
-        """The frames from one to another, both included, as if the trace had no others."""
+        """Return a range of frames (ends included) as a trace of its own."""
         rows = slice(first, last + 1)
         return replace(
             self,
@@ -239,16 +239,16 @@ class TraceReader:
 
     @property
     def together(self) -> int:
-        """The number of bindings that are worked on at once, in all frames."""
+        """Number of bindings to process at once, over all frames."""
         return max(CELLS // max(len(self), 1), 1)
 
     def seconds(self, frame: int) -> float:
-        """The time of a frame since the trace began."""
+        """Return the time of a frame since the trace start; s."""
         return seconds_of(int(self.times[frame] - self.start))
 
 
 class PlanValues(SignalValues):
-    """The values of a plan's formulas and tests in one trace, for some bindings.
+    """Values of a plan's formulas and tests in one trace, for some bindings.
 
     Parameters
     ----------
@@ -277,29 +277,29 @@ class PlanValues(SignalValues):
         self._tests: dict[str, Column] = {}
 
     def evaluation(self, counted: str) -> PlanValues:
-        """The values of the other evaluation of a check, with all that is the same in both."""
+        """Return a copy for the other evaluation of a check. Shared values are reused."""
         found = copy(self)
         found._counted = counted  # noqa: SLF001 - of one's own kind
         return found
 
     def test(self, test: Test) -> Column:
-        """The value of a test, worked out once."""
+        """Return the value of a test. It is computed once."""
         if test.name not in self._tests:
             self._tests[test.name] = super().test(test)
         return self._tests[test.name]
 
     def formula(self, formula: Formula) -> Bools:
-        """(B, F) where a formula is true."""
+        """Return a mask (B, F) of the bindings and frames in which a formula is true."""
         lenient = tolerant(formula, self.clock.tolerance)
         times, rows = self.clock.times, len(self._bindings)
         return evaluate_rows(lenient, self.columns(formula), times, rows)
 
     def columns(self, formula: Formula) -> dict[str, Bools]:
-        """The propositions of a formula: (B, F), or (1, F) where a proposition is the same for all."""
+        """Return the propositions of a formula as masks (B, F), or (1, F) if equal for all bindings."""
         return {name: self.proposition(name) for name in propositions(formula)}
 
     def proposition(self, name: str) -> Bools:
-        """(B, F), or (1, F), where the atom, or the test, of that name is true."""
+        """Return a mask (B, F) or (1, F) of the frames in which an atom or test is true."""
         if name[-1] in SIGNS:
             if name[-1] != self._counted:
                 return np.zeros((1, len(self._trace)), np.bool_)
@@ -314,11 +314,11 @@ class PlanValues(SignalValues):
         return self._atoms[name]
 
     def condition(self, expression: Bound, test: Test) -> Bools:
-        """(B, F) where a condition within a test is true."""
+        """Return a mask (B, F) of the frames in which a condition inside a test is true."""
         return self.formula(test.formulas[expression])
 
     def margins(self, course: SignalCall, test: Test) -> Floats:
-        """(B, F) the margin by which a condition within a test is true."""
+        """Return the margins (B, F) of a condition inside a test."""
         rows, size = len(self._bindings), max(self._trace.together // MARGIN_CELLS, 1)
         if rows > size:
             parts = (self._bindings[low : low + size] for low in range(0, rows, size))
@@ -331,7 +331,7 @@ class PlanValues(SignalValues):
         return np.broadcast_to(value, (rows, len(self._trace)))
 
     def signal(self, signal: Ask) -> Column:
-        """The values of a signal: (B, F)."""
+        """Return the values (B, F) of a signal."""
         if isinstance(self._plan, CheckPlan) and signal.name in self._plan.states:
             return self._state(*self._plan.states[signal.name])
         found = self._trace.relations[signal.name]
@@ -339,7 +339,7 @@ class PlanValues(SignalValues):
         return found.column(places, len(self._trace))
 
     def _state(self, of: Ask | None, doubt: str | None) -> Column:
-        """Where a value is there, 0 if it is known and 1 if it is not."""
+        """Return 0 where a value is known, and 1 where it is unknown. An absent value is masked."""
         frames = len(self._trace)
         if of is None:
             return Column(np.zeros((1, frames)), np.ones((1, frames), np.bool_))
@@ -363,7 +363,7 @@ def traces(
     gaps: str = "break",
     within: Window | None = None,
 ) -> Iterator[TraceReader]:
-    """The traces that can answer a query, in order of the catalog, with the relations that are asked.
+    """Yield the answerable traces of a query in catalog order, with the queried relations.
 
     They are read a few at a time, the more the fewer rows they have, so that memory does not grow with a store.
     Traces that have too many rows together are read again, half of them at a time.
@@ -406,7 +406,7 @@ def read(
     *,
     gaps: str,
 ) -> tuple[list[TraceReader], int]:
-    """The traces of a window of whole traces, as :func:`traces` gives them; and how many rows were read.
+    """Return the traces of a window for :func:`traces`, and the number of rows read.
 
     Raises
     ------
@@ -431,7 +431,7 @@ def read(
 
 
 def _narrowed(ask: Ask, traces: Collection[TraceReader]) -> Ask | None:
-    """A question about no more nodes than the steps before it leave; ``None``: they leave none."""
+    """Limit a query to the nodes found by earlier steps. ``None`` means that they found no nodes."""
     ids: dict[str, Ints] = {}
     narrow = ask.loose or ask.value is not None
     for before in ask.after:
@@ -448,7 +448,7 @@ def _narrowed(ask: Ask, traces: Collection[TraceReader]) -> Ask | None:
 def _window_left(
     ask: Ask, catalog: Catalog, window: Window | None, traces: Mapping[int, TraceReader]
 ) -> Window | None:
-    """The traces in which each of the steps that are asked before holds."""
+    """Return the window of the traces in which all earlier steps hold."""
     left = {
         trace_id
         for trace_id, trace in traces.items()
@@ -465,7 +465,7 @@ def _no_rows(ask: Ask) -> TimedRelation:
 
 
 def chosen_traces(file: StoreFile, query: Query, catalog: Catalog) -> dict[int, tuple[Any, ...]]:
-    """The traces that a query asks, and can ask, by id: name, start (ns) and period (ns)."""
+    """Return the answerable traces of a query: id → name, start (ns) and period (ns)."""
     chosen, left = traces_of(query, catalog)
     return {
         row[0]: tuple(row[1:])
@@ -475,7 +475,7 @@ def chosen_traces(file: StoreFile, query: Query, catalog: Catalog) -> dict[int, 
 
 
 def frame_times(file: StoreFile, window: Window | None) -> dict[str, Ints]:
-    """Ids, numbers, times and log times of the frames of a window, in order of the ids."""
+    """Return ids, numbers, times and log times of the frames of a window, ordered by id."""
     low, high = (window.low << BUCKET_SHIFT, window.high << BUCKET_SHIFT) if window else (0, _LAST)
     sql, values = CLOCK, (low, high)
     if window and window.traces is not None:
@@ -485,20 +485,20 @@ def frame_times(file: StoreFile, window: Window | None) -> dict[str, Ints]:
 
 
 def buckets_of(file: StoreFile, window: Window | None) -> dict[str, Ints]:
-    """The buckets from the first to the last of a window, their frames and those that follow soon, as masks."""
+    """Return the buckets of a window with masks: their frames, and the frames without a gap before."""
     low, high = (window.low, window.high) if window else (0, _LAST)
     return _ordered(file, BUCKETS, low, high)
 
 
 def times_of(file: StoreFile, window: Window | None) -> tuple[Ints, Ints]:
-    """Ids of the frames from the first to the last of a window, in order, and their times; ns."""
+    """Return the ordered frame ids of a window, and their times; ns."""
     low, high = (window.low << BUCKET_SHIFT, window.high << BUCKET_SHIFT) if window else (0, _LAST)
     ids, times = _ordered(file, TIMES, low, high).values()
     return ids, times
 
 
 def _ordered(file: StoreFile, sql: str, low: int, high: int) -> dict[str, Ints]:
-    """Columns of whole numbers of a range, in ascending order of the first."""
+    """Return integer columns of a range, sorted by the first column."""
     asked = file.arrays(sql, (low, high), plain=True).items()
     found = {name: np.ma.getdata(column).astype(np.int64) for name, column in asked}
     first = next(iter(found.values()))
@@ -535,7 +535,7 @@ def arrays_of(
     values: Sequence[Bound],
     most: int,
 ) -> tuple[Ints, Keys, list[Any]]:
-    """The rows in which a pattern holds, in any order: ids of frames, its bindings, and values of each.
+    """Return the rows of a pattern's matches, unsorted: frame ids, bindings, and values.
 
     Of a signal the relations of its edges come behind the nodes.
 
@@ -571,7 +571,7 @@ def _relate(
     found: Mapping[int, TraceReader],
     most: int,
 ) -> int:
-    """Ask one relation, and give each trace its part; how many rows it has, which may be so many at most."""
+    """Query one relation, add its rows to each trace, and return their number. ``most`` limits it."""
     if ask.everywhere:
         for trace in found.values():
             every = np.arange(len(trace))
@@ -595,7 +595,7 @@ def _relate(
 
 
 def _by_trace(ids: Ints) -> Iterable[tuple[int, slice]]:
-    """The traces of frames in order, and which of them are theirs."""
+    """Return the trace ids of ordered frames, and the slice of frames of each trace."""
     if not len(ids):
         return []
     owners = trace_of(ids)
@@ -605,7 +605,7 @@ def _by_trace(ids: Ints) -> Iterable[tuple[int, slice]]:
 
 
 def ascending(times: Ints) -> Ints:
-    """Times that ascend, where a recording's stand still or jump back.
+    """Return strictly ascending times. Repeated times and backward jumps are corrected.
 
     A time that is equal to the one before counts as a nanosecond later. Behind a jump back all times are later
     by so much that :data:`sgstore.world.JUMP_NS` lie between: the jump is a gap, which no bound of time spans.

@@ -52,7 +52,7 @@ TRUE: Final = b.Value(value=True, type=Type.boolean)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ask:
-    """A question about single frames: an atom, a signal, or the pattern of a step.
+    """Query on single frames: an atom, a signal, or the pattern of a step.
 
     Attributes
     ----------
@@ -80,18 +80,18 @@ class Ask:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Keys of the nodes and edges that a binding speaks of."""
+        """Keys of the nodes and edges in a binding."""
         return (*self.variables, *self.edges) if self.value is None else self.variables
 
     @property
     def everywhere(self) -> bool:
-        """Tell whether it asks nothing, and so holds in every frame."""
+        """True if the query has no condition and so holds in every frame."""
         scope = self.query.scope
         return self.value is None and not (scope.nodes or scope.edges or scope.where)
 
     @property
     def loose(self) -> bool:
-        """Tell whether its nodes hang together by no edges, so that it may hold for very many of them."""
+        """True if edges do not connect all nodes. Such a query may have very many matches."""
         scope = self.query.scope
         groups = [{node} for node in scope.nodes]
         for edge in scope.edges:
@@ -100,7 +100,7 @@ class Ask:
         return len(groups) > 1
 
     def among(self, nodes: Mapping[str, Iterable[int]]) -> Ask:
-        """The same question about those ids alone of some of its nodes."""
+        """Return the query limited to these ids for some of its nodes."""
         scope = self.query.scope
         where = (b.node_among(node, ids) for node, ids in nodes.items())
         narrower = replace(scope, where=(*scope.where, *where))
@@ -109,7 +109,7 @@ class Ask:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Test:
-    """An expression over values of several frames.
+    """Expression over values of several frames.
 
     Attributes
     ----------
@@ -141,7 +141,7 @@ class Test:
 
 @dataclass(slots=True)
 class Plan:
-    """Atoms, signals and tests of single frames that some expressions are made of.
+    """Atoms, signals and tests of single frames, which make up temporal expressions.
 
     Parameters
     ----------
@@ -172,11 +172,11 @@ class Plan:
 
     @property
     def asks(self) -> dict[str, Ask]:
-        """All that is asked of single frames, by name."""
+        """All queries on single frames by name."""
         return self.atoms | self.signals
 
     def formula(self, expression: b.Bound) -> f.Formula:
-        """The formula of a condition; atoms and tests that it needs become part of the plan."""
+        """Return the formula of a condition. Needed atoms and tests are added to the plan."""
         if b.is_temporal(expression):
             return self._over_time(expression)
         things = self._things(expression)
@@ -186,7 +186,7 @@ class Plan:
         return self._logic(expression)
 
     def quantity(self, expression: b.Bound) -> f.Formula:
-        """The formula of a condition whose comparisons of numbers are propositions: :attr:`margins`."""
+        """Return the formula of a condition with a proposition for each number comparison: :attr:`margins`."""
         match expression:
             case b.Tense(word=word, operands=operands):
                 bound = f.Bound(expression.low, expression.high, expression.frames)
@@ -202,12 +202,11 @@ class Plan:
 
     @property
     def _manifold(self) -> frozenset[str]:
-        """Keys of the edges of which several may join two nodes in a frame: each condition is of any one."""
         edges = self.whole.scope.edges
         return frozenset(edge.key for edge in edges if len(edge.relations) > 1)
 
     def _things(self, expression: b.Bound) -> frozenset[str]:
-        """Keys of the nodes and edges that an expression speaks of, the ends of these edges among them."""
+        """Return the keys of an expression's nodes and edges, with the end nodes of these edges."""
         edges = b.edges_of(expression)
         ends = (
             e for edge in self.whole.scope.edges if edge.key in edges for e in (edge.src, edge.dst)
@@ -215,7 +214,7 @@ class Plan:
         return b.nodes_of(expression) | edges | frozenset(ends)
 
     def _guarded(self, expression: b.Bound) -> frozenset[str]:
-        """Return the nodes and edges without which a condition on one frame is false."""
+        """Return the nodes and edges whose absence makes a single-frame condition false."""
         match expression:
             case b.Operation("AND", operands):
                 return frozenset().union(*map(self._guarded, operands))
@@ -250,7 +249,7 @@ class Plan:
                 return self._atom(expression, self._things(expression))
 
     def _merged(self, operands: tuple[b.Bound, ...]) -> list[b.Bound]:
-        """Conditions that are all to be true, with those that others guard made one with them.
+        """Group the operands of a conjunction by their nodes, to use one query per group.
 
         What speaks of no more entities than another condition, which is false where one of these is absent, is
         asked together with it: one question finds few, where each alone might find many.
@@ -279,7 +278,7 @@ class Plan:
         return [_all(parts) for _, parts in groups] + alone
 
     def present(self, node: str) -> f.Formula:
-        """That a node is there."""
+        """Return the formula that is true where a node is present."""
         return self._atom(TRUE, frozenset({node}))
 
     def _atom(self, expression: b.Bound, things: frozenset[str]) -> f.Formula:
@@ -294,7 +293,7 @@ class Plan:
         return f.Proposition(name)
 
     def test(self, expression: b.Bound) -> Test:
-        """An expression over values of several frames, of any type."""
+        """Return the test of an expression over several frames. Add it if new."""
         key = "=" + unnumbered_text(expression)
         name = self._names.get(key)
         if name is None:
@@ -359,7 +358,7 @@ class Plan:
 
 
 def plan_of_steps(query: b.Query, steps: Sequence[BoundStep]) -> Plan:
-    """Return a plan for conditions of steps, whose bindings are of all their nodes."""
+    """Return a plan for conditions of steps. Its bindings cover the nodes of all steps."""
     nodes = {key: node for step in reversed(steps) for key, node in step.scope.nodes.items()}
     edges = tuple(edge for step in steps for edge in step.scope.edges)
     scope = b.Scope(nodes, {}, edges, (), frozenset())
@@ -368,7 +367,7 @@ def plan_of_steps(query: b.Query, steps: Sequence[BoundStep]) -> Plan:
 
 
 def kept_throughout(check: b.BoundCheck) -> b.Bound | None:
-    """The condition that a check wants in every frame, of everybody; ``None``: it is of another form."""
+    """Return the condition that a check requires in every frame for all entities, or ``None``."""
 
     def lasting(formula: b.Bound) -> b.Bound | None:
         match formula:
@@ -385,23 +384,23 @@ def kept_throughout(check: b.BoundCheck) -> b.Bound | None:
 
 
 def plan_of_returned(check: BoundCheck) -> Plan:
-    """Return a plan, without questions yet, for the values that a check returns."""
+    """Return a plan, without queries yet, for the values that a check returns."""
     return Plan(query_of_check(check), variables_of(check), prefix="returned ")
 
 
 def query_of_check(check: BoundCheck) -> b.Query:
-    """The settings and nodes of a check as those of a query."""
+    """Return a query with the settings and nodes of a check."""
     about = check.relations, check.injective, check.ego, check.unknown_is_false
     return b.Query(check.scope, b.Result(), *about, world=check.world)
 
 
 def variables_of(check: BoundCheck) -> tuple[str, ...]:
-    """Keys of the nodes that the quantifiers of a check bind."""
+    """Return the node keys bound by the quantifiers of a check."""
     return tuple(node for q in check.quantifiers for node in q.nodes)
 
 
 def asks_of_steps(query: b.Query, steps: Sequence[BoundStep], kept: Iterable[str]) -> list[Ask]:
-    """Return the patterns of steps, named ``step 1``, ``step 2``, ….
+    """Return the patterns of steps, named ``step 1``, ``step 2`` and so on.
 
     All nodes of a step are bound where its conditions need that, else those kept.
     """
@@ -418,7 +417,7 @@ def asks_of_steps(query: b.Query, steps: Sequence[BoundStep], kept: Iterable[str
 
 
 def tied_in_steps(query: b.Query) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the nodes and edges by which steps of alternatives hang together: those that have names."""
+    """Return the named nodes and edges, which connect the steps of alternatives."""
     happen = [step for step in query.steps if query.alternatives and not step.absent]
     nodes = (node for step in happen for node in step.scope.nodes.values())
     edges = (edge.key for step in happen for edge in step.scope.edges if edge.named)
@@ -427,7 +426,7 @@ def tied_in_steps(query: b.Query) -> tuple[frozenset[str], frozenset[str]]:
 
 
 def _together(query: b.Query, size: int) -> list[frozenset[int]]:
-    """For each of so many steps those others that happen in every match in which it does."""
+    """Return for each step the other steps that occur in every match with this step."""
     if not query.alternatives:
         return [frozenset(range(size))] * size
     ways = [frozenset(way.steps) for way in query.alternatives]
@@ -476,7 +475,7 @@ MARGINS: Final[Mapping[str, Callable[[b.Bound, b.Bound], b.Bound]]] = {
 
 
 def has_margin(comparison: b.Operation) -> bool:
-    """Tell whether a condition compares numbers, not constants alone."""
+    """True if a condition compares numbers, and not only constants."""
     constants = b.Value | b.Operation
     return (
         comparison.word in MARGINS
@@ -490,7 +489,7 @@ def _all(parts: list[b.Bound]) -> b.Bound:
 
 
 def _two_valued(expression: b.Bound, *, outermost: bool = True) -> b.Bound:  # noqa: PLR0911 - a case each
-    """A condition on one frame whose smallest conditions are false where they are unknown.
+    """Return a single-frame condition in which unknown simple conditions count as false.
 
     Where it is only asked whether all of some conditions are true, nothing need be done: unknown is not true.
     """
@@ -519,7 +518,7 @@ def _two_valued(expression: b.Bound, *, outermost: bool = True) -> b.Bound:  # n
 
 
 def _never_unknown(expression: b.Bound) -> bool:
-    """Tell whether it compares a number of matches with a constant, which is known always."""
+    """True if the condition compares a count of matches with a constant. Such a condition is always known."""
     match expression:
         case b.Operation(operands=(b.BlockValue(word="COUNT"), b.Value(value=value))):
             return value is not None
@@ -533,7 +532,7 @@ def _never_unknown(expression: b.Bound) -> bool:
 def plan_text(
     plan: Plan, formula: f.Formula, reset: f.Formula | None, catalog: Catalog | None = None
 ) -> str:
-    """A plan: the formula, and what each of its propositions is; with a catalog, also the SQL of the atoms."""
+    """Return a plan as text: the formula and its propositions. With a catalog, add the SQL of the atoms."""
     lines = [f"formula {formula_text(formula)}"]
     lines += [f"reset {formula_text(reset)}"] if reset is not None else []
     lines += needs_text(plan, catalog)
@@ -541,7 +540,7 @@ def plan_text(
 
 
 def needs_text(plan: Plan, catalog: Catalog | None = None) -> list[str]:
-    """Return the needs of a plan as text, a line each; with a catalog, also the SQL."""
+    """Return the queries and tests of a plan as text lines. With a catalog, add the SQL."""
     lines: list[str] = []
     for ask in plan.asks.values():
         where = " AND ".join(value_text(part) for part in ask.query.scope.where) or "TRUE"
@@ -557,7 +556,7 @@ def needs_text(plan: Plan, catalog: Catalog | None = None) -> list[str]:
 
 
 def ask_text(ask: Ask) -> str:
-    """Name of a question in an error: a step by its number, a signal or a condition as it is written."""
+    """Return the name of a query for error messages: step number, signal text or condition text."""
     if ask.value is not None:
         return value_text(ask.value)
     conditions = " AND ".join(value_text(part) for part in ask.query.scope.where)
@@ -565,7 +564,7 @@ def ask_text(ask: Ask) -> str:
 
 
 def sql_text(statement: SqlStatement) -> list[str]:
-    """A statement, indented, with the values that it binds."""
+    """Return an indented SQL statement with its parameter values."""
     lines = [f"    {line}" for line in statement.sql.splitlines()]
     return lines + [f"    ${n} = {value!r}" for n, value in enumerate(statement.values, start=1)]
 
@@ -584,19 +583,19 @@ def link_text(link: StepLink) -> str:
 
 
 def way_text(way: StepWay) -> str:
-    """Return one of the sequences that an expression of steps stands for as text."""
+    """Return one of the sequences of a step expression as text."""
     links = ["", *(f"{link_text(link)} " for link in way.links)]
     steps = (f"{link}step {n + 1}" for link, n in zip(links, way.steps, strict=True))
     return f"sequence {' '.join(steps)}"
 
 
 def length_text(length: Length) -> str:
-    """A length of time."""
+    """Return a duration as text."""
     return f"{length.amount}frames" if length.frames else f"{length.amount / 1e9:g}s"
 
 
 def _refuse_large(value: b.Bound) -> None:
-    """Refuse a value over time of whole numbers that no float is equal to: columns have 64-bit floats.
+    """Reject a value over time with integers beyond the exact range of float64.
 
     Conditions are asked of each frame, exactly.
 

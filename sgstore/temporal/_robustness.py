@@ -1,4 +1,4 @@
-"""Robustness: by how much a formula is true, or false.
+"""Robustness: the margin by which a formula is true or false.
 
 A comparison of numbers has a **margin**: by how much it holds, below zero by how much it fails. Any other
 condition holds infinitely, or fails so. Negation changes the sign, *and* is the least, *or* the greatest, and
@@ -54,7 +54,7 @@ MARGIN_CELLS: Final = 16
 
 @dataclass(frozen=True, slots=True)
 class Robustness:
-    """Margin by which a trace meets a check, and what decides it.
+    """Margin by which a trace satisfies a check, and the condition and frame that decide it.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class Robustness:
 
 
 def apart_from_absence(found: Robustness, without: Callable[[], Robustness]) -> Robustness:
-    """Return a margin that is not infinitely bad for want of an entity that is absent.
+    """Replace a margin of minus infinity that comes from an absent entity.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def apart_from_absence(found: Robustness, without: Callable[[], Robustness]) -> 
 
 
 def margin_of(test: Test, column: Column, tolerance: int, unknown: float = -np.inf) -> Floats:
-    """(B, F) the margin of a comparison; unknown is false.
+    """Return the margin (B, F) of a comparison. Unknown counts as false.
 
     Parameters
     ----------
@@ -126,12 +126,12 @@ def margin_of(test: Test, column: Column, tolerance: int, unknown: float = -np.i
 
 
 def margin_of_flags(flags: Bools) -> Floats:
-    """Margins of what is true or false and no more."""
+    """Return infinite margins for a Boolean condition."""
     return np.where(flags, np.inf, -np.inf)
 
 
 def condition_text(plan: Plan, name: str) -> str:
-    """The condition that a proposition of a plan stands for, as text."""
+    """Return the condition behind a proposition of a plan as text."""
     name = base_name(name)
     meanings = plan.meanings if isinstance(plan, CheckPlan) else {}
     if name in meanings:
@@ -154,7 +154,7 @@ def margin_columns(
     tolerance: int,
     unknown: float = -np.inf,
 ) -> dict[str, Floats]:
-    """The margins of the propositions of a formula.
+    """Return the margins of the propositions of a formula.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def margin_columns(
 
 
 class MarginTable:
-    """The margins of the propositions of a trace, and of formulas of them.
+    """Margins of the propositions of a trace, and of formulas over them.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ class MarginTable:
         self._known: dict[Formula, Floats] = {}
 
     def value(self, formula: Formula) -> Floats:
-        """(B, F): the margin at each frame; (1, F) if it is the same for all bindings."""
+        """Return the margin (B, F) of a formula at each frame, or (1, F) if equal for all bindings."""
         if formula not in self._known:
             self._known[formula] = self._value(formula)
         return self._known[formula]
@@ -236,7 +236,7 @@ class MarginTable:
                 return until(sides, self.value(right)[:, ::-1], first, end)[:, ::-1]
 
     def _asked(self, formula: Until | Since) -> tuple[Places, Places]:
-        """(F,) and (F,) the first frame in a bound, and the one behind the last, at each frame."""
+        """Return the first frame of a bound and the frame after the last one, for each frame, shape (F,)."""
         forward = isinstance(formula, Until)
         bound = formula.bound.widened(self._tolerance)
         near, far = self._clock.window(bound, forward=forward)
@@ -250,7 +250,9 @@ class MarginTable:
     # What decides
 
     def decisive(self, formula: Formula, row: int, frame: int) -> tuple[str, int] | None:  # noqa: PLR0911
-        """The proposition, and the frame, whose margin a formula has, of equal ones the one met first.
+        """Return the proposition and frame whose margin equals the margin of a formula.
+
+        The first of several wins.
 
         ``None``: no frame decides, but an end of the trace.
         """
@@ -295,13 +297,12 @@ class MarginTable:
         return self.decisive(formula.left, row, int(way[int(np.argmin(before))]))
 
     def _at(self, formula: Formula, row: int) -> Floats:
-        """(F,) the margins of one binding."""
         found = self.value(formula)
         return found[min(row, len(found) - 1)]
 
 
 def until(left: Floats | None, right: Floats, first: Places, end: Places) -> Floats:
-    """(B, F) the margin of an *until*: the greatest, over its bound, of ``right`` and all ``left`` before.
+    """Return the margin (B, F) of an *until*: its best frame for ``right`` and all earlier ``left``.
 
     Parameters
     ----------
@@ -332,12 +333,11 @@ def _greatest_of(values: Floats, first: Places, end: Places) -> Floats:
 
 
 def _behind(values: Floats) -> Floats:
-    """(B, F + 1) with what is behind the last frame: nothing that could be true."""
     return np.concatenate((values, np.full((len(values), 1), -np.inf)), axis=1)
 
 
 def _unbounded(left: Floats, right: Floats) -> Floats:
-    """(B, F): at each frame the greater of ``right`` and the least of ``left`` and what is at the next one.
+    """Return for each frame the larger of ``right`` and the smaller of ``left`` and the next result; (B, F).
 
     Such a step is a clamp, and so are several in a row: blocks of frames are clamped side by side, then joined.
     """

@@ -1,4 +1,4 @@
-"""Robustness frame by frame, in bounded memory.
+"""Online robustness, frame by frame, in bounded memory.
 
 A formula's margin at a frame may depend on later ones. Within a bound, that is waited for. Without one, what is
 not known is *one* number for each such operator: its margin at the next frame. A margin is then built of these
@@ -80,20 +80,18 @@ MARGIN: Final = np.dtype([("value", "f8"), ("name", "i8"), ("frame", "i8"), ("ti
 
 
 def _better(one: Margins, other: Margins, *, greatest: bool) -> Margins:
-    """The greater, or the lesser, of two margins; of equal ones the first."""
     a, b = one["value"], other["value"]
     return np.where(b > a if greatest else b < a, other, one)
 
 
 def _best(margins: Margins, *, greatest: bool) -> Margins:
-    """(B, V) the greatest, or the least, of some, (N, B, V)."""
     values = margins["value"]
     place = values.argmax(axis=0) if greatest else values.argmin(axis=0)
     return np.take_along_axis(margins, place[None], axis=0)[0]
 
 
 def _best_so_far(margins: Margins, *, greatest: bool) -> Margins:
-    """(N, B, V) the greatest, or the least, of each and those before it."""
+    """Return the running maximum or minimum (N, B, V)."""
     values = margins["value"] if greatest else -margins["value"]
     new = np.ones(values.shape, np.bool_)
     new[1:] = values[1:] > np.maximum.accumulate(values, axis=0)[:-1]
@@ -102,13 +100,11 @@ def _best_so_far(margins: Margins, *, greatest: bool) -> Margins:
 
 
 def _from_a_frame(margins: Margins, others: Margins) -> Margins:
-    """Margins, or equal ones that come from a frame where they do not."""
     same = (margins["name"] < 0) & (margins["value"] == others["value"])
     return np.where(same, others, margins)
 
 
 def _constant(value: Any, shape: tuple[int, ...]) -> Margins:
-    """Margins that come from no frame."""
     found = np.zeros(shape, MARGIN)
     found["value"], found["name"] = value, -1
     return found
@@ -116,7 +112,7 @@ def _constant(value: Any, shape: tuple[int, ...]) -> Margins:
 
 @dataclass(slots=True)
 class _Tape:
-    """Margins of frames that follow one another.
+    """Margins of consecutive frames.
 
     Attributes
     ----------
@@ -150,7 +146,7 @@ class _Tape:
 
 @dataclass(slots=True)
 class _Part:
-    """A part of a formula.
+    """Subformula with its margins.
 
     Attributes
     ----------
@@ -179,21 +175,21 @@ class _Part:
     tape: _Tape = field(default_factory=lambda: _Tape(0, np.zeros((0, 1, 1), MARGIN)))
 
     def join(self, one: Margins, other: Margins) -> Margins:
-        """Join margins as *or* does; of the dual, as *and*."""
+        """Combine margins as a disjunction, or as a conjunction in the dual formula."""
         return _better(one, other, greatest=self.positive)
 
     def meet(self, one: Margins, other: Margins) -> Margins:
-        """Join margins as *and* does; of the dual, as *or*."""
+        """Combine margins as a conjunction, or as a disjunction in the dual formula."""
         return _better(one, other, greatest=not self.positive)
 
     @property
     def nothing(self) -> float:
-        """The margin of what is never true; of the dual, of what always is."""
+        """Margin of the constant false, or of the constant true in the dual formula."""
         return -np.inf if self.positive else np.inf
 
 
 class MarginStream:
-    """The margin of a formula at the first frame, for some bindings.
+    """Margin of a formula at the first frame, updated online for several bindings.
 
     Parameters
     ----------
@@ -276,7 +272,7 @@ class MarginStream:
     # Frame by frame
 
     def step(self, columns: Mapping[str, Floats], tick: Tick, parents: Ints) -> None:
-        """Tell the next frame.
+        """Process the next frame.
 
         Parameters
         ----------
@@ -301,15 +297,15 @@ class MarginStream:
         self._forget()
 
     def margins(self) -> Margins:
-        """(B,) the margins if the trace ended now: of :data:`MARGIN`."""
+        """Return the margins (B,) if the trace ended now, with dtype :data:`MARGIN`."""
         return copy(self)._finished()  # noqa: SLF001 - of one's own kind
 
     def name(self, number: int) -> str:
-        """Return the name of the proposition of that number."""
+        """Return the name of the proposition with this number."""
         return self._names[number]
 
     def _finished(self) -> Margins:
-        """(B,) the margins as the trace has ended; nothing can be told any more."""
+        """Return the margins (B,) of the ended trace. No further frame is possible."""
         self._parts = [replace(part, tape=copy(part.tape)) for part in self._parts]
         self._ended = True
         self._advance()
@@ -327,7 +323,7 @@ class MarginStream:
                 self._answer = part.tape.at(0)
 
     def _replace(self, bit: int, value: Margins) -> None:
-        """Put what a frame shows in the place of what was not known."""
+        """Replace unknown margins by the values of a frame."""
         low, high = self._vertices & ~bit, self._vertices | bit
 
         def shown(old: Margins) -> Margins:
@@ -343,7 +339,7 @@ class MarginStream:
         return _constant(value, (self._rows, len(self._vertices)))
 
     def _here(self, name: str, *, positive: bool) -> Margins:
-        """The margins of a proposition in this frame."""
+        """Return the margins of a proposition in this frame."""
         found = self._all(0.0)
         column = self._columns[name][:, None]
         found["value"] = column if positive else -column
@@ -352,7 +348,7 @@ class MarginStream:
         return found
 
     def _told(self, part: _Part) -> Iterator[Margins]:
-        """The margins of a part that are known now, one frame after the other."""
+        """Yield the newly known margins of a part, frame by frame."""
         match part.formula:
             case TruthConstant(value=value):
                 if not self._ended:
@@ -389,7 +385,7 @@ class MarginStream:
 
     @property
     def _count(self) -> int:
-        """The number of frames so far."""
+        """Number of frames so far."""
         return self._start + len(self._times)
 
     def _right(self, part: _Part) -> _Tape:
@@ -400,7 +396,6 @@ class MarginStream:
         return None if part.left is None else self._parts[part.left].tape
 
     def _sides(self, part: _Part) -> int:
-        """Up to before which frame both sides are known."""
         left = self._left(part)
         return min(self._right(part).end, self._right(part).end if left is None else left.end)
 
@@ -447,7 +442,10 @@ class MarginStream:
             yield _best(found, greatest=part.positive)
 
     def _window_ahead(self, at: int, bound: Bound, *, single: bool) -> tuple[int, int] | None:
-        """The first frame in a bound, and the one behind the last; ``None``: a later frame tells."""
+        """Return the first frame of a bound and the frame after the last.
+
+        ``None`` means a later frame decides.
+        """
         bound, count = bound.widened(self._tolerance), self._count
         if bound.frames:
             first = min(at + bound.low, count)
@@ -486,7 +484,7 @@ class MarginStream:
             yield _best(found, greatest=part.positive)
 
     def _window_back(self, at: int, bound: Bound, *, single: bool) -> tuple[int, int]:
-        """The first and the last frame in a bound; -1 is before the trace."""
+        """Return the first and the last frame of a bound. -1 means before the trace."""
         bound = bound.widened(self._tolerance)
         if bound.frames:
             last = max(at - bound.low, -1)
@@ -530,7 +528,7 @@ class MarginStream:
 
 
 class RobustnessMonitor:
-    """Margin by which a check is met, while a trace comes.
+    """Online robustness of a check.
 
     Parameters
     ----------
@@ -573,7 +571,7 @@ class RobustnessMonitor:
         self._rows: dict[Partial, int] = {}
 
     def step(self) -> None:
-        """A frame has come, and the questions were asked of it."""
+        """Process the next frame after its queries."""
         if self._without is not None:
             self._without.step()
         valuation, known = self._valuation, self._memories
@@ -602,12 +600,11 @@ class RobustnessMonitor:
         known.held = {one: memories.get(one, ()) for one in letters}
 
     def _row(self, binding: Partial) -> int:
-        """The row of a binding, or of what is known of it."""
         wider = self._valuation.lattice.wider(binding)
         return next(self._rows[one] for one in wider if one in self._rows)
 
     def told(self, levels: Sequence[Level], names: Mapping[str, Mapping[int, str]]) -> Robustness:
-        """Margin by which the check is met if the trace ends now, and what decides it.
+        """Return the robustness of the check if the trace ends now.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Runs of a pattern of one frame, and values over them, in many traces at once.
+"""Runs of a single-frame pattern, and values over them, for many traces at once.
 
 All rows, a binding in a frame each, stand in one line: by traces, bindings and frames. So the work does not
 grow with the number of traces, and a value over a run is read with the rows of the pattern, and of no others.
@@ -67,7 +67,7 @@ RunsTold = tuple["Ints", "Ints", "Keys", list[list[Any]]]
 
 @dataclass(frozen=True)
 class FrameLine:
-    """The frames of many traces in one line.
+    """Frames of many traces in one array.
 
     They are told by the buckets of a store, some sixty at a time; times are read where they are asked for.
 
@@ -100,7 +100,7 @@ class FrameLine:
     def read(
         cls, file: StoreFile, about: Mapping[int, tuple[Any, ...]], window: Window | None
     ) -> FrameLine:
-        """Frames of some traces, told as by :func:`chosen_traces`, of those in a window."""
+        """Read the frames of the traces in a window. ``about`` is the result of :func:`chosen_traces`."""
         buckets = buckets_of(file, window)
         owners = buckets["bucket"] >> BUCKET_BITS
         rows = np.isin(owners, [*about])
@@ -120,7 +120,7 @@ class FrameLine:
 
     @cached_property
     def times(self) -> Ints:
-        """(F,) the times of the frames, which ascend within a trace; ns."""
+        """Times of the frames, shape (F,), strictly ascending in each trace; ns."""
         ids, times = self.told()
         if len(ids) != len(self.ids):
             times = times[np.isin(trace_of(ids), self.traces)]
@@ -134,7 +134,7 @@ class FrameLine:
 
     @cached_property
     def begins(self) -> Bools:
-        """(F,) whether a trace begins with a frame, or what follows a gap."""
+        """Mask (F,) of the frames at the start of a trace or after a gap."""
         found = np.zeros(len(self.ids), np.bool_)
         if self.apart:
             longest = np.array([longest_step_ns(period) for period in self.periods.tolist()])
@@ -144,7 +144,7 @@ class FrameLine:
         return found
 
     def places(self, ids: Ints) -> Ints:
-        """(R,) the place of each of some frames; -1 of those that are not here."""
+        """Return the index of each frame id, shape (R,). -1 means not present."""
         if not len(self.ids):
             return np.full(len(ids), -1)
         traces = trace_of(ids)
@@ -163,7 +163,7 @@ class FrameLine:
 
 @dataclass(frozen=True)
 class BindingRows:
-    """Rows of bindings in frames, by traces, bindings and frames; each once.
+    """Rows of frame and binding, sorted by trace, binding and frame, without duplicates.
 
     Attributes
     ----------
@@ -187,7 +187,7 @@ class BindingRows:
     def of(
         cls, line: FrameLine, ids: Ints, keys: Keys, values: Mapping[b.Bound, Column]
     ) -> BindingRows:
-        """From rows in any order, of which those are left out whose traces are not asked."""
+        """Build the table from unsorted rows. Rows of other traces are dropped."""
         frames = line.places(ids)
         known = frames >= 0
         if not known.all():
@@ -206,7 +206,7 @@ class BindingRows:
         return found.only(~again) if again.any() else found
 
     def only(self, rows: Bools) -> BindingRows:
-        """Some of the rows."""
+        """Return the selected rows."""
         owners = np.cumsum(self.fresh)[rows]
         fresh = np.diff(owners, prepend=0) != 0
         values = {name: _rows(value, rows) for name, value in self.values.items()}
@@ -217,12 +217,12 @@ class BindingRows:
 
     @cached_property
     def starts(self) -> Ints:
-        """The first row of each run: of frames that follow one another, with the same binding."""
+        """Index of the first row of each run. A run has consecutive frames and one binding."""
         follows = np.diff(self.frames, prepend=-2) == 1
         return np.flatnonzero(self.fresh | ~follows | self.line.begins[self.frames])
 
     def held(self, hold: b.BoundHold) -> BindingRows:
-        """The rows of the runs that last as long as is asked."""
+        """Return the rows of the runs with the required duration."""
         if not len(self):
             return self
         counts = np.diff(self.starts, append=len(self))
@@ -237,7 +237,7 @@ class BindingRows:
 
 
 class RowValues(SignalValues):
-    """The values of the tests of a plan, a row of bindings in frames each: (1, R).
+    """Values of the tests of a plan, one column per row of frame and binding: (1, R).
 
     Parameters
     ----------
@@ -250,12 +250,12 @@ class RowValues(SignalValues):
         self._rows = rows
 
     def signal(self, signal: Ask) -> Column:
-        """The values of a signal: (1, R)."""
+        """Return the values (1, R) of a signal."""
         assert signal.value is not None  # noqa: S101 - it is no atom
         return self._rows.values[signal.value]
 
     def course(self, course: b.SignalCall, test: Test) -> Column:
-        """The value of a window: (1, R)."""
+        """Return the values (1, R) of a function over a time window."""
         column = self.signal(test.signals[course.operand])
         first = self.window_starts(course)
         if course.word in {"sum_over", "avg_over"}:
@@ -265,7 +265,7 @@ class RowValues(SignalValues):
         return over_columns(course.word, column, first)
 
     def window_starts(self, course: b.SignalCall) -> Ints:
-        """(R,) the first row of the window of a course at each row."""
+        """Return the first row of the time window at each row, shape (R,)."""
         rows, line = self._rows, self._rows.line
         here = np.arange(len(rows))
         stretch = np.cumsum(line.begins)[rows.frames]
@@ -288,7 +288,7 @@ class RowValues(SignalValues):
 
 
 class RunFinder:
-    """Finder of the runs of a pattern of one frame in a store.
+    """Search for the runs of a single-frame pattern in a store.
 
     Parameters
     ----------
@@ -321,7 +321,7 @@ class RunFinder:
         self._window_nodes = frozenset(ask.variables) if bare else None
 
     def fits(self, places: Sequence[b.Bound]) -> bool:
-        """Tell whether rows of the pattern are enough to tell where it holds, and some values."""
+        """True if the pattern's rows alone determine its frames and the requested values."""
         step = self._query.steps[0]
         if self._query.spans or step.absent or self._query.gaps != "break" or self._ask.everywhere:
             return False
@@ -345,11 +345,10 @@ class RunFinder:
 
     @cached_property
     def _about(self) -> dict[int, tuple[Any, ...]]:
-        """The traces that are asked."""
         return chosen_traces(self._file, self._query, self._catalog)
 
     def found(self, places: Sequence[b.Bound], within: Window | None) -> Iterator[RunsTold]:
-        """The runs in whole traces; not more of these at a time than memory may hold.
+        """Yield the runs in whole traces, in groups that fit into memory.
 
         Parameters
         ----------
@@ -371,7 +370,7 @@ class RunFinder:
                 yield told
 
     def _found(self, places: Sequence[b.Bound], window: Window | None) -> tuple[RunsTold, int]:
-        """The runs in a window, and how many rows were read."""
+        """Return the runs in a window, and the number of rows read."""
         step = self._query.steps[0]
         tests = {one: self._plan.test(one) for one in step.when}
         tests |= {one: self._plan.test(one) for place in places for one in _values(place)}
@@ -398,7 +397,7 @@ class RunFinder:
         return self._parts(rows, told), many
 
     def _parts(self, rows: BindingRows, told: list[Any]) -> RunsTold:
-        """Runs in which all that is told stays the same, and ids of frames follow one another."""
+        """Split runs where a returned value changes or a frame id is skipped."""
         ids = rows.line.ids[rows.frames]
         new = np.diff(ids, prepend=-2) != 1
         new[rows.starts] = True
@@ -410,7 +409,7 @@ class RunFinder:
         return ids[first], ids[last], rows.keys[first], values
 
     def _projected(self, rows: BindingRows) -> BindingRows:
-        """Rows of what is told of a match alone."""
+        """Return the rows with only the columns that a match returns."""
         if self._named == self._ask.columns:
             return rows
         columns = [self._ask.columns.index(name) for name in self._named]
@@ -418,7 +417,7 @@ class RunFinder:
         return BindingRows.of(rows.line, ids, rows.keys[:, columns], rows.values)
 
     def _read(self, tests: Collection[Test], window: Window | None) -> BindingRows:
-        """The rows of the pattern, with all that tests need of them."""
+        """Return the rows of the pattern, with the values that the tests need."""
         signals = (signal.value for test in tests for signal in test.signals.values())
         asked = list(dict.fromkeys(value for value in signals if value is not None))
         line = FrameLine.read(self._file, self._about, window)
@@ -432,14 +431,13 @@ class RunFinder:
 
 
 def _values(place: b.Bound) -> tuple[b.Bound, ...]:
-    """The values of frames that a place is made of."""
     if not isinstance(place, b.OverMatch):
         return (place,)
     return (place.operand,) if place.at is None else (place.operand, place.at)
 
 
 def _column(told: Any) -> Column:
-    """(1, R) what the database tells of rows."""
+    """Convert a database column to a column of shape (1, R)."""
     values, known = np.ma.getdata(told), ~np.ma.getmaskarray(told)
     if values.dtype.kind in "iuf":
         values = values.astype(np.float64)
@@ -452,13 +450,12 @@ def _rows(column: Column, rows: Any) -> Column:
 
 
 def _whole(column: Column, rows: int) -> Column:
-    """A column with a value for each row."""
     shape = 1, rows
     return Column(np.broadcast_to(column.values, shape), np.broadcast_to(column.known, shape))
 
 
 def _order(columns: Sequence[Ints]) -> Ints:
-    """The order of rows by some columns, the first of them first."""
+    """Return the sort order of rows by some columns. The first column is the primary key."""
     rows = len(columns[0])
     if not rows:
         return np.zeros(0, np.int64)
@@ -484,7 +481,7 @@ def _order(columns: Sequence[Ints]) -> Ints:
 
 
 def _earliest(at: Ints, limit: Ints, low: Ints, high: Ints) -> Ints:
-    """The first places, from ``low`` on, where ascending numbers reach a limit, as they do at ``high``."""
+    """Return the first indices between ``low`` and ``high`` at which ascending numbers reach a limit."""
     low, high = low.copy(), high.copy()
     while np.any(low < high):
         middle = (low + high) // 2
@@ -494,7 +491,7 @@ def _earliest(at: Ints, limit: Ints, low: Ints, high: Ints) -> Ints:
 
 
 def _one_by_one(word: str, values: Any, known: Bools, first: Ints) -> Column:
-    """Sums, or averages, of the values known in windows."""
+    """Return exact sums or means of the known values in each window."""
     count = np.concatenate(([0], np.cumsum(known)))
     some = values[known].tolist()
     ends = zip(count[first].tolist(), count[1:].tolist(), strict=True)

@@ -1,4 +1,4 @@
-"""The monitor of one ``MATCH`` or sequence, frame by frame, and its events."""
+"""Online monitor of one ``MATCH`` or sequence, frame by frame, and its events."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class FrameTime:
-    """A frame of the trace that is watched.
+    """Number and times of a monitored frame.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class FrameTime:
 
 @dataclass(frozen=True, slots=True)
 class MonitorEvent:
-    """Something that is known from a frame on.
+    """Event reported by an online monitor at a frame.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ NEVER: Final = 1 << 62
 
 @dataclass(slots=True)
 class Run:
-    """Frames one after the other, without a gap, in which a step holds.
+    """Consecutive frames without a gap in which a step holds.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class StepFrame:
-    """A frame in which a step holds.
+    """Frame in which a step holds.
 
     Attributes
     ----------
@@ -139,12 +139,12 @@ class StepFrame:
 
     @property
     def ends(self) -> tuple[int, ...]:
-        """Numbers of the frame, and of the first and the last one of its run, as far as that is known."""
+        """Numbers of the frame and of the first and last frame of its run, as far as known."""
         return (self.number, self.run.number, *([self.run.last] if self.run.over else []))
 
 
 class StepState:
-    """A step and one binding.
+    """State of one step for one binding.
 
     Parameters
     ----------
@@ -173,25 +173,25 @@ class StepState:
 
     @property
     def idle(self) -> bool:
-        """Tell whether nothing is remembered."""
+        """True if the state is empty."""
         return not (self.places or self._queue or self._run)
 
     @property
     def oldest(self) -> int:
-        """The first frame of the runs of which something is kept or may come; :data:`NEVER`: there are none."""
+        """First frame of the stored or possible runs. :data:`NEVER` means that there are none."""
         runs = [place.run.number for place in self.places[:1]]
         runs += [self._run.number] if self._run is not None else []
         return min([*runs, self.undecided])
 
     @property
     def undecided(self) -> int:
-        """The number of the first frame that may still turn out to be a place; :data:`NEVER`: none so far."""
+        """Number of the first undecided frame. :data:`NEVER` means that there is none."""
         if self._waiting:
             return self._waiting[0].number
         return self._queue[0][0] if self._queue else NEVER
 
     def frames(self) -> Iterator[int]:
-        """Numbers of the frames that are a place, may become one, or are an end of a run of such frames."""
+        """Yield the numbers of decided and undecided frames of the step, and of the ends of their runs."""
         for place in (*self.places, *self._waiting):
             yield from place.ends
         if self._run is not None:
@@ -199,12 +199,12 @@ class StepState:
         yield from (number for number, _, _ in self._queue)
 
     def ask(self, holds: Needs, *, gap: bool) -> None:
-        """The next frame, and what its conditions still need."""
+        """Add the next frame with its open conditions."""
         self._queue.append((self._pulse.tick.number, self._pulse.tick.time, gap))
         self.open.append(holds)
 
     def decide(self, needs: list[Needs]) -> None:
-        """Decide open frames: one that needs nothing any more is a place, or is none."""
+        """Decide the open frames whose conditions are known."""
         self.open = deque(needs)
         while self.open and isinstance(self.open[0], bool):
             number, time, gap = self._queue.popleft()
@@ -231,7 +231,7 @@ class StepState:
         self._waiting = []
 
     def _long(self) -> bool:
-        """Tell whether the run is as long as is asked."""
+        """True if the run has the required duration."""
         if self._hold is None:
             return True
         last = self._waiting[-1]
@@ -249,7 +249,7 @@ class StepState:
         self._run = None
 
     def finish(self) -> None:
-        """The trace has ended."""
+        """End the trace."""
         self.decide([n if isinstance(n, bool) else any(t.ended for _, t in n) for n in self.open])
         self._end()
 
@@ -259,7 +259,7 @@ Binding = dict[str, int]
 
 
 def joined(one: Binding, names: tuple[str, ...], key: Key, apart: frozenset[str]) -> Binding | None:
-    """A binding and another one together; ``None`` if they differ, or what must differ does not."""
+    """Merge two bindings. ``None`` means a conflict, or two equal nodes that must differ."""
     both = dict(one)
     for name, node in zip(names, key, strict=True):
         known = both.get(name)
@@ -285,7 +285,7 @@ FoundMatch = tuple[StepWay, Binding, tuple[StepFrame, ...]]
 
 
 class SequenceMonitor:
-    """A pattern, while a trace comes.
+    """Online monitor of a pattern over one trace.
 
     Parameters
     ----------
@@ -333,7 +333,7 @@ class SequenceMonitor:
     # Frame by frame
 
     def step(self, here: FrameTime, people: NodeNames) -> list[MonitorEvent]:
-        """A frame has come, and the questions were asked of it: what is known from it on."""
+        """Process the next frame after its queries, and return the new events."""
         self._conditions.step()
         gap = self._pulse.breaks(bridge=self.query.gaps == "bridge")
         for number in range(len(self._steps)):
@@ -350,7 +350,7 @@ class SequenceMonitor:
         return self._found(here)
 
     def _now(self, number: int) -> dict[Key, Needs]:
-        """The bindings in which a step's pattern is found, and what its conditions still need."""
+        """Return the bindings of a step's pattern in this frame, and the open conditions of each."""
         question, variables = self._asks[number]
         places = [variables.index(name) for name in self._columns[number]]
         answers = self._questions.answers[question]
@@ -391,7 +391,7 @@ class SequenceMonitor:
         return found
 
     def _certain(self) -> Iterator[FoundMatch]:
-        """Matches that are certain from this frame on."""
+        """Yield the matches that became certain with this frame."""
         (way,) = self._asked
         if all(self._held[number] for number in self._happen[way]):
             for binding in self._bindings({}, self._happen[way]):
@@ -400,7 +400,7 @@ class SequenceMonitor:
 
     @cached_property
     def _lasting(self) -> dict[StepWay, frozenset[int]]:
-        """Places among the steps that happen, of those whose runs must be over before a match can be told."""
+        """Positions of the steps whose runs must end before a match can be reported."""
         return {way: frozenset(self._lasting_in(happen)) for way, happen in self._happen.items()}
 
     def _lasting_in(self, happen: tuple[int, ...]) -> Iterator[int]:
@@ -413,7 +413,7 @@ class SequenceMonitor:
             yield len(happen) - 1
 
     def _frames(self) -> Iterator[int]:
-        """Numbers of the frames at which a part of a match may begin or end."""
+        """Yield the numbers of the frames at which a part of a match can begin or end."""
         for number in frozenset[int]().union(*self._happen.values()):
             for one in self._held[number].values():
                 yield from one.frames()
@@ -422,7 +422,7 @@ class SequenceMonitor:
                 yield from place.ends
 
     def _bindings(self, binding: Binding, steps: Sequence[int]) -> Iterator[Binding]:
-        """Bindings of all steps together, each of which has places."""
+        """Yield the joint bindings of all steps, if each step has frames."""
         if not steps:
             yield binding
             return
@@ -433,7 +433,7 @@ class SequenceMonitor:
                     yield from self._bindings(both, steps[1:])
 
     def _agreeing(self, number: int, binding: Binding) -> list[tuple[Key, StepState]]:
-        """The bindings of a step that may agree with another one."""
+        """Return the bindings of a step that are compatible with another binding."""
         names, held = self._columns[number], self._held[number]
         if all(name in binding for name in names):
             key = tuple(binding[name] for name in names)
@@ -466,7 +466,7 @@ class SequenceMonitor:
         return self._held[number].get(tuple(binding[name] for name in self._columns[number]))
 
     def _ways(self, way: StepWay, at: int, place: StepFrame, binding: Binding) -> Ways:
-        """The places of the steps of a sequence from one on, the first of which is given."""
+        """Yield the frames of the remaining steps of a sequence, starting from a given frame."""
         steps, following = way.steps, at + 1
         if following == len(steps):
             return (place,)
@@ -498,7 +498,7 @@ class SequenceMonitor:
     def _reached(
         self, place: StepFrame, link: StepLink, held: StepState | None, stop: int
     ) -> list[StepFrame]:
-        """The places of the next step that a link allows."""
+        """Return the frames of the next step that a link allows."""
         found = [p for p in held.places if p.number <= stop] if held is not None else []
         first = place.number
         match link.kind:
@@ -521,7 +521,7 @@ class SequenceMonitor:
     def _closed(  # noqa: PLR0911 - a case each
         self, place: StepFrame, link: StepLink, held: StepState | None, stop: int
     ) -> bool:
-        """Tell whether no further place of the next step can come that a link allows."""
+        """True if a link allows no further frame of the next step."""
         if self._ended:
             return True
         tick = self._pulse.tick
@@ -579,7 +579,7 @@ class SequenceMonitor:
     def _span(
         self, part: OverMatch, happen: tuple[int, ...], ways: tuple[StepFrame, ...]
     ) -> tuple[int, int]:
-        """The first and the last frame of a part of a match."""
+        """Return the first and the last frame of a part of a match."""
         if part.start == AT_FRAME:
             return ways[-1].number, ways[-1].number
         if part.start is None or part.end is None:
@@ -599,7 +599,7 @@ class SequenceMonitor:
     # What is kept
 
     def _forget(self) -> None:
-        """Let go of the places that no match can have any more."""
+        """Drop the step frames that no match can use any more."""
         first = self._held[0]
         for key, one in first.items():
             if one.places:
@@ -617,7 +617,7 @@ class SequenceMonitor:
                     one.places.pop(0)
 
     def _oldest(self, number: int) -> tuple[dict[Key, int], list[int]]:
-        """The first frames in which a match may begin, by what the first step and another one both bind.
+        """Return the first possible frames of a match by the nodes shared by the first and another step.
 
         Also which columns of the other step these are.
         """
@@ -648,7 +648,7 @@ class SequenceMonitor:
     def _alive(  # noqa: PLR0911 - a case each
         self, way: StepWay, at: int, binding: Binding, place: StepFrame
     ) -> bool:
-        """Tell whether it is still open what follows a place in a sequence."""
+        """True if later frames can still continue a sequence after this frame."""
         following, steps = at + 1, way.steps
         if following == len(steps):
             return False
@@ -674,7 +674,7 @@ class SequenceMonitor:
         return False
 
     def finish(self, here: FrameTime) -> list[MonitorEvent]:
-        """The trace has ended: what only that makes known."""
+        """End the trace, and return the events that only the end decides."""
         self._ended = True
         for held in self._held:
             for one in held.values():
@@ -683,7 +683,7 @@ class SequenceMonitor:
 
 
 def _returned(query: Query) -> list[ReturnColumn]:
-    """The columns that speak of matches over several frames; what is counted of all of them is told by none."""
+    """Return the columns that describe multi-frame matches. Aggregates over all matches have none."""
     if query.result.aggregated:
         return []
     return [
@@ -702,7 +702,7 @@ def _named(query: Query) -> tuple[str, ...]:
 
 
 def _within(link: StepLink, place: StepFrame, other: StepFrame, tolerance: int) -> bool:
-    """Tell whether another place is as much later as a link asks; times have a tolerance, in ns."""
+    """True if the delay between two frames meets the limits of a link; tolerance in ns."""
     later = {True: other.number - place.number, False: other.time - place.time}
     slack = {True: 0, False: tolerance}
     after, within = link.after, link.within
@@ -712,7 +712,7 @@ def _within(link: StepLink, place: StepFrame, other: StepFrame, tolerance: int) 
 
 
 class _Conditions:
-    """The conditions of steps that look at other frames."""
+    """Conditions of steps that depend on other frames."""
 
     def __init__(
         self, query: Query, steps: Sequence[BoundStep], questions: QueryCache, pulse: StreamClock
@@ -733,7 +733,7 @@ class _Conditions:
         self._frames: dict[Partial, ProgressionFrame] = {}
 
     def step(self) -> None:
-        """A frame has come, and the questions were asked of it."""
+        """Process the next frame after its queries."""
         if not any(self._asked):
             return
         known = self._known
@@ -753,15 +753,15 @@ class _Conditions:
         known.keep(entries, lambda one, other: one == other)
 
     def row(self, nodes: Binding) -> Partial:
-        """Return the row of a binding that the conditions are given."""
+        """Return the nodes of a binding in the order of the condition variables."""
         return tuple(nodes.get(name) for name in self._variables)
 
     def now(self, number: int, row: Partial) -> Term:
-        """Return the needs of a step's conditions for a binding in this frame."""
+        """Return the open conditions of a step for a binding in this frame."""
         return self._frame(row).now(self._when[number])
 
     def resolved(self, needs: Needs) -> Needs:
-        """Return the needs of a former frame, with what this one shows."""
+        """Update the open conditions of an earlier frame with the data of this frame."""
         if isinstance(needs, bool):
             return needs
         return settled([(row, self._frame(row).resolved(term)) for row, term in needs])
@@ -772,7 +772,7 @@ class _Conditions:
 
 
 def settled(needs: list[tuple[Partial, Term]]) -> Needs:
-    """Tell whether one of some conditions holds, or which of them may."""
+    """Return True if one of the conditions holds, False if none can, else the open conditions."""
     if any(term.word == "true" for _, term in needs):
         return True
     left = tuple((row, term) for row, term in needs if term.word != "false")

@@ -1,4 +1,4 @@
-"""Sequences over a store: the steps of a query joined over time in arrays."""
+"""Sequences over a store: the steps of a query joined over time as arrays."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """The way from one step to the next.
+    """Link from one step to the next.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Leg:
 
 
 class BindingLine:
-    """The frames of many bindings in one line: binding b's frame i is at ``b * stride + i``.
+    """Frames of many bindings in one index: frame i of binding b has position ``b * stride + i``.
 
     Parameters
     ----------
@@ -107,11 +107,11 @@ class BindingLine:
         ]  # before the clock jumps
 
     def frame(self, places: Ints) -> Ints:
-        """The frame of each place."""
+        """Return the frame of each position."""
         return places % self.stride
 
     def run_ends(self, places: Ints) -> Ints:
-        """(R,) the last place of the run that each of some ascending places is in."""
+        """Return the last position of the run of each ascending position, shape (R,)."""
         if not len(places):
             return places
         last = np.append(self._starts(places)[1:], True)
@@ -119,7 +119,7 @@ class BindingLine:
         return places[np.minimum.accumulate(ends[::-1])[::-1]]
 
     def run_starts(self, places: Ints) -> Ints:
-        """(R,) the first place of the run that each of some ascending places is in."""
+        """Return the first position of the run of each ascending position, shape (R,)."""
         if not len(places):
             return places
         return places[
@@ -127,18 +127,18 @@ class BindingLine:
         ]
 
     def runs(self, places: Ints) -> Ints:
-        """(R,) the number of the run that each of some ascending places is in."""
+        """Return the run number of each ascending position, shape (R,)."""
         return np.cumsum(self._starts(places)) - 1
 
     def _starts(self, places: Ints) -> Bools:
-        """Return where runs begin: after a missing frame, a gap, or another binding's last frame."""
+        """Return a mask of run starts: after a missing frame, a gap, or the last frame of another binding."""
         starts = np.ones(len(places), np.bool_)
         follows = np.diff(places) == 1
         starts[1:] = ~follows | self._breaks[self.frame(places[1:])]
         return starts
 
     def held(self, places: Ints, hold: BoundHold) -> Ints:
-        """Those places whose run is as long as is asked."""
+        """Return the positions whose run has the required duration."""
         if not len(places):
             return places
         runs = self.runs(places)
@@ -153,7 +153,7 @@ class BindingLine:
         return places[hold.fits(length, self.clock.tolerance)[runs]]
 
     def window(self, leg: Leg, places: Ints) -> tuple[Ints, Ints]:
-        """(R,) and (R,) the first and the last place at which the next step may be, from each place."""
+        """Return the first and last allowed position of the next step for each position, both (R,)."""
         frame = self.frame(places)
         base = places - frame
         if leg.kind == "while":
@@ -177,7 +177,7 @@ class BindingLine:
         return low, high
 
     def _moved(self, frame: Ints, by: Length | None, side: str) -> Ints:
-        """The first frame that is so much later (``left``), or the last that is not more (``right``)."""
+        """Return the first frame at or after a delay (``left``), or the last frame within it (``right``)."""
         times = self.clock.times
         if by is None:
             return frame if side == "left" else np.full_like(frame, self.frames - 1)
@@ -194,7 +194,7 @@ class BindingLine:
 
 
 def matches_of(line: BindingLine, first: Ints, legs: Sequence[Leg], policy: str) -> Ints:
-    """The matches of a sequence.
+    """Return the matches of a sequence.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ def matches_of(line: BindingLine, first: Ints, legs: Sequence[Leg], policy: str)
 
 
 def _next(possible: Ints, low: Ints, high: Ints, *, latest: bool) -> tuple[Ints, Bools]:
-    """The earliest (or latest) of some places within each window, and whether there is one."""
+    """Return the earliest or latest position in each window, and a mask of the windows that have one."""
     if not len(possible):
         return low, np.zeros(len(low), np.bool_)
     if latest:
@@ -245,7 +245,6 @@ def _next(possible: Ints, low: Ints, high: Ints, *, latest: bool) -> tuple[Ints,
 
 
 def _unfollowed(line: BindingLine, leg: Leg, places: Ints) -> Ints:
-    """Those places after which something does not happen within a time."""
     absent = leg.absent if leg.absent is not None else places[:0]
     low, high = line.window(Leg("then", None, leg.within, None, None), places)
     _, followed = _next(absent, low, high, latest=False)
@@ -253,7 +252,7 @@ def _unfollowed(line: BindingLine, leg: Leg, places: Ints) -> Ints:
 
 
 def _one_a_run(line: BindingLine, first: Ints, possible: Ints) -> Ints:
-    """The first of the possible places in each run of the first step."""
+    """Return the first possible position in each run of the first step."""
     runs = line.runs(first)[np.searchsorted(first, possible)] if len(possible) else possible
     return possible[np.diff(runs, prepend=-1) != 0] if len(possible) else possible
 
@@ -266,7 +265,7 @@ ROWS: Final = 2_000_000
 
 @dataclass(frozen=True, slots=True)
 class JoinedBindings:
-    """Bindings of several relations together.
+    """Joint bindings of several relations.
 
     Attributes
     ----------
@@ -281,7 +280,7 @@ class JoinedBindings:
     places: Ints
 
     def parts(self, relations: Sequence[TimedRelation]) -> Iterator[JoinedBindings]:
-        """The same in parts of which each has not too many rows."""
+        """Split the bindings into parts with a limited number of rows."""
         if not len(self.bindings):
             return
         rows = np.zeros(len(self.bindings), np.int64)
@@ -296,7 +295,7 @@ class JoinedBindings:
 def joined(
     relations: Sequence[tuple[tuple[str, ...], TimedRelation]], apart: Collection[str]
 ) -> JoinedBindings:
-    """All bindings of some relations, each with its variables, that agree on what these share.
+    """Return the joint bindings of relations that agree on their shared variables.
 
     Parameters
     ----------
@@ -335,7 +334,7 @@ def _with(
 
 
 def _pairs(left: Keys, right: Keys) -> tuple[Ints, Ints]:
-    """Numbers of the rows of two tables that are equal, ordered by the first."""
+    """Return index pairs of equal rows in two tables, ordered by the first."""
     if not len(left) or not len(right):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     both = np.concatenate((left, right))
@@ -366,7 +365,7 @@ _Part = tuple["Ints", "Ints", "Keys", list[list[Any]]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchesOfWay:
-    """Matches of one of the sequences that a query stands for, with some of its bindings.
+    """Matches of one alternative sequence of a query, for some of its bindings.
 
     Attributes
     ----------
@@ -385,12 +384,12 @@ class MatchesOfWay:
     told: Ints
 
     def chosen(self, rows: Any) -> MatchesOfWay:
-        """Some of the matches."""
+        """Return the selected matches."""
         return replace(self, told=self.told[rows])
 
 
 class Finder:
-    """Finder of the matches of a query over several frames in a store.
+    """Search for the matches of a multi-frame query in a store.
 
     Parameters
     ----------
@@ -414,7 +413,7 @@ class Finder:
         self._runs = None if query.spans else RunFinder(*about)
 
     def __call__(self, places: tuple[Bound, ...], window: Window | None) -> ExternalRelation:
-        """The matches in a window, or in the whole traces that it is a part of.
+        """Return the matches in a window, extended to whole traces.
 
         Parameters
         ----------
@@ -443,7 +442,7 @@ class Finder:
     def _parts(
         self, places: tuple[Bound, ...], window: Window | None
     ) -> Iterator[tuple[str, _Part]]:
-        """The matches in a window, each part with the name of a trace that it is of."""
+        """Yield the matches in a window in parts, each with the name of one of its traces."""
         if self._runs is not None and self._runs.fits(places):
             for first, last, keys, values in self._runs.found(places, _whole(window)):
                 yield "a trace", (first, last, self._ordered(self._named(0), keys), values)
@@ -455,7 +454,7 @@ class Finder:
     def readers(
         self, window: Window | None, places: tuple[Bound, ...] = ()
     ) -> Iterator[TraceReader]:
-        """The traces of a window, or those that it is a part of, with what the query needs of them.
+        """Yield the traces of a window, extended to whole traces, with the data that the query needs.
 
         Parameters
         ----------
@@ -468,11 +467,11 @@ class Finder:
         return traces(*about, gaps=self._query.gaps, within=_whole(window))
 
     def matches(self, trace: TraceReader) -> bool:
-        """Tell whether there is a match in some frames of a trace, as if they were all."""
+        """True if the selected frames of a trace contain a match."""
         return any(len(part[0]) for part in self._find(trace, ()))
 
     def _asks_of(self, places: tuple[Bound, ...], steps: Sequence[Ask]) -> dict[str, Ask]:
-        """All that is asked of single frames; of what is only returned, no more than steps leave."""
+        """Return all single-frame queries. Queries of returned values cover only the bindings of the steps."""
         for place in places:
             for value in _worked_out(place):
                 self._planned(value)
@@ -483,13 +482,12 @@ class Finder:
         return first | {ask.name: ask for ask in steps} | later
 
     def _planned(self, place: Bound) -> Formula | Test:
-        """The formula, or the test, whose value is asked for at a place."""
         if is_formula(place) or (isinstance(place, SignalCall) and place.word == "exists_now"):
             return self._plan.formula(place)
         return self._plan.test(place)
 
     def text(self, places: tuple[Bound, ...]) -> str:
-        """The questions about single frames, and the formulas over their answers."""
+        """Return the single-frame queries, and the formulas over their results, as text."""
         lines: list[str] = []
         for number, (step, ask) in enumerate(zip(self._query.steps, self._steps, strict=True)):
             if number and not self._query.alternatives:
@@ -522,7 +520,7 @@ class Finder:
     def _of_way(
         self, line: BindingLine, held: list[TimedRelation], way: StepWay
     ) -> Iterator[MatchesOfWay]:
-        """The matches of one of the sequences that the query stands for."""
+        """Yield the matches of one alternative sequence of the query."""
         happen = way.happen
         together = joined([(self._named(n), held[n]) for n in happen], self._apart)
         for part in together.parts([held[n] for n in happen]):
@@ -542,7 +540,7 @@ class Finder:
     def _chosen(
         self, line: BindingLine, held: list[TimedRelation], found: list[MatchesOfWay]
     ) -> Iterator[MatchesOfWay]:
-        """Of matches that begin in one run of one step, with one binding, the one that counts.
+        """Yield the best match for each run of the first step and each binding.
 
         Places of steps are compared as those of one sequence are. One that goes on counts as later than one
         that has ended; where all are the same, the sequence that is written first counts.
@@ -586,7 +584,7 @@ class Finder:
         return (*(n for n in ask.variables if n in self._tied), *ask.edges)
 
     def _held(self, trace: TraceReader, line: BindingLine, number: int) -> TimedRelation:
-        """Return the frames in which a step holds: its pattern, its other conditions, and its duration."""
+        """Return the frames in which a step holds, after its pattern, conditions and duration."""
         step, ask = self._query.steps[number], self._steps[number]
         relation = trace.relations[ask.name]
         owners = np.repeat(np.arange(len(relation.keys)), np.diff(relation.starts))
@@ -605,7 +603,7 @@ class Finder:
     def _true(
         self, trace: TraceReader, relation: TimedRelation, ask: Ask, formula: Formula, owners: Ints
     ) -> Any:
-        """Tell whether a formula is true in each row of a relation."""
+        """Return a mask of the relation rows in which a formula is true."""
         true = np.zeros(len(owners), np.bool_)
         for low, high, rows in _chunks(relation.starts, trace.together):
             bindings = relation.keys[low:high, : len(ask.variables)]
@@ -673,7 +671,7 @@ class Finder:
         return owner * line.stride + relation.frames[rows]
 
     def _legs(self, way: StepWay, at: list[Ints], absent: dict[int, Ints]) -> list[Leg]:
-        """The ways between the steps that happen; what must not happen lies on them."""
+        """Return the links between the occurring steps. Absent steps become conditions of a link."""
         legs: list[Leg] = []
         links, number, following = way.links, 1, iter(at[1:])
         while number <= len(links):
@@ -689,7 +687,7 @@ class Finder:
     def _span(
         self, line: BindingLine, place: OverMatch, one: MatchesOfWay, ends: Ints
     ) -> tuple[Ints, Ints]:
-        """(M,) and (M,) the first and the last frame of the part of each match that a value is about."""
+        """Return the first and last frame of the part of each match that a value covers, both (M,)."""
         told, happen = one.told, one.happen
         if place.start is None or place.end is None:
             return line.frame(told[:, 0]), ends
@@ -735,22 +733,18 @@ class Finder:
     # Values
 
     def _value(self, place: Bound, values: PlanValues) -> Column:
-        """A value over time of some bindings: (B, F)."""
         asked = self._planned(place)
         return values.test(asked) if isinstance(asked, Test) else Column(values.formula(asked))
 
     def _over(self, place: OverMatch, values: PlanValues, stretches: Stretches) -> Any:
-        """(M,) a value over stretches of frames, as Python has it."""
         at = None if place.at is None else self._value(place.at, values)
         return stretches.told(place.word, self._value(place.operand, values), at)
 
     def _ordered(self, names: tuple[str, ...], keys: Keys) -> Keys:
-        """Bindings with the columns in the order of the query's nodes and edges."""
         return keys[:, [names.index(name) for name in (*self._kept, *self._edges)]]
 
 
 def _whole(window: Window | None) -> Window | None:
-    """The whole traces that a window is a part of."""
     if window is None:
         return None
     high = ((window.high - 1) >> BUCKET_BITS) + 1
@@ -758,14 +752,14 @@ def _whole(window: Window | None) -> Window | None:
 
 
 def _chunks(starts: Ints, size: int) -> Iterator[tuple[int, int, slice]]:
-    """Keys in parts of so many, with their rows."""
+    """Yield ranges of at most ``size`` keys, with their rows."""
     for low in range(0, len(starts) - 1, size):
         high = min(low + size, len(starts) - 1)
         yield low, high, slice(int(starts[low]), int(starts[high]))
 
 
 def _worked_out(place: Bound) -> tuple[Bound, ...]:
-    """The values of frames that are needed for what is returned of a match."""
+    """Return the single-frame values behind a returned value of a match."""
     match place:
         case StepTime():
             return ()

@@ -1,4 +1,4 @@
-"""Shortest clips: the fewest consecutive frames that still have a match, or a violation.
+"""Shortest clips: the fewest consecutive frames that still contain a match or a violation.
 
 Each clip that is tried is a trace of its own: what looks back or ahead sees nothing outside of it, and who is
 in none of its frames is not in it. Values of single frames stay as they are: times since the beginning,
@@ -46,7 +46,7 @@ Span = tuple["FrameRef", "FrameRef"]
 
 @dataclass(frozen=True, slots=True)
 class ShortestClip:
-    """Shortest clip of a trace that still has a match, or violates a check.
+    """Shortest clip of a trace that still contains a match, or violates a check.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class ShortestClip:
 
 
 def fewest(frames: int, has: Callable[[int, int], bool], *, grows: bool) -> tuple[int, int] | None:
-    """The shortest range of frames that has something, the earliest of these; ``None``: no range has it.
+    """Return the shortest, then earliest, range of frames that meets a condition, or ``None``.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def shortest_clips(
     parameters: Mapping[str, object],
     clip: str | None = None,
 ) -> Iterator[ShortestClip]:
-    """The shortest clips that have a match of a query, or violate checks: one for each trace (and check).
+    """Yield the shortest clips that match a query or violate checks: one for each trace (and check).
 
     Each clip that is tried is a trace of its own: what looks back or ahead sees nothing outside of it, and
     who is in none of its frames is not in it.
@@ -156,7 +156,7 @@ def shortest_clips(
 
 
 def _span(file: StoreFile, clip: str) -> Span:
-    """The first and the last frame of a clip, by its text."""
+    """Return the first and last frame of a clip given as text."""
     ends = range_of(clip)
     if ends is None:
         raise StoreError(f"{clip}: no clip; expected TRACE@12s..18s or TRACE#120..180")
@@ -171,7 +171,6 @@ def _span(file: StoreFile, clip: str) -> Span:
 
 
 def _of_trace(catalog: Catalog, trace_id: int) -> Window:
-    """The window of a whole trace."""
     ids = [one.trace_id for one in catalog.traces]
     return Window.of([extents(catalog)[ids.index(trace_id)]])
 
@@ -215,7 +214,7 @@ def _matching(
 def _of_one_frame(
     file: StoreFile, matches: TemporalMatches, span: Span | None
 ) -> Iterator[ShortestClip]:
-    """The first frame of each trace, or in a clip, that matches."""
+    """Yield the first matching frame of each trace, or of a clip."""
     low, high = (-1, (1 << 63) - 1) if span is None else (one.frame_id for one in span)
     found: dict[int, FrameRef] = {}
     for one in matches.frames():
@@ -240,7 +239,7 @@ def _looks_ahead(condition: Bound | None) -> bool:
 
 
 def _lasts(check: BoundCheck) -> bool:
-    """Tell whether frames that violate a check still do when others follow: nobody who comes can mend it."""
+    """True if later frames and new entities cannot repair a violation of the check."""
     quantifiers = check.quantifiers
     return check.gaps != "unknown" and not any(
         q.word != "FORALL" or _looks_ahead(q.where) for q in quantifiers
@@ -248,7 +247,7 @@ def _lasts(check: BoundCheck) -> bool:
 
 
 def _stays(query: Query) -> bool:
-    """Tell whether frames with a match of a query still have one when others follow."""
+    """True if later frames cannot remove a match of the query."""
     return not any(
         step.absent
         or (step.hold is not None and step.hold.comparison not in {">", ">="})
@@ -258,7 +257,7 @@ def _stays(query: Query) -> bool:
 
 
 def _cut(trace: TraceReader, span: Span | None) -> TraceReader:
-    """A trace, or the frames of a clip in it."""
+    """Return the frames of a clip in a trace, or the whole trace."""
     if span is None:
         return trace
     first, last = np.searchsorted(trace.frame_ids, [one.frame_id for one in span]).tolist()

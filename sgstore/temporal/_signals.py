@@ -102,7 +102,7 @@ def evaluate_rows(formula: Formula, columns: Mapping[str, Bools], times: Ints, r
 
 @dataclass(frozen=True, slots=True)
 class PropositionTable:
-    """The propositions of a trace.
+    """Truth values of the propositions of a trace, and of formulas over them.
 
     Parameters
     ----------
@@ -115,11 +115,11 @@ class PropositionTable:
     times: Ints
 
     def whole(self, formula: Formula) -> Bools:
-        """(F,): the value at each frame of the whole trace, which has at least one."""
+        """Return the value (F,) of a formula at each frame of a trace with at least one frame."""
         return self.value(formula)[0]
 
     def value(self, formula: Formula) -> Bools:  # noqa: PLR0911 - a case each
-        """(B, F): the value at each frame; (1, F) if it is the same for all bindings."""
+        """Return the value (B, F) of a formula at each frame, or (1, F) if equal for all bindings."""
         match formula:
             case TruthConstant(value=value):
                 return np.full((1, len(self.times)), value)
@@ -153,7 +153,7 @@ class PropositionTable:
                 return true if left == TRUE else true & (hit >= _last(~self.value(left)))
 
     def window(self, bound: Bound, *, forward: bool) -> tuple[Places | None, Places | None]:
-        """The first and the last frame that an operator looks at, from each frame, in its direction.
+        """Return the nearest and farthest frame of an operator's bound, for each frame.
 
         ``None``: this frame; and the last one that there is.
         """
@@ -180,12 +180,12 @@ class PropositionTable:
 
     @property
     def frames(self) -> Places:
-        """(F,) the numbers of the frames."""
+        """Numbers of the frames, shape (F,)."""
         return _frames(len(self.times))
 
     @property
     def _period(self) -> int | None:
-        """The time between two frames, if it is always the same; ns."""
+        """Constant time between frames; ns. ``None`` means a varying time."""
         if len(self.times) < 2:
             return None
         period = int(self.times[1] - self.times[0])
@@ -193,17 +193,14 @@ class PropositionTable:
 
 
 def _sum(times: Ints, by: int) -> Ints:
-    """Later times, where they can be told in 64 bits."""
     return np.minimum(times, np.iinfo(np.int64).max - by) + by
 
 
 def _frames(frames: int) -> Places:
-    """Their numbers, in as few bytes as they need with some room."""
     return np.arange(frames, dtype=np.int32 if frames < 1 << 29 else np.int64)
 
 
 def _next(flags: Bools) -> Places:
-    """(R, F): the first frame from each on where a flag is set; F where there is none."""
     frames = flags.shape[1]
     here = _frames(frames)
     places = np.where(flags, here, here.dtype.type(frames))[:, ::-1]
@@ -211,13 +208,12 @@ def _next(flags: Bools) -> Places:
 
 
 def _last(flags: Bools) -> Places:
-    """(R, F): the last frame up to each where a flag is set; -1 where there is none."""
     here = _frames(flags.shape[1])
     return np.maximum.accumulate(np.where(flags, here, here.dtype.type(-1)), axis=1)
 
 
 def _at(places: Places, frame: Places | None) -> Places:
-    """The places told at other frames; F and -1 where these are out of the trace, behind and before it."""
+    """Return values at other frames. Before the trace, return -1; after it, F."""
     if frame is None:
         return places
     frames = places.shape[1]
@@ -236,7 +232,7 @@ NS: Final = 1e9
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """The frames of a trace.
+    """Times and runs of the frames of a trace.
 
     Attributes
     ----------
@@ -259,19 +255,19 @@ class Clock:
     def of(
         cls, times: Ints, numbers: Ints, period: int, longest: float, tolerance: int = 0
     ) -> Clock:
-        """A clock whose gaps are times of more than ``longest`` (ns), and numbers of frames left out."""
+        """Return a clock with gaps at time steps over ``longest`` (ns) and at skipped frame numbers."""
         gaps = (np.diff(times) > longest) | (np.diff(numbers) != 1)
         runs = np.concatenate(([0], np.cumsum(gaps)))[: len(times)]
         return cls(times, runs, period, tolerance)
 
     @property
     def gap_before(self) -> Bools:
-        """(F,) whether a gap ends at a frame; nothing comes before the first one."""
+        """Mask (F,) of the frames directly after a gap. The first frame is not one of them."""
         return np.concatenate(([False], np.diff(self.runs) != 0))[: len(self.times)]
 
 
 class SignalValues:
-    """Values of the tests of a plan, for some bindings; a subclass says what signals and propositions are.
+    """Values of the tests of a plan for some bindings. Subclasses provide signals and propositions.
 
     Parameters
     ----------
@@ -282,29 +278,29 @@ class SignalValues:
         self.clock = clock
 
     def signal(self, signal: Ask) -> Column:
-        """The values of a signal: (B, F)."""
+        """Return the values (B, F) of a signal."""
         raise NotImplementedError
 
     def condition(self, expression: b.Bound, test: Test) -> Bools:
-        """(B, F) where a condition within a test is true."""
+        """Return a mask (B, F) of the frames in which a condition inside a test is true."""
         raise NotImplementedError
 
     def proposition(self, name: str) -> Bools:
-        """(B, F) where the atom, or the test, of that name is true."""
+        """Return a mask (B, F) of the frames in which an atom or test is true."""
         raise NotImplementedError
 
     def margins(self, course: b.SignalCall, test: Test) -> Floats:
-        """(B, F) the margin by which a condition within a test is true."""
+        """Return the margins (B, F) of a condition inside a test."""
         raise NotImplementedError
 
     def test(self, test: Test) -> Column:
-        """Return the value of a test: (B, F), or of length 1 in an axis in which it is the same everywhere."""
+        """Return the value of a test: (B, F), with length 1 in an axis of equal values."""
         with np.errstate(all="ignore"):
             found = _evaluator(test)(self)
         return Column(np.atleast_2d(found.values), found.known)
 
     def course(self, course: b.SignalCall, test: Test) -> Column:  # noqa: PLR0911 - a case each
-        """The value of a :class:`~sgstore.lang.ir.SignalCall`."""
+        """Return the value of a :class:`~sgstore.lang.ir.SignalCall`."""
         match course.word:
             case "prev":
                 return self._back(self.signal(test.signals[course.operand]), 1)
@@ -325,7 +321,7 @@ class SignalValues:
                 return self._age(seen) if word == "age" else Column(seen)
 
     def _back(self, column: Column, by: int | Ints) -> Column:
-        """The values some frames before, unknown where there are none or a gap lies between."""
+        """Return the values some frames earlier. They are unknown before the trace or across a gap."""
         frames = len(self.clock.times)
         here = np.arange(frames)
         there = here - by if isinstance(by, int) else by
@@ -337,7 +333,7 @@ class SignalValues:
         return Column(values[:, inside], known[:, inside] & told)
 
     def window_starts(self, course: b.SignalCall) -> Ints:
-        """(F,) the first frame of the window of a course at each frame; it does not begin before a gap."""
+        """Return the first frame of the time window at each frame, shape (F,). Windows end at gaps."""
         times, here = self.clock.times, np.arange(len(self.clock.times))
         begun = np.maximum.accumulate(np.where(self.clock.gap_before, here, 0))
         if course.frames:
@@ -359,7 +355,7 @@ class SignalValues:
         return Column(self._turned(now, by, change), known)
 
     def _turned(self, now: Column, by: int | Ints, change: Array) -> Array:
-        """Return the change of an angle, full turns included; the short way where it was not seen."""
+        """Return the change of an angle with full turns. Where values are missing, use the short way."""
         frames = len(self.clock.times)
         there = np.arange(frames) - by if isinstance(by, int) else by
         there = np.clip(there, 0, None)
@@ -370,7 +366,7 @@ class SignalValues:
         return np.where(whole, sums - sums[:, there], wrapped(change))
 
     def _run_length(self, flags: Bools, *, frames: bool) -> Column:
-        """Return the length of the run of a condition up to each frame: frames, or s from its first one."""
+        """Return the duration for which a condition has held, at each frame: in frames, or in s."""
         here = np.arange(flags.shape[1])
         first = flags.copy()
         first[:, 1:] = flags[:, 1:] & (~flags[:, :-1] | self.clock.gap_before[1:])
@@ -394,7 +390,6 @@ class SignalValues:
 
 @lru_cache(maxsize=256)
 def _evaluator(test: Test) -> Columns[SignalValues]:
-    """Return the evaluator of the expression of a test."""
     return column_evaluator(test.expression, partial(_over_time, test=test))
 
 
@@ -421,7 +416,7 @@ def _over_time(part: b.Bound, test: Test) -> Columns[SignalValues] | None:
 
 
 def lasts(expression: b.Bound) -> bool:
-    """Tell whether an expression is about how long something lasts, or is ago, in seconds."""
+    """True if the expression depends on a duration in seconds."""
     parts = b.walk(expression)
     return any(isinstance(p, b.SignalCall) and p.word in _TIMES and not p.frames for p in parts)
 
@@ -430,7 +425,7 @@ _TIMES: Final = frozenset({"run_length", "since_true", "age"})
 
 
 def wrapped(degrees: Any) -> Any:
-    """Degrees from -180 to below 180."""
+    """Return angles in [-180, 180) degrees."""
     return (degrees + 180.0) % 360.0 - 180.0
 
 

@@ -1,4 +1,4 @@
-"""The monitor's queries on one frame, each asked once; the truth of bindings, and their values over time.
+"""Single-frame queries of the monitor, the truth of bindings, and their values over time.
 
 A binding says of each variable which node it is, or ``None``: any node of which nothing is known. What is known
 of a binding that is not held is what is known of the one held that says most of what it says; so a check over a
@@ -61,7 +61,7 @@ T = TypeVar("T")
 
 
 class Lattice:
-    """Order of partial bindings of some variables, from none bound to all.
+    """Order of partial bindings of some variables, from none bound to all bound.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class Lattice:
         self._patterns = [frozenset(pattern) for pattern in patterns]
 
     def placed(self, key: Key, places: tuple[int, ...]) -> Partial:
-        """Return the binding in which some variables have these values."""
+        """Return the binding with these values at some variables."""
         if self.size == 1:
             return key or self.stranger
         told: list[int | None] = [None] * self.size
@@ -85,7 +85,7 @@ class Lattice:
         return tuple(told)
 
     def wider(self, binding: Partial) -> Iterator[Partial]:
-        """Bindings that say the same and no more, those that say most first, itself among them."""
+        """Yield the binding and its generalisations, most specific first."""
         if self.size == 1:
             yield binding
             if binding[0] is not None:
@@ -97,7 +97,7 @@ class Lattice:
                 yield tuple(n if place in pattern else None for place, n in enumerate(binding))
 
     def closed(self, bindings: Iterable[Partial], known: Iterable[Partial] = ()) -> set[Partial]:
-        """Bindings, the one of strangers, and those that say what several of them say.
+        """Return the bindings with the empty binding and all unions of compatible bindings.
 
         Those that are ``known`` are closed already.
         """
@@ -113,14 +113,14 @@ class Lattice:
         return found
 
     def ordered(self, bindings: Iterable[Partial]) -> list[Partial]:
-        """Those first that say less."""
+        """Sort bindings by the number of bound variables, fewest first."""
         if self.size < 2:
             return sorted(bindings, key=lambda one: one != self.stranger)
         return sorted(bindings, key=lambda one: sum(node is not None for node in one))
 
 
 def _both(one: Partial, other: Partial) -> Partial | None:
-    """Return the union of two bindings; ``None`` if they contradict one another."""
+    """Return the union of two bindings. ``None`` means a contradiction."""
     told: list[int | None] = []
     for first, second in zip(one, other, strict=True):
         if first is not None and second is not None and first != second:
@@ -130,7 +130,7 @@ def _both(one: Partial, other: Partial) -> Partial | None:
 
 
 class BindingTable(Generic[T]):
-    """Values by binding; a binding without an entry has that of a wider one.
+    """Values by binding. A binding without an entry inherits from its generalisation.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ class BindingTable(Generic[T]):
         return next(held[wider] for wider in self.lattice.wider(binding) if wider in held)
 
     def keep(self, found: dict[Partial, T], same: Callable[[T, T], bool]) -> None:
-        """Hold what is known now, but for bindings of which the same is known as of wider ones."""
+        """Store new values, without bindings whose value equals that of a generalisation."""
         lattice = self.lattice
         strangers = found[lattice.stranger]
         if lattice.size < 2:
@@ -175,7 +175,7 @@ Key = tuple[int, ...]
 
 
 def answerer(ask: Ask) -> Callable[[FrameView, NodeNames], Mapping[Key, Any]]:
-    """Return a function from a graph to the bindings of a question, each with its value (``None``: unknown).
+    """Return a function from a graph to the bindings of a query, each with its value (``None``: unknown).
 
     Edges of a binding are places in :data:`RELATIONS`.
     """
@@ -212,7 +212,7 @@ def answerer(ask: Ask) -> Callable[[FrameView, NodeNames], Mapping[Key, Any]]:
 
 
 class NodeNames:
-    """The nodes of one graph by what they may be.
+    """Nodes of one graph by kind, with their names.
 
     Parameters
     ----------
@@ -227,7 +227,7 @@ class NodeNames:
         return node in self._view.nodes
 
     def of(self, kinds: b.Kinds) -> frozenset[int]:
-        """Those that are of some kinds."""
+        """Return the nodes of some kinds."""
         if kinds not in self._found:
             view, ego = self._view, self._view.graph.ego
             found = {n for kind in kinds.other for n in view.by_kind.get(kind, ())}
@@ -239,15 +239,15 @@ class NodeNames:
         return self._found[kinds]
 
     def tells(self, node: int, attribute: str) -> Any:
-        """An attribute of a node; ``None``: it is not known."""
+        """Return an attribute of a node. ``None`` means unknown."""
         return self._view.nodes[node].get(attribute)
 
     def records(self, kind: str) -> bool:
-        """Tell whether the trace says of events of a kind that they happen, or do not."""
+        """True if the trace records events of this kind."""
         return kind in self._view.graph.events
 
     def has_lanes(self, what: str) -> bool:
-        """Tell whether the map tells of lanes: ``ways``, ``curvature``, ``slope``."""
+        """True if the map has values for lanes: ``ways``, ``curvature`` or ``slope``."""
         reach = self._view.graph.reach
         return reach is not None and reach.tells(what)
 
@@ -258,7 +258,7 @@ class NodeNames:
 
 @dataclass(slots=True)
 class QueryCache:
-    """All questions about the graphs of one ego, and their answers in the last frame.
+    """All queries on the graphs of one ego, with their results in the last frame.
 
     Attributes
     ----------
@@ -278,11 +278,11 @@ class QueryCache:
     here: dict[b.Kinds, int] = field(default_factory=dict["b.Kinds", int])
 
     def met(self, kinds: b.Kinds) -> Mapping[int, str]:
-        """Return the nodes of some kinds seen so far: node → name; it grows with each frame."""
+        """Return the nodes of some kinds seen so far: node → name. The mapping grows with each frame."""
         return self._met.setdefault(kinds, {})
 
     def add(self, ask: Ask) -> int:
-        """The number of a question; the same for those that ask the same."""
+        """Add a query, and return its number. Equal queries share a number."""
         value = None if ask.value is None else unnumbered_text(ask.value)
         key = _told(ask.query), ask.variables, value, ask.edges
         if key not in self._known:
@@ -291,7 +291,7 @@ class QueryCache:
         return self._known[key]
 
     def add_parts(self, query: b.Query, keys: tuple[str, ...]) -> int:
-        """The number of the question for the rows of a query in several parts.
+        """Add a query for the rows of several pattern parts, and return its number.
 
         The bindings of the named nodes and edges are told, each with what its first row returns.
         """
@@ -313,7 +313,7 @@ class QueryCache:
         return len(self._all) - 1
 
     def ask(self, view: FrameView, people: NodeNames) -> None:
-        """Ask them all of a graph."""
+        """Evaluate all queries on a graph."""
         self.fresh.clear()
         for kinds, known in self._met.items():
             present = people.of(kinds)
@@ -325,7 +325,6 @@ class QueryCache:
 
 
 def _place(row: Binding, name: str) -> Any:
-    """The node, or the place of the relation, that a name is bound to; ``None``: it is absent."""
     if name in row.nodes:
         return row.nodes[name]
     return row.edges[name] and RELATIONS.index(row.edges[name][0])
@@ -355,7 +354,7 @@ Memory = tuple[Any, ...]
 
 
 class StreamClock:
-    """The frames that came so far, as far back as somebody looks.
+    """Recent frame times, as far back as an operator needs them.
 
     Parameters
     ----------
@@ -385,13 +384,13 @@ class StreamClock:
 
     @property
     def period(self) -> int:
-        """The time between two frames; ns. 0 before there are two."""
+        """Median time between frames; ns. It is 0 before the second frame."""
         if self._period is not None:
             return self._period
         return self._sorted[(len(self._sorted) - 1) // 2] if self._sorted else 0
 
     def step(self, time_ns: int) -> None:
-        """The next frame; see :func:`sgstore.temporal._offline.ascending` for one that is not later."""
+        """Add the next frame. A time that does not ascend: see :func:`sgstore.temporal._offline.ascending`."""
         last, told = self.tick, self._last_ns
         self._last_ns = time_ns
         self.jump = last.number >= 0 and time_ns < told
@@ -411,16 +410,16 @@ class StreamClock:
         self.tick = Tick(time_ns, last.number + 1, tolerance_ns(self.period))
 
     def breaks(self, *, bridge: bool) -> bool:
-        """Return whether runs end before the last frame; ``bridge``: gaps end none, but jumps back do."""
+        """True if runs end before the last frame. With ``bridge``, only backward jumps end runs."""
         return self.jump or (self.gap and not bridge)
 
     def told(self, time: int) -> int:
-        """The time of a frame as it was told, by that of its tick; ns."""
+        """Return the original time of a frame from its corrected time; ns."""
         after = bisect_right(self._jumps, (time, NEVER, 0))
         return time - self._jumps[after - 1][1] if after else time
 
     def jump_after(self, time: int) -> int:
-        """The number of the first frame behind the next jump back of the clock; :data:`NEVER`: none so far."""
+        """Return the number of the first frame after the next backward jump, or :data:`NEVER`."""
         after = bisect_right(self._jumps, (time, NEVER, 0))
         return self._jumps[after][2] if after < len(self._jumps) else NEVER
 
@@ -432,7 +431,7 @@ class StreamClock:
 
 
 def _courses(expression: b.Bound) -> Iterator[b.SignalCall]:
-    """The values over time that an expression is made of; those in their conditions are of other tests."""
+    """Yield the time functions in an expression, except those inside their conditions."""
     if isinstance(expression, b.SignalCall):
         yield expression
     elif not b.is_formula(expression):
@@ -441,7 +440,7 @@ def _courses(expression: b.Bound) -> Iterator[b.SignalCall]:
 
 
 class SignalState:
-    """The tests of a plan, frame by frame.
+    """Tests of a plan, evaluated frame by frame.
 
     Parameters
     ----------
@@ -486,12 +485,12 @@ class SignalState:
 
     @property
     def begun(self) -> Memory:
-        """The memory before the first frame."""
+        """Memory before the first frame."""
         pasts = (progression.begun for progression in self.conditions.values())
         return (*(None for _ in self.places), *pasts)
 
     def step(self) -> None:
-        """A frame has come, and the pulse has been told."""
+        """Process the next frame after the clock."""
         tick = self.pulse.tick
         if self.gap:
             self._frames.clear()
@@ -502,23 +501,23 @@ class SignalState:
 
     @property
     def gap(self) -> bool:
-        """Tell whether a gap lies before this frame."""
+        """True if a gap lies before this frame."""
         return self.pulse.breaks(bridge=self._bridge)
 
     @property
     def oldest(self) -> int:
-        """The number of the first frame that is still looked back to."""
+        """Number of the oldest frame that a test can still read."""
         return self._frames[0][1]
 
     def window(self, course: b.SignalCall) -> tuple[int, int]:
-        """Number and time of the oldest frame that the window of a course may have now."""
+        """Return number and time of the oldest frame in the current window of a time function."""
         tick = self.pulse.tick
         if course.frames:
             return max(tick.number - course.by + 1, self._begun), -NEVER
         return self._begun, tick.time - course.by - tick.tolerance
 
     def there(self, course: b.SignalCall) -> int:
-        """The number of the frame that ``delta`` compares this one with; -1: there is none."""
+        """Return the number of the frame that ``delta`` compares with this frame, or -1."""
         tick = self.pulse.tick
         if course.frames:
             number = tick.number - course.by
@@ -536,7 +535,7 @@ class SignalState:
         atom: Callable[[str], Bools],
         signal: Callable[[Ask], Column],
     ) -> tuple[dict[str, Column], list[Memory]]:
-        """The values of all tests in this frame for some bindings, and what these remember from now on.
+        """Return the values of all tests in this frame for some bindings, and their new memories.
 
         Parameters
         ----------
@@ -557,7 +556,7 @@ class SignalState:
 
 
 class _Now(SignalValues):
-    """One frame of some bindings, while it is worked out."""
+    """Evaluation of tests in one frame for some bindings."""
 
     def __init__(
         self,
@@ -582,37 +581,37 @@ class _Now(SignalValues):
         self._rows = len(memories)
 
     def memories(self) -> list[Memory]:
-        """Return the memory of each binding from now on."""
+        """Return the new memory of each binding."""
         columns = [self._new[course] for course in self._all.places]
         columns += [self._kept[condition] for condition in self._all.conditions]
         return list(zip(*columns, strict=True)) if columns else [() for _ in range(self._rows)]
 
     def test(self, test: Test) -> Column:
-        """The value of a test, (B, 1); the memories change once for each."""
+        """Return the value (B, 1) of a test. It is computed once, because it updates the memory."""
         if test.name not in self._tests:
             self._tests[test.name] = super().test(test)
         return self._tests[test.name]
 
     def signal(self, signal: Ask) -> Column:
-        """The values of a signal: (B, 1)."""
+        """Return the values (B, 1) of a signal."""
         return self._signal(signal)
 
     def proposition(self, name: str) -> Bools:
-        """(B, 1) where an atom, or a test, is true."""
+        """Return a mask (B, 1) of the bindings for which an atom or test is true."""
         if name in self._all.plan.tests:
             found = self.test(self._all.plan.tests[name]).true
             return np.broadcast_to(found, (self._rows, 1))
         return self._atom(name)[:, None]
 
     def margins(self, course: b.SignalCall, test: Test) -> Floats:
-        """(B, 1) the margin by which a condition on this frame is true."""
+        """Return the margins (B, 1) of a condition on this frame."""
         formula, tolerance = test.quantities[course.operand], self._tick.tolerance
         columns = margin_columns(self._all.plan, formula, self.test, self.proposition, tolerance)
         value = MarginTable(columns, np.zeros(1, np.int64)).value(formula)
         return np.broadcast_to(value, (self._rows, 1))
 
     def condition(self, expression: b.Bound, test: Test) -> Bools:
-        """(B, 1) where a condition within a test is true."""
+        """Return a mask (B, 1) of the bindings for which a condition inside a test is true."""
         if expression not in self._flags:
             self._flags[expression] = self._condition(expression)[:, None]
         return self._flags[expression]
@@ -634,7 +633,7 @@ class _Now(SignalValues):
         return np.array([value for value, _ in found], np.bool_)
 
     def course(self, course: b.SignalCall, test: Test) -> Column:
-        """The value of a course."""
+        """Return the value of a time function."""
         if course not in self._courses:
             self._courses[course] = self._course(course, test)
         return self._courses[course]
@@ -740,7 +739,7 @@ _Trail = tuple[_Point, tuple[_Point, ...]]
 
 
 def _moved(old: _Trail | None, value: float | None, here: int, oldest: int) -> _Trail | None:
-    """A trail with the value of one more frame."""
+    """Return an angle history extended by the value of one frame."""
     points = old[1] if old is not None else ()
     if points and points[0][0] < oldest:
         points = tuple(point for point in points if point[0] >= oldest)
@@ -756,7 +755,7 @@ def _moved(old: _Trail | None, value: float | None, here: int, oldest: int) -> _
 
 
 def column_of(values: list[Any]) -> Column:
-    """A value of each binding in one frame: (B, 1); ``None`` is not known."""
+    """Return a column (B, 1) with one value per binding. ``None`` means unknown."""
     known = [value is not None for value in values]
     like = next((value for value in values if value is not None), 0.0)
     empty = "" if isinstance(like, str) else type(like)()
@@ -768,7 +767,7 @@ def column_of(values: list[Any]) -> Column:
 
 
 class Valuation:
-    """The atoms and tests of a plan, for the bindings of which something is known.
+    """Truth values of the atoms and tests of a plan, for the known bindings.
 
     Parameters
     ----------
@@ -824,7 +823,7 @@ class Valuation:
         *,
         closed: bool = False,
     ) -> tuple[dict[Partial, int], Mapping[Partial, Memory]]:
-        """A frame has come, and the questions were asked of it.
+        """Process the next frame after its queries.
 
         Parameters
         ----------
@@ -858,7 +857,7 @@ class Valuation:
         return letters, self._measure(list(rows), letters, memory)
 
     def _told(self) -> dict[Partial, int]:
-        """The atoms that are true of bindings which say no more than the atom asks."""
+        """Return the true atoms of each binding that an atom directly binds."""
         answers, placed = self._questions.answers, self.lattice.placed
         told: dict[Partial, int] = {}
         for bit, number, places in self._atoms:
@@ -880,7 +879,7 @@ class Valuation:
                     yield self.lattice.placed(key, places)
 
     def _state(self, name: str, rows: list[Partial], letters: Mapping[Partial, int]) -> Column:
-        """Where a value is there, 0 if it is known and 1 if it is not."""
+        """Return 0 where a value is known, and 1 where it is unknown. An absent value is masked."""
         of, doubt = self._states[name]
         if of is None:
             return column_of([0.0] * len(rows))
@@ -901,7 +900,7 @@ class Valuation:
         letters: dict[Partial, int],
         memory: Callable[[Partial], Memory | None],
     ) -> dict[Partial, Memory]:
-        """Tell letters the tests that are true; what bindings remember from now on."""
+        """Add the true tests to the letters of the bindings, and return the new memories."""
         self._courses.step()
         columns: dict[str, Bools] = {}
 

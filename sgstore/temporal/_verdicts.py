@@ -1,4 +1,4 @@
-"""Verdicts: values of formulas, when they are decided, and at every prefix.
+"""Verdicts of formulas: their values, the frame that decides them, and their value at every prefix.
 
 At a frame, a formula that looks ahead has a *course*: what it is if the trace ends there, and at which later
 ends it becomes something else. Logic joins courses; an *until* whose sides can only become true is true from
@@ -49,12 +49,12 @@ if TYPE_CHECKING:
 
 
 class TooDeep(Exception):  # noqa: N818 - no error: who asks goes another way
-    """A formula has no courses that are worked out at once."""
+    """A formula is too deep for evaluation as columns. The caller uses another method."""
 
 
 @dataclass(frozen=True, slots=True)
 class PrefixVerdicts:
-    """Values of a formula at each frame for each end of the trace.
+    """Values of a formula at each frame, for each possible end of the trace.
 
     Attributes
     ----------
@@ -68,12 +68,12 @@ class PrefixVerdicts:
     switches: Places
 
     def at(self, ends: Places) -> Bools:
-        """(F,) what it is at each frame if the trace ends somewhere."""
+        """Return the values (F,) of the formula at each frame, for one end per frame."""
         return self.start ^ (np.sum(self.switches <= ends, axis=0) % 2 == 1)
 
     @property
     def rising(self) -> Places:
-        """(F,) the first end from which on it is true; F: none.
+        """Return the first end from which the formula stays true, shape (F,). F means never.
 
         Raises
         ------
@@ -88,7 +88,7 @@ class PrefixVerdicts:
 
 
 def prefix_values(formula: Formula, table: PropositionTable) -> Bools:
-    """The value at the first frame if the trace ended at each frame: (F,).
+    """Return the value at the first frame for each possible end of the trace, shape (F,).
 
     Raises
     ------
@@ -99,7 +99,7 @@ def prefix_values(formula: Formula, table: PropositionTable) -> Bools:
 
 
 def _at_first(formula: Formula, at: int, table: PropositionTable) -> Bools:  # noqa: PLR0911
-    """(F,) the value at one frame for each end from there on."""
+    """Return the value at one frame for each end from there on, shape (F,)."""
     frames = len(table.times)
     if not looks_ahead(formula):
         return np.full(frames, table.whole(formula)[at])
@@ -123,7 +123,7 @@ def _at_first(formula: Formula, at: int, table: PropositionTable) -> Bools:  # n
 
 
 def _shown(formula: Until, at: int, table: PropositionTable) -> Bools:
-    """An *until* at one frame: whether up to each end some frame shows its right side."""
+    """Return, for each end, True if the right side of an *until* has held by then."""
     near, far = table.window(formula.bound, forward=True)
     frames = len(table.times)
     first = at if near is None else int(near[at])
@@ -181,7 +181,7 @@ def _course(formula: Formula, table: PropositionTable) -> PrefixVerdicts:
 
 
 def _joined(courses: list[PrefixVerdicts], join: Any) -> PrefixVerdicts:
-    """Courses joined by logic, without switches that change nothing."""
+    """Combine prefix verdicts by a logical operation, and drop switches without effect."""
     frames = len(courses[0].start)
     start = join([course.start for course in courses])
     switches = np.sort(np.concatenate([course.switches for course in courses]), axis=0)
@@ -213,7 +213,7 @@ Decided = tuple["Places", "Places"]
 def known(  # noqa: PLR0911 - a case each
     formula: Formula, table: PropositionTable, *, ended: int | None = None
 ) -> Decided:
-    """Return the frame at which the value of a formula at each frame is certain.
+    """Return, for each frame, the frame that makes the value of a formula certain.
 
     Parameters
     ----------
@@ -257,7 +257,7 @@ def known(  # noqa: PLR0911 - a case each
 
 
 def endless(formula: Formula) -> bool:
-    """Tell whether a formula waits for something as long as the trace goes on."""
+    """True if the formula has no time limit and stays open until the trace ends."""
     return isinstance(formula, Until) and formula.bound.high is None
 
 
@@ -278,7 +278,7 @@ def _known_until(formula: Until, table: PropositionTable, *, ended: int | None) 
 
 
 def _is_over(bound: Bound, table: PropositionTable, widened: int) -> Bools:
-    """(F,) whether the bound of an operator that looks ahead is over with the last frame."""
+    """Return a mask (F,) of the frames whose forward bound ends within the trace."""
     if bound.high is None:
         return np.ones(len(table.times), np.bool_)
     if bound.frames:
@@ -287,7 +287,7 @@ def _is_over(bound: Bound, table: PropositionTable, widened: int) -> Bools:
 
 
 def _known_since(formula: Since, table: PropositionTable, *, ended: int | None) -> Decided:
-    """The same backwards; at the first frame everything before is known."""
+    """Return, for each frame, the frame that makes a *since* certain. The past of the first frame is known."""
     here, frames = table.frames, len(table.times)
     left = (None, None)
     if formula.left != TRUE:
@@ -307,7 +307,7 @@ def _known_since(formula: Since, table: PropositionTable, *, ended: int | None) 
 
 
 def met(right: Places, left: Places | None, bound: Bound, table: PropositionTable) -> Places:
-    """From when on an *until* is known to be true at each frame, if nothing that is true becomes false.
+    """Return, for each frame, the first frame that makes an *until* certainly true, for monotonic operands.
 
     Parameters
     ----------
@@ -324,7 +324,7 @@ def met(right: Places, left: Places | None, bound: Bound, table: PropositionTabl
 
 
 def _asked(bound: Bound, table: PropositionTable) -> tuple[Places, Places | None]:
-    """The first frame that an *until* asks its right side of, and that behind the last one, if there is one."""
+    """Return the first frame of the bound of an *until*, and the frame after the last one, if any."""
     here, frames = table.frames, len(table.times)
     near, far = table.window(bound, forward=True)
     start = here if near is None else np.minimum(near, frames)
@@ -340,7 +340,7 @@ def _chained(
     *,
     least: bool,
 ) -> Places:
-    """The chain max(right, min(left, …)) over places from ``start`` to before ``end``, ``last`` behind them.
+    """Return max(right, min(left, …)) over frames from ``start`` to before ``end``, then ``last``.
 
     Parameters
     ----------
@@ -378,7 +378,7 @@ def _chained(
 
 
 def _most(values: Places, start: Places, end: Places | None) -> Places:
-    """The greatest value from ``start`` to before ``end``; the least number there is, where that is nothing."""
+    """Return the maximum from ``start`` to before ``end``. An empty range gives the smallest integer."""
     nothing = np.iinfo(values.dtype).min
     if end is None:
         onward = np.append(np.maximum.accumulate(values[::-1])[::-1], nothing)
@@ -416,7 +416,7 @@ Violation = tuple[int, int, bool]
 
 
 class Settled:
-    """A formula with its columns in one trace.
+    """Formula with its proposition columns in one trace.
 
     Parameters
     ----------
@@ -437,7 +437,7 @@ class Settled:
 
     @cached_property
     def value(self) -> Bools:
-        """(F,) where the formula is true."""
+        """Mask (F,) of the frames in which the formula is true."""
         return self._table.whole(self.formula)
 
     @cached_property
@@ -445,17 +445,17 @@ class Settled:
         return known(self.formula, self._table)
 
     def trap(self, start: int) -> int | None:
-        """The frame at which it is certain that the formula is false at ``start``; ``None``: at none."""
+        """Return the frame that makes the formula certainly false at ``start``, or ``None``."""
         trap = int(self._known[1][start])
         return trap if trap < self._frames else None
 
     @cached_property
     def _missed(self) -> Places:
-        """(F,) the frame at which a formula is false as no frame follows, but for bounds that are not over."""
+        """Frames (F,) at which the formula becomes false if the trace ends, except for open bounds."""
         return known(self.formula, self._table, ended=self._tolerance)[1]
 
     def due(self, start: int, end: str) -> bool:
-        """Tell whether a formula that is false at ``start`` is still due at the end of the trace.
+        """True if a formula that is false at ``start`` is still open at the end of the trace.
 
         Parameters
         ----------
@@ -468,7 +468,7 @@ class Settled:
         return end == "bounded" and int(self._missed[start]) >= self._frames
 
     def statuses(self) -> NDArray[np.int8]:
-        """(F,) what is known, as each frame is read, of the formula at the first: places in :data:`STATUS`."""
+        """Return the status (F,) of the formula after each frame: indices in :data:`STATUS`."""
         try:
             ended = prefix_values(self.formula, self._table)
         except TooDeep:
@@ -479,7 +479,7 @@ class Settled:
         return told
 
     def _stepped(self) -> Bools:
-        """The value at the first frame if the trace ended at each frame, one after the other."""
+        """Return the value at the first frame for each possible end of the trace, computed step by step."""
         progression = Progression(self.formula)
         names, plain = progression.names, progression.untimed and not progression.past
         end = min(int(self._known[0][0]), int(self._known[1][0]), self._frames - 1) + 1
@@ -505,7 +505,7 @@ class Settled:
         return ended
 
     def violations(self, reset: Bools | None, *, weak: bool = False) -> list[Violation]:
-        """Return the violations of the formula, asked from the first frame on.
+        """Return the violations of the formula, evaluated from the first frame on.
 
         Parameters
         ----------
@@ -517,7 +517,7 @@ class Settled:
         return self.judged(reset, "weak" if weak else "strong")[0]
 
     def judged(self, reset: Bools | None, end: str) -> tuple[list[Violation], bool]:
-        """Return the violations of the formula, asked from the first frame on; and whether it is still due.
+        """Return the violations of the formula, and True if it is still open at the end.
 
         Parameters
         ----------
@@ -546,7 +546,7 @@ class Settled:
 def within_bounds(
     formula: Formula, columns: Mapping[str, Bools], times: Ints, gaps: Bools, rows: int
 ) -> tuple[Bools, Bools]:
-    """The value of a formula at the first frame, at least and at most, if nothing is known of gaps.
+    """Return the lower and upper value of a formula at the first frame, with any content of the gaps.
 
     In each gap one frame more is thought, of which every proposition may be true or false. What the formula
     asks to be true is taken to be false for the one, and true for the other.
@@ -583,7 +583,6 @@ def within_bounds(
 
 
 def _taken(formula: Formula, *, upper: bool) -> Formula:
-    """A formula whose propositions are those that make it true most easily, or least."""
     if isinstance(formula, Proposition):
         return Proposition(formula.name + ("+" if upper else "-"))
     inner = upper != isinstance(formula, Not)
@@ -591,7 +590,7 @@ def _taken(formula: Formula, *, upper: bool) -> Formula:
 
 
 def always_true(formula: Formula) -> Formula | None:
-    """Return the operand of an ``ALWAYS`` to the end of the trace; ``None`` if a formula has another form."""
+    """Return the operand of an unbounded ``ALWAYS``. ``None`` means another form of formula."""
     match formula:
         case Not(operand=Until(left=left, right=right, bound=bound)) if (
             left == TRUE and bound == WHOLE
@@ -602,5 +601,5 @@ def always_true(formula: Formula) -> Formula | None:
 
 
 def bounded(formula: Formula) -> bool:
-    """Tell whether a formula depends on later frames only up to some time."""
+    """True if the formula depends on later frames only within a limited time."""
     return all(part.bound.high is not None for part in walk(formula) if isinstance(part, Until))

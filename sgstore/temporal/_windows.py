@@ -1,4 +1,4 @@
-"""Numbers over stretches of frames: the least, the greatest, the sum and the average.
+"""Aggregates over frame intervals: minimum, maximum, sum and mean.
 
 Over columns a stretch is told by its first frame and by the one behind its last, for each frame, and is worked
 out for all frames at once, in O(n log w) for the longest stretch w. A stream keeps the values that its window
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 def over_columns(word: str, column: Column, first: Places) -> Column:
-    """A function of the values known in the window that ends at each frame.
+    """Return an aggregate of the known values in the window that ends at each frame.
 
     Parameters
     ----------
@@ -64,7 +64,9 @@ def over_columns(word: str, column: Column, first: Places) -> Column:
 
 
 def greatest(values: Floats, first: Places, end: Places) -> Floats:
-    """(B, F) the greatest of the values from ``first`` to before ``end``; ``-inf`` of none.
+    """Return the maximum of the values from ``first`` to before ``end``, shape (B, F).
+
+    An empty range gives ``-inf``.
 
     Parameters
     ----------
@@ -94,7 +96,7 @@ def greatest(values: Floats, first: Places, end: Places) -> Floats:
 
 
 def sums(values: Floats, first: Places, end: Places) -> Floats:
-    """(B, F) the sums of the values from ``first`` to before ``end``, rounded once.
+    """Return the correctly rounded sums of the values from ``first`` to before ``end``, shape (B, F).
 
     Parameters
     ----------
@@ -116,21 +118,19 @@ def sums(values: Floats, first: Places, end: Places) -> Floats:
 
 
 def _summed(values: Floats) -> tuple[Floats, Floats]:
-    """(B, N + 1) the sums of the first values, as they are rounded; (B, N) what each addition lost."""
     total = np.zeros((len(values), values.shape[1] + 1))
     np.cumsum(values, axis=1, out=total[:, 1:])
     return total, _lost(total[:, :-1], values, total[:, 1:])
 
 
 def _difference(total: Floats, first: Places, end: Places) -> tuple[Floats, Floats]:
-    """The difference of sums, rounded, and what that lost."""
     one, other = total[:, end], -total[:, first]
     found = one + other
     return found, _lost(one, other, found)
 
 
 def _lost(one: Floats, other: Floats, total: Floats) -> Floats:
-    """Exact error of a rounded sum of two (Knuth's TwoSum)."""
+    """Return the exact rounding error of a sum of two numbers (Knuth's TwoSum)."""
     part = total - one
     return (one - (total - part)) + (other - part)
 
@@ -156,7 +156,7 @@ _UNIT: Final = 1074
 def next_window(
     word: str, window: Window | None, value: float | None, here: Tick, oldest: tuple[int, int]
 ) -> Window | None:
-    """A window with the value of one more frame, and without what it has left behind.
+    """Add the value of one frame to a window, and drop values outside it.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def next_window(
 
 
 def window_value(word: str, window: Window | None) -> float | None:
-    """The number that a window makes; ``None``: no value in it is known."""
+    """Return the aggregate of a window. ``None`` means that it has no known value."""
     if window is None:
         return None
     points, total = window
@@ -204,13 +204,13 @@ def window_value(word: str, window: Window | None) -> float | None:
 
 
 def exact(value: float) -> int:
-    """A number in units of the smallest one."""
+    """Return a float as an exact multiple of the smallest positive float."""
     part, whole = float(value).as_integer_ratio()
     return part << (_UNIT - whole.bit_length() + 1)
 
 
 def rounded(total: int) -> float:
-    """A number that is told in units of the smallest one."""
+    """Convert a multiple of the smallest positive float back to a float."""
     try:
         return total / (1 << _UNIT)
     except OverflowError:
