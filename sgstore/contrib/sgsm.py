@@ -1,13 +1,13 @@
-"""Properties of SGSM, written in its scene graph language (SGL), as text of the query language.
+"""Translator from SGSM properties, written in its scene graph language (SGL), to the query language.
 
-What is read is Python as SGSM's users write it, nested calls or nested ``partial``; it is parsed, never run::
+The input is Python code for SGSM, with nested calls or nested ``partial``. It is parsed, but never run::
 
     lanes = partial(P.relSet, "Ego", "isIn")
     in_opposing_lane = P.gt(P.size(P.intersection(lanes, P.relSet(lanes, "opposes"))), 0)
     Property("Phi1", "G(~in_opposing_lane)", [("in_opposing_lane", in_opposing_lane)])
 
-Sets of nodes become patterns, truth values become predicates without parameters, properties become ``CHECK``.
-In SGL different sets may hold the same node, so the result says ``USING NODES any``.
+Sets of nodes become patterns, truth values become predicates without parameters, and properties become
+``CHECK``. In SGL different sets may contain the same node, so the result has ``USING NODES any``.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ if TYPE_CHECKING:
 
 
 MAX_TEXT: Final = 1 << 20
-"""Longest text that is translated; characters."""
+"""Longest text accepted for translation; characters."""
 
 MAX_NAMES: Final = 100
-"""Longest chain of names that stand for one another."""
+"""Longest chain of names that refer to other names."""
 
 MAX_CALLS: Final = 100_000
-"""Most calls that are translated: a name stands for all that it means, each time."""
+"""Largest number of translated calls. Each use of a name counts all calls of its definition."""
 
 MAX_TIMES: Final = 10_000
-"""Most frames that ``$[N][…]`` may count."""
+"""Largest ``N`` of ``$[N][…]``; frames."""
 
 _ATTRIBUTES: Final = {
     "carla_speed": "{0}.speed",
     "speed": "{0}.speed",
-    # CARLA steers to the right with positive numbers, sgstore to the left.
+    # Positive steering is to the right in CARLA, and to the left in sgstore.
     "ego_control_carla_steer": "-{0}.steer",
     "ego_control_carla_throttle": "{0}.throttle",
     "ego_control_carla_brake": "{0}.brake",
@@ -65,7 +65,7 @@ _TAKES: Final[Mapping[str, tuple[int, int]]] = {
     "filterByAttr": (3, 3),
     **dict.fromkeys(("intersection", "union", "difference", "symmetric_difference"), (2, 2)),
 }
-"""How many arguments each function of SGL takes: at least, at most."""
+"""Smallest and largest number of arguments of each SGL function."""
 
 MAX_NUMBER: Final = 1e300
 """Largest number of the query language."""
@@ -81,7 +81,7 @@ _SIGNS: Final[dict[type[ast.cmpop], str]] = {
 
 
 def translated(text: str) -> str:
-    """The same properties in the query language.
+    """Translate SGSM properties to the query language.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def translated(text: str) -> str:
     Raises
     ------
     QueryError
-        It is not Python, or holds something that SGL does not have; it says where.
+        Invalid Python, or a part that SGL does not have. The error has the place.
     """
     if len(text) > MAX_TEXT:
         raise QueryError(f"the text has {len(text)} characters; {MAX_TEXT} are allowed")
@@ -120,7 +120,7 @@ def translated(text: str) -> str:
 
 
 def _check(found: str) -> None:
-    """Refuse what is no sentence of the query language: names that it cannot have, too much in one another."""
+    """Reject a translation that is not valid in the query language."""
     if not found.strip():
         return
     try:
@@ -131,7 +131,7 @@ def _check(found: str) -> None:
 
 
 def _place(text: str, error: SyntaxError) -> TextSpan:
-    """Return the place where Python finds a mistake."""
+    """Return the position of a Python syntax error in the text."""
     before = text.split("\n")[: (error.lineno or 1) - 1]
     start = sum(len(line) + 1 for line in before) + max((error.offset or 1) - 1, 0)
     return TextSpan(min(start, len(text)), min(start, len(text)) + 1)
@@ -139,7 +139,7 @@ def _place(text: str, error: SyntaxError) -> TextSpan:
 
 @dataclass
 class _Found:
-    """A set of nodes as a pattern in which ``node`` stands for its members."""
+    """Set of nodes as a pattern. ``node`` is the variable of its members."""
 
     node: str
     label: str = ""
@@ -218,7 +218,7 @@ class _Translation:
     # Truth values and numbers
 
     def truth(self, value: ast.expr) -> str:
-        """A truth value as a condition."""
+        """Translate a truth value to a condition."""
         word, arguments = self._call(value)
         if word in _COMPARISONS:
             return self._comparison(_COMPARISONS[word], *arguments)
@@ -247,7 +247,7 @@ class _Translation:
         word, arguments = self._call(value)
         if word != "size":
             raise self._refused(f"expected a number or size(…), found {word}", value)
-        # Members are counted, not the ways in which the pattern finds them.
+        # Members are counted, not the matches of the pattern.
         found = self._set(arguments[0])
         if not found.paths:
             return f"COUNT {{{found.text()}}}"
@@ -255,7 +255,7 @@ class _Translation:
         return f"COUNT {{({member}) WHERE {self._member(arguments[0], member)}}}"
 
     def _written(self, value: ast.expr, at: ast.expr) -> str:
-        """A number as it is written."""
+        """Return a number as text of the query language."""
         number = value.value if isinstance(value, ast.Constant) else None
         if isinstance(number, bool) or not isinstance(number, int | float):
             raise self._refused("expected a number", at)
@@ -266,7 +266,7 @@ class _Translation:
     # Sets of nodes
 
     def _set(self, value: ast.expr, node: str = "") -> _Found:
-        """A set of nodes as a pattern; ``node`` is the name of the variable for its members."""
+        """Translate a set of nodes to a pattern. ``node`` is the variable name for its members."""
         node = node or self._name()
         value = self._resolved(value)
         if isinstance(value, ast.Constant) and value.value in {"Ego", "G"}:
@@ -328,7 +328,7 @@ class _Translation:
         return f"{_ATTRIBUTES[name].format(node)} {sign} {self._number(compared.comparators[0])}"
 
     def _resembling(self, node: str, name: str, test: ast.Constant) -> str:
-        """Return the values that SGL finds by searching a text for a regular expression."""
+        """Translate a regular expression in SGL to a condition on the matching values."""
         try:
             wanted = regex(str(test.value))
         except re.error as error:
@@ -338,7 +338,7 @@ class _Translation:
             kinds = [kind for kind in KINDS if any(wanted.search(word) for word in words[kind])]
             return self._among(f"{node}.kind", kinds, test)
         if name == "light_state":
-            # CARLA has no red with yellow.
+            # CARLA has no combined red and yellow state.
             plain = [state for state in LIGHT_STATES if "_" not in state]
             found = [state for state in plain if wanted.search(state.capitalize())]
             return self._among(f"{node}.light_state", found, test)
@@ -377,7 +377,7 @@ class _Translation:
         )
 
     def _member(self, of: ast.expr, node: str) -> str:
-        """That a node is in a set."""
+        """Return the condition that a node is in a set."""
         found = self._set(of, node)
         if found.paths:
             return f"EXISTS {{{found.text()}}}"
@@ -391,7 +391,7 @@ class _Translation:
         return f"n{self._numbers}"
 
     def _resolved(self, value: ast.expr) -> ast.expr:
-        """Return the expression that a name stands for."""
+        """Return the expression that a name is assigned to."""
         for _ in range(MAX_NAMES):
             if not isinstance(value, ast.Name) or value.id not in self._names:
                 return value
@@ -399,7 +399,7 @@ class _Translation:
         raise self._refused("a name is defined by itself", value)
 
     def _call(self, value: ast.expr) -> tuple[str, list[ast.expr]]:
-        """Function and arguments of a call, or of a ``partial``."""
+        """Return the function name and the arguments of a call or a ``partial``."""
         value = self._resolved(value)
         if not isinstance(value, ast.Call):
             raise self._refused("expected a call", value)
@@ -430,22 +430,22 @@ class _Translation:
         return QueryError(reason, text=self._text, span=TextSpan(start, max(end, start + 1)))
 
     def _offset(self, line: int, column: int) -> int:
-        """Return the offset in the text of a place of Python's: a line and a byte in it."""
-        lines = _LINE.findall(self._text)  # by Python's ends of lines alone
+        """Convert a position in Python source, line and byte, to an offset in the text."""
+        lines = _LINE.findall(self._text)  # only line ends that Python accepts
         text = lines[line - 1] if line <= len(lines) else ""
         inside = text.encode(errors="replace")[:column].decode(errors="replace")
         return min(sum(map(len, lines[: line - 1])) + len(inside), len(self._text))
 
 
 _OTHER_NAMES: Final = {"off_road": ("Off Road",), "person": ("walker", "pedestrian")}
-"""What CARLASGG calls kinds."""
+"""Names of kinds in CARLASGG."""
 
 
 _LINE: Final = re.compile(r"[^\r\n]*(?:\r\n|\r|\n)|[^\r\n]+")
 
 
 def _function(value: ast.expr) -> str:
-    """Return the name of the called function, without its module; empty if it is no call."""
+    """Return the name of the called function without its module. It is empty for other expressions."""
     return _last_name(value.func) if isinstance(value, ast.Call) else ""
 
 
@@ -475,7 +475,7 @@ _WORDS: Final = {"->": "IMPLIES", "|": "OR", "&": "AND", "U": "UNTIL", "R": "REL
 
 
 class _Ltl:
-    """A formula in the words of ``ltlf2dfa``, with SGSM's ``$[N][…]`` for N frames in a row at some time."""
+    """Translator of an LTL formula in the syntax of ``ltlf2dfa``. SGSM's ``$[N][…]`` means N frames in a row."""
 
     def __init__(self, text: str, defined: Mapping[str, str]) -> None:
         self._formula = text
@@ -544,7 +544,7 @@ class _Ltl:
         return f"({inner})"
 
     def _in_a_row(self, times: int, inner: str) -> str:
-        """N frames in a row: all of the next N - 1 frames, which must be there, and this one."""
+        """Return the condition that a formula holds in N consecutive frames at some time."""
         if not 0 < times <= MAX_TIMES:
             raise self._refused(f"expected 1 to {MAX_TIMES} frames")
         last = times - 1

@@ -1,10 +1,10 @@
 """SQL of the second phase: conditions and values of single frames.
 
-Numbers of pairs and conditions on values of frames: statements around the join that brings the values.
+Statements around the join of the frame values compute pair numbers and test conditions.
 
-Each number is computed in terms of others, in layers, one statement within the other, so that each part has a
-name and is computed once; a condition stands in the first layer that has all its parts. Of ``gap``,
-``ttc`` and ``closing_time``, which are dear, a cheap lower bound is compared before.
+Pair numbers are computed in layers of nested statements, so that each part has a name and is computed once. A
+condition is tested in the first layer that has all its parts. For the expensive ``gap``, ``ttc`` and
+``closing_time``, a cheap lower bound is tested first.
 """
 
 from __future__ import annotations
@@ -87,11 +87,11 @@ if TYPE_CHECKING:
 
 
 Part = tuple[str, str, str]
-"""A number of a pair: its name, and the nodes."""
+"""Pair number: its name and the two nodes."""
 
 
 def _pairs(found: Iterable[Leaf]) -> list[PairNumber]:
-    """The numbers of pairs among values that are computed in layers."""
+    """Return the pair numbers that are computed in layers."""
     return [
         leaf for leaf in found if isinstance(leaf, PairNumber) and leaf.function not in LOOKED_UP
     ]
@@ -99,25 +99,25 @@ def _pairs(found: Iterable[Leaf]) -> list[PairNumber]:
 
 @dataclass(slots=True)
 class Join:
-    """The join of the second phase in the making.
+    """Join of the second phase during its construction.
 
     Attributes
     ----------
     select : Select
     frame : str
-        The column of the frame; empty as long as there is none.
+        Column of the frame id; empty until a table has it.
     trace : str
-        The id of the trace; empty: that of the frame's.
+        SQL of the trace id; empty means derived from the frame id.
     nodes, edges : dict of str to str
-        Node → the column of its id, edge → the column of its relation.
+        Column of the id by node, column of the relation by edge.
     at : dict of str to Aliases
-        Tables of a node's values that are joined.
+        Joined tables of each node.
     texts : dict of Leaf to str
-        Values that are there, as they are computed.
+        SQL of the available values.
     lanes : set of str
-        Aliases of the rows that are joined for attributes of edges.
+        Aliases of the tables joined for edge attributes.
     world : bool
-        Whether what was recorded is asked of all that is known.
+        True if recorded measures cover all data of scope ``world``.
     """
 
     select: Select = field(default_factory=Select)
@@ -133,24 +133,24 @@ class Join:
 
 @dataclass(slots=True)
 class Layers:
-    """The statements around a join that compute numbers of pairs and test conditions.
+    """Nested statements around a join that compute pair numbers and test conditions.
 
-    What no cheap condition needs is computed after these have been tested.
+    Numbers that no cheap condition needs are computed after the tests of the cheap conditions.
 
     Attributes
     ----------
     join : Join
     needed : list of Leaf
-        Values that conditions or results are made of.
+        Values needed by conditions or results.
     conditions : list of Bound
     without : frozenset of str
-        Marks of pairs that no pair of these traces needs (:data:`sgstore.pair_numbers.MARKS`).
+        Marks that no pair of these traces needs (:data:`sgstore.pair_numbers.MARKS`).
     users : frozenset of str
         Nodes that are road users.
     early : set of Part
-        What the conditions are made of that no dear number is in.
+        Parts of the conditions without expensive numbers.
     tested : int
-        The layer after which these are tested.
+        Layer after which these conditions are tested.
     """
 
     join: Join
@@ -174,7 +174,7 @@ class Layers:
         self.tested = max((stage_of(name, self.without) for name, _, _ in self.early), default=0)
 
     def stage(self, name: str, a: str, b: str) -> int:
-        """The layer in which a number of a pair is computed; 0 for a raw column."""
+        """Return the layer in which a pair number is computed, or 0 for a raw column."""
         if not stage_of(name):
             return 0
         part = name, a, b
@@ -184,12 +184,12 @@ class Layers:
         return self._stages[part]
 
     def stage_of_test(self, condition: Bound) -> int:
-        """The layer after which a condition can be tested."""
+        """Return the layer after which a condition can be tested."""
         pairs = _pairs(leaves(condition))
         return max((self.stage(pair.function, pair.a, pair.b) for pair in pairs), default=0)
 
     def text(self, values: BoundValues, keys: list[str], wanted: list[Leaf]) -> str:
-        """The whole: frame, keys and the values that are wanted."""
+        """Return the complete SQL, with frame, keys and wanted values."""
         later = list(dict.fromkeys(of_later(self.needed)))
         if not later:
             return self._without_later(values, keys, wanted)
@@ -212,7 +212,7 @@ class Layers:
         return final.text()
 
     def _without_later(self, values: BoundValues, keys: list[str], wanted: list[Leaf]) -> str:
-        """The same without conditions on what was recorded later."""
+        """Return the SQL without conditions on measures from later frames."""
         pairs = _pairs(self.needed)
         last = max((self.stage(pair.function, pair.a, pair.b) for pair in pairs), default=0)
         innermost = self.join.select
@@ -261,7 +261,7 @@ class Layers:
         ]
 
     def _raw(self, pairs: list[PairNumber]) -> dict[str, str]:
-        """The raw columns that numbers of pairs are made of."""
+        """Return the raw columns that pair numbers need."""
         columns: dict[str, str] = {}
         for pair in pairs:
             for name in sorted(needed_for(pair.function, self.without)):
@@ -274,13 +274,13 @@ class Layers:
 
 
 def named(text: str, name: str) -> str:
-    """A column under its name, which need not be said if it is called so anyway."""
+    """Return a column with its name. ``AS`` is omitted if the column already has that name."""
     return text if text == name or text.endswith(f".{name}") else f"{text} AS {name}"
 
 
-# Bound patterns → SQL, second phase: conditions and results that need values of single frames ----
-# The frames that the first phase leaves are joined with ``state`` (and the tables of constants) for each node
-# whose values are asked for; numbers of pairs are computed around that join (:mod:`sgstore.lang._sql_frames`).
+# SQL of the second phase: conditions and results that need values of single frames ----
+# The frames from the first phase are joined with ``state`` (and the tables of constants) for each node whose
+# values are needed. Pair numbers are computed around that join.
 
 PATTERN: Final = '":pattern"'
 FRAME: Final = '":frame"'
@@ -289,7 +289,7 @@ MAP: Final = '":map"'
 
 
 def phases(sql: SqlBuilder, scope: Scope) -> Phases:
-    """The conditions of a scope by phase; of matches that are known nothing is left to be tested."""
+    """Return the conditions of a scope by phase. Known matches need no tests."""
     return Phases() if sql.found_in(scope) else phases_of(scope, sql.query, sql.catalog)
 
 
@@ -302,9 +302,9 @@ def masks(
     edges: frozenset[str] = frozenset(),
     kinds: frozenset[str] = frozenset(),
 ) -> str:
-    """The relation of the first phase: one row a bucket and binding of some nodes and edges.
+    """Return the relation of the first phase: one row for each bucket and binding.
 
-    ``kinds`` are nodes whose kind is a column, too, of those of :func:`told_kinds`.
+    ``kinds`` are nodes whose kind is also a column; they must be in :func:`told_kinds`.
     """
     if (found := sql.found_in(scope)) is not None:
         return found_masks(found)
@@ -318,21 +318,21 @@ def masks(
 
 
 def existence(sql: SqlBuilder, scope: Scope, given: SharedRelation | None) -> str:
-    """In which frames a block has a match: one row a bucket and binding of the nodes outside."""
+    """Return the relation of a block: one row for each bucket and outer binding with a match."""
     keys = frozenset(scope.outer)
     parts = phases(sql, scope)
     if parts.rest or parts.late:
         return folded(frames(sql, scope, given, keys), columns_of(keys))
     text = masks(sql, scope, parts, given, keys)
     if set(scope.nodes) and not parts.blocks:
-        return text  # grouped already, for the nodes inside are dropped
+        return text  # already grouped, because the inner nodes are dropped
     return merged(text, {column: column for column in columns_of(keys)})
 
 
 def _block(
     sql: SqlBuilder, condition: Bound, given: SharedRelation
 ) -> tuple[str, frozenset[str], bool]:
-    """Return where a block is true (or, if the last is false, where it is not), and its outer nodes."""
+    """Return the relation of a block, its outer nodes, and true if a match is required, not excluded."""
     match condition:
         case BlockValue(scope=scope):
             return existence(sql, scope, given), frozenset(scope.outer), True
@@ -346,7 +346,7 @@ def _block_counted(
     sql: SqlBuilder, condition: Bound, given: SharedRelation
 ) -> tuple[str, frozenset[str], bool]:
     counted = counted_block(condition)
-    assert counted is not None, condition  # noqa: S101 - it was filed so
+    assert counted is not None, condition  # noqa: S101 - guaranteed by phases_of
     block, sign, number = counted
     wanted = not COMPARISONS[sign].columns((Column(0), Column(number))).true
     sign = sign if wanted else complement(sign)
@@ -366,13 +366,13 @@ def _block_counted(
 def block_matches(
     sql: SqlBuilder, block: BlockValue, given: SharedRelation | None, columns: Iterable[Leaf] = ()
 ) -> str:
-    """The matches of a block, one row each and frame."""
+    """Return the relation of all matches of a block, one row for each match and frame."""
     nodes, edges = _told_apart(block.scope)
     return frames(sql, block.scope, given, nodes, edges, columns)
 
 
 def _told_apart(scope: Scope) -> tuple[frozenset[str], frozenset[str]]:
-    """Nodes and edges by which the matches of a block differ, and the nodes outside that it speaks of."""
+    """Return the nodes and edges that identify the matches of a block, including outer nodes."""
     nodes = {key for key, node in scope.nodes.items() if node.role != "hidden"}
     edges = frozenset(edge.key for edge in scope.edges if edge.named)
     return frozenset(nodes) | frozenset(scope.outer), edges
@@ -386,18 +386,18 @@ def frames(
     edges: frozenset[str] = frozenset(),
     columns: Iterable[Leaf] = (),
 ) -> str:
-    """The relation of the second phase: one row a frame and binding of some nodes and edges.
+    """Return the relation of the second phase: one row for each frame and binding.
 
     Parameters
     ----------
     sql : SqlBuilder
     scope : Scope
     given : SharedRelation or None
-        What binds the outer nodes.
+        Relation that binds the outer nodes.
     nodes, edges : frozenset of str
-        What is to be bound; every binding comes once for each frame.
+        Nodes and edges to bind. Each binding occurs once for each frame.
     columns : iterable of Leaf
-        Values wanted beside them, each a column named by :func:`column_of`.
+        Additional values, each a column named by :func:`column_of`.
     """
     parts = phases(sql, scope)
     wanted = list(dict.fromkeys(columns))
@@ -414,7 +414,7 @@ def frames(
     join, given = _first_phase(sql, scope, parts, given, bound, ties, needed)
     _second_phase(sql, join, scope, parts, given, needed)
     join.world = sql.catalog.world
-    # The ego is one, whatever it is.
+    # A frame has only one ego, of any kind.
     users = frozenset(
         key for key in {*scope.nodes, *scope.outer} if scope.kinds(key).other <= _USERS
     )
@@ -437,7 +437,7 @@ def frames(
 def _needless(
     catalog: Catalog, pairs: Iterable[PairNumber], users: frozenset[str]
 ) -> frozenset[str]:
-    """Marks that no pair needs whose numbers are asked for, of what the traces have."""
+    """Return marks that no needed pair number uses in these traces."""
     uneven = 0
     for trace in catalog.traces:
         uneven |= trace.uneven
@@ -451,13 +451,13 @@ def _needless(
 
 
 _USERS: Final = frozenset({*VEHICLES, "person", "animal"})
-"""Road users: none of them is flat."""
+"""Road users, which are never flat."""
 
 
 def _kinds_of_edges(
     sql: SqlBuilder, scope: Scope, parts: Phases, needed: list[Leaf]
 ) -> dict[Leaf, str]:
-    """Kinds that the rows of edges say, of nodes that need no table for anything else."""
+    """Return kinds to read from edge rows, for nodes that need no other table."""
     found = {leaf: leaf.node for leaf in needed if _is(leaf, "kind")}
     more = {key for leaf in needed if leaf not in found for key in _valued(leaf)} | parts.late
     known = told_kinds(sql, scope, parts) - more
@@ -473,7 +473,7 @@ def _by_buckets(
     edges: frozenset[str],
     wanted: list[Leaf],
 ) -> str:
-    """One row a bucket and binding, with the number of frames that it stands for."""
+    """Return one row for each bucket and binding, with its number of frames."""
     select, texts = _of_buckets(sql, scope, parts, given, nodes, edges, wanted)
     texts[INVARIANT] = held(PATTERN)
     columns = {column: f"{PATTERN}.{column}" for column in columns_of(nodes, edges)}
@@ -491,7 +491,7 @@ def _of_buckets(
     edges: frozenset[str],
     wanted: Sequence[Leaf],
 ) -> tuple[Select, dict[Leaf, str]]:
-    """Return the result of the first phase, joined with the tables of lasting values, and their SQL."""
+    """Return the first phase joined with tables of constant values, and the SQL of these values."""
     found = sql.found_in(scope)
     known = set[str]() if found else told_kinds(sql, scope, parts)
     kinds = {leaf: leaf.node for leaf in wanted if _is(leaf, "kind") and leaf.node in known}
@@ -516,16 +516,16 @@ def _of_buckets(
 def in_masks(
     sql: SqlBuilder, scope: Scope, wanted: Iterable[Leaf], values: Mapping[str, str]
 ) -> str:
-    """In which frames some match has which values: one row a bucket and combination of them.
+    """Return the relation of frames in which a match has given values, as masks.
 
     Parameters
     ----------
     sql : SqlBuilder
     scope : Scope
     wanted : iterable of Leaf
-        What the values are made of.
+        Leaves of the values.
     values : mapping of str to str
-        Column, quoted → its text in terms of a relation ``":rows"`` that has the columns ``wanted``.
+        Quoted column → its SQL, in terms of a relation ``":rows"`` with the columns ``wanted``.
     """
     rows = _lasting(sql, scope, wanted)
     if rows is not None:
@@ -537,7 +537,7 @@ def in_masks(
 
 
 def _lasting(sql: SqlBuilder, scope: Scope, wanted: Iterable[Leaf]) -> str | None:
-    """One row a bucket and match, with values that last as long; ``None`` if frames must be looked at."""
+    """Return one row for each bucket and match if all values are constant in a bucket, or None."""
     parts, wanted = phases(sql, scope), list(dict.fromkeys(wanted))
     known = sql.found_in(scope)
     if (known and not known.runs) or parts.rest or parts.late:
@@ -562,7 +562,7 @@ def _first_phase(
     ties: frozenset[str],
     needed: list[Leaf],
 ) -> tuple[Join, SharedRelation | None]:
-    """Return the result of the first phase and its frames, and what the blocks of the second phase need."""
+    """Return the first phase joined with its frames, and the relation for blocks of the second phase."""
     join, nodes = Join(), bound - parts.late
     if parts.empty:
         return join, None
@@ -571,7 +571,7 @@ def _first_phase(
     join.edges |= {key: f"{PATTERN}.{quoted(f'{key}.type')}" for key in ties}
     known = sql.found_in(scope)
     if known is not None:
-        join.select.lenient = True  # what is not there in the frame is unknown
+        join.select.lenient = True  # absent values of the frame are unknown
         join.select.join(known.frames(PATTERN[1:-1]), [])
         join.frame = f'{PATTERN}."frame_id"'
         if not blocks:
@@ -584,7 +584,7 @@ def _first_phase(
     join.texts |= {leaf: f"{PATTERN}.{quoted(column_of(leaf))}" for leaf in told}
     kinds = frozenset(told.values())
     text = masks(sql, scope, parts, given, nodes, ties, kinds)
-    # How many rows several edges or a block give, the database cannot tell before it has them.
+    # The database cannot estimate the number of rows of several edges or a block in advance.
     if blocks or (scope is sql.query.scope and (len(scope.edges) > 1 or parts.blocks)):
         given = SharedRelation(sql.share(text, "pattern"), nodes, ties)
         text = Select(["*"], [quoted(given.name)]).text()
@@ -601,10 +601,10 @@ def _first_phase(
 def _leader(
     sql: SqlBuilder, scope: Scope, parts: Phases, nodes: frozenset[str], needed: list[Leaf]
 ) -> str | None:
-    """The node whose states bring the frames with them, so that masks need not be expanded.
+    """Return the node whose states are read first, so that masks are not expanded. ``None`` means no node.
 
-    The many states are then looked up in the few rows of the first phase, rather than these, one row a
-    frame, among the states. Only where a query chooses traces it is better to say which frames are asked.
+    The states are then looked up in the few rows of the first phase, and not these rows among the many
+    states. If the query selects traces, it is faster to start from the frames.
     """
     if parts.trace or (
         scope is sql.query.scope and (sql.query.ego is not None or sql.catalog.only is not None)
@@ -628,13 +628,14 @@ def _join_leader(sql: SqlBuilder, join: Join, scope: Scope, key: str) -> None:
     join.select.join(f'"state" AS {alias}', [*on, in_mask(PATTERN, frame)])
     join.select.where += sql.within(frame, 64, met=True)
     join.frame = frame
-    # Said of the bucket, so that constants are looked up for the rows of masks, and not for all states.
+    # The condition is on the bucket, so that constants are looked up for the rows of masks, and not for all
+    # states.
     join.trace = f'{PATTERN}."bucket" >> 18'
     join.at[key] = Aliases(state=alias)
 
 
 def _of_kinds(sql: SqlBuilder, scope: Scope, key: str, state: str) -> list[str]:
-    """Conditions that keep states to what a node may be; of the ego's states it is enough that they are."""
+    """Return conditions that limit states to the kinds of a node. For the ego, its mark is sufficient."""
     if scope.kinds(key).one_a_frame and key not in phases(sql, scope).late:
         return [f'{state}."is_ego"']
     return kind_conditions(
@@ -645,12 +646,12 @@ def _of_kinds(sql: SqlBuilder, scope: Scope, key: str, state: str) -> list[str]:
 def _tables_of(
     sql: SqlBuilder, scope: Scope, key: str, needed: list[Leaf], *, stated: bool = False
 ) -> set[Home]:
-    """Return the tables of the needed values of a node; ``stated``: its state is joined anyway."""
+    """Return the tables with the needed values of a node. ``stated`` if its state is joined anyway."""
     profile = Profile.of(scope.kinds(key), sql.catalog)
     of_it = [leaf for leaf in needed if key in _valued(leaf)]
     homes = _homes(of_it, profile)
     if profile.places == 1 and profile.moving and (stated or Home.state in homes):
-        # Its state says its kind as well, and so its name.
+        # The state also has the kind of the node, and so its name.
         homes = {Home.state} | _homes([leaf for leaf in of_it if not _of_kind(leaf)], profile)
     return homes
 
@@ -663,7 +664,7 @@ def _second_phase(
     given: SharedRelation | None,
     needed: list[Leaf],
 ) -> None:
-    """Join whatever the values come from, and say how each is computed that the first phase does not tell."""
+    """Join all tables with needed values, and set the SQL of each value missing in the first phase."""
     needed = [leaf for leaf in needed if leaf not in join.texts]
     for key in sorted(parts.late):
         _bind_late(sql, join, scope, key)
@@ -686,7 +687,7 @@ def _second_phase(
 
 
 def _bind_late(sql: SqlBuilder, join: Join, scope: Scope, key: str) -> None:
-    """A node that is bound by its state in the frame."""
+    """Bind a node by its state in the frame."""
     alias = quoted(key)
     on = [f'{alias}."frame_id" = {join.frame}'] if join.frame else []
     on += _of_kinds(sql, scope, key, alias)
@@ -698,7 +699,7 @@ def _bind_late(sql: SqlBuilder, join: Join, scope: Scope, key: str) -> None:
 
 
 def _join_rows(sql: SqlBuilder, join: Join, scope: Scope, needed: list[Leaf]) -> None:
-    """The rows of the frame, of its trace and of the map, where they are needed."""
+    """Join the rows of the frame, its trace and the map, where needed."""
     kinds = {type(leaf) for leaf in needed}
     about = {key for leaf in needed for key in _valued(leaf)}
     about |= {
@@ -725,14 +726,14 @@ def _join_rows(sql: SqlBuilder, join: Join, scope: Scope, needed: list[Leaf]) ->
 
 
 def _join_values(sql: SqlBuilder, join: Join, scope: Scope, key: str, homes: set[Home]) -> None:
-    """The tables that some values of a node come from."""
+    """Join the tables with the needed values of a node."""
     profile = Profile.of(scope.kinds(key), sql.catalog)
     at, node = join.at.get(key, Aliases()), join.nodes[key]
     state, entity, part = at.state, None, None
     if Home.state in homes and state is None:
         state = quoted(key)
         on = [f'{state}."frame_id" = {join.frame}']
-        if not scope.kinds(key).one_a_frame:  # one column filters the scan as it reads
+        if not scope.kinds(key).one_a_frame:  # a single column can filter during the scan
             on.append(f'{state}."node_id" = {node}')
         on += _of_kinds(sql, scope, key, state) + sql.within(f'{state}."frame_id"', 64, met=True)
         alone = profile.places == 1
@@ -754,7 +755,7 @@ def _join_values(sql: SqlBuilder, join: Join, scope: Scope, key: str, homes: set
 def _value_text(  # noqa: PLR0911 - a case each
     sql: SqlBuilder, join: Join, scope: Scope, given: SharedRelation | None, leaf: Leaf
 ) -> str:
-    """Return the SQL of a value; a block or the attributes of an edge are joined for it."""
+    """Return the SQL of a value, and join the block or edge attributes that it needs."""
     match leaf:
         case NodeValue(node=node):
             return join.nodes[node]
@@ -770,9 +771,9 @@ def _value_text(  # noqa: PLR0911 - a case each
             return _of_block(sql, join, given, leaf)
         case Happened(nodes=nodes):
             return happened_text(leaf, join.frame, [join.nodes[key] for key in nodes])
-        case PairNumber():  # along lanes; the others are computed in layers
+        case PairNumber():  # looked up; other numbers are computed in layers
             return _of_ways(sql, join, scope, leaf)
-        case GroupKey():  # which stands above groups only
+        case GroupKey():  # only allowed above groups
             raise TypeError(leaf)
 
 
@@ -823,10 +824,10 @@ def _of_ways(sql: SqlBuilder, join: Join, scope: Scope, leaf: PairNumber) -> str
 
 
 def _of_block(sql: SqlBuilder, join: Join, given: SharedRelation | None, leaf: BlockValue) -> str:
-    """The value of a block for each frame and binding of the nodes outside."""
+    """Return the SQL of a block value, joined by frame and outer nodes."""
     keys = frozenset(leaf.scope.outer)
     alias = f":block {leaf.number}"
-    if alias not in join.lanes:  # a condition may speak of one block twice
+    if alias not in join.lanes:  # a condition may use a block twice
         join.lanes.add(alias)
         rows = _block_rows(sql, leaf, given, keys)
         on = [f'{quoted(alias)}."frame_id" = {join.frame}']
@@ -845,7 +846,7 @@ def _block_rows(
     sql: SqlBuilder, leaf: BlockValue, given: SharedRelation | None, keys: frozenset[str]
 ) -> str:
     if leaf.word == "EXISTS":
-        # A column that is no key: DuckDB 2.0.0 errs where keys are tested for NULL.
+        # A column that is not a key: DuckDB 2.0.0 gives wrong results if keys are tested for NULL.
         rows = frames(sql, leaf.scope, given, keys)
         return Select(["*", 'TRUE AS "value"'], [nested(rows, ":block")]).text()
     parts = list(leaves(leaf.value)) if leaf.value is not None else []
@@ -865,11 +866,11 @@ def _is(leaf: Leaf, name: str) -> TypeGuard[NodeAttribute]:
 
 
 _BARE: Final = {DisplayUnit.binding, DisplayUnit.owner, DisplayUnit.role, DisplayUnit.own}
-"""What is told of a node without its tables."""
+"""Units of attributes that need no table of the node."""
 
 
 def _valued(leaf: Leaf) -> frozenset[str]:
-    """Nodes whose tables a value needs."""
+    """Return the nodes whose tables a value needs."""
     match leaf:
         case NodeAttribute(node=node, attribute=attribute):
             return frozenset() if attribute.unit in _BARE else frozenset({node})
@@ -880,7 +881,7 @@ def _valued(leaf: Leaf) -> frozenset[str]:
 
 
 def _homes(needed: list[Leaf], profile: Profile) -> set[Home]:
-    """Return the tables with values of a node, of those where the node may be."""
+    """Return the tables with the needed values of a node, limited to tables that can store the node."""
     homes: set[Home] = set()
     for leaf in needed:
         if isinstance(leaf, PairNumber):
@@ -891,13 +892,12 @@ def _homes(needed: list[Leaf], profile: Profile) -> set[Home]:
 
 
 def _of_kind(leaf: Leaf) -> bool:
-    """Tell whether a value is made of the kind, and the id, of a node."""
+    """True if a value depends only on the kind and id of a node."""
     return _is(leaf, "kind") or _is(leaf, "name")
 
 
-# Values that a binding has for a whole bucket: constants of entities, of parts of the map, and of traces ----
-# Results that are made of nothing else need no single frames; how often they count is the number of frames that
-# a mask holds.
+# Values that are constant in a bucket: constants of entities, of parts of the map, and of traces ----
+# Results with only such values need no single frames. Their count is the number of frames in a mask.
 
 
 def _join_lasting(
@@ -908,7 +908,7 @@ def _join_lasting(
     catalog: Catalog,
     needed: Iterable[Leaf],
 ) -> dict[Leaf, str]:
-    """Join what lasting values come from to a relation of buckets; how each value is computed."""
+    """Join tables of constant values to a relation of buckets. Return the SQL of each value."""
     needed = list(needed)
     trace = f"{bucket} >> 18"
     of_traces = [leaf for leaf in needed if isinstance(leaf, TraceAttribute)]

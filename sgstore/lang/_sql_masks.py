@@ -1,6 +1,6 @@
-"""SQL of the first phase: presence and relations as bit masks.
+"""SQL of the first phase: presence of nodes and relations as bit masks.
 
-Presence of nodes and conditions on one node alone: as masks, a relation for each table that holds such nodes.
+Presence and single-node conditions become masks, with one relation for each table that stores such nodes.
 """
 
 from __future__ import annotations
@@ -71,26 +71,26 @@ _BIT: Final = '"bit"'
 
 
 def bit_of(frame: str) -> str:
-    """The mask of a single frame, given its id or its number in the bucket."""
+    """Return the SQL of the mask of a single frame, from its id or its number in the bucket."""
     number = frame if frame.endswith(_BIT) else f"{frame} & 63"
     return f"CAST(1 AS BIGINT) << CAST({number} AS INTEGER)"
 
 
-# In which frames how many rows hold, told by adding up their masks rather than by looking at single frames
+# Counting rows per frame by adding masks, without reading single frames
 # ------------------------------------------------------------------------------------------------
-# A mask is spread over twelve numbers, each with every twelfth bit of it, so that a bit has twelve to itself.
-# The sums of these numbers over many rows are then the counts of all frames of a bucket, five to a number. To
-# see which counts reach a bound, the top bit of each is set and the bound is taken from it: where that bit
-# stays, the count was large enough.
+# A mask is spread over twelve numbers, each with every twelfth bit, so that each frame has a field of twelve
+# bits. The sums of these numbers over many rows are the counts of all frames of a bucket, five counts in each
+# number. To compare counts with a bound, the top bit of each field is set and the bound is subtracted. If the
+# top bit stays set, the count reaches the bound.
 #
-# A count must stay below the top bit, so this is right for up to :data:`MOST` rows. Where a bucket has more,
-# its frames are counted one by one.
+# A count must stay below the top bit, so this is valid for up to :data:`MOST` rows. In a bucket with more
+# rows, the frames are counted one by one.
 
 WIDTH: Final = 12
-"""Bits that a count has to itself; 60 frames are five counts in each of twelve numbers."""
+"""Bits of each count; 60 frames are five counts in each of twelve numbers."""
 
 MOST: Final = (1 << (WIDTH - 1)) - 1
-"""So many rows can be added up."""
+"""Largest number of rows that can be added."""
 
 _ONES: Final = sum(1 << place for place in range(0, 60, WIDTH))
 _TOPS: Final = _ONES << (WIDTH - 1)
@@ -98,14 +98,14 @@ _TOPS: Final = _ONES << (WIDTH - 1)
 
 @dataclass(frozen=True, slots=True)
 class CountRange:
-    """The counts that a comparison wants, none of them 0: ``least`` and more, but less than ``end``."""
+    """Range of positive counts that a comparison accepts: at least ``least`` and less than ``end``."""
 
     least: int
     end: int | None
 
     @classmethod
     def of(cls, sign: str, number: float) -> CountRange:
-        """The counts from 1 on for which ``count sign number`` is true; it must be false for 0."""
+        """Return the counts from 1 for which ``count sign number`` is true; it must be false for 0."""
         up, past = math.ceil(number), math.floor(number) + 1
         match sign:
             case "=":
@@ -125,25 +125,25 @@ class CountRange:
 
     @property
     def empty(self) -> bool:
-        """Tell whether no count is wanted."""
+        """True if the range contains no count."""
         return self.end is not None and self.least >= self.end
 
     def condition(self, count: str) -> str:
-        """Tell whether a count is wanted."""
+        """Return the SQL condition that a count is in the range."""
         least = f"{count} >= {self.least}"
         return least if self.end is None else f"{least} AND {count} < {self.end}"
 
 
 def frames_with(rows: str, keys: list[str], wanted: CountRange) -> str:
-    """In which frames as many rows hold as are wanted: one row a bucket and keys.
+    """Return SQL for the frames whose number of rows is in a range, as masks.
 
     Parameters
     ----------
     rows : str
-        Name of a relation with the columns ``bucket``, ``mask`` and those of the keys. A frame counts once for
-        each row in whose mask it is.
+        Name of a relation with the columns ``bucket``, ``mask`` and the key columns. A frame counts once for
+        each row whose mask contains it.
     keys : list of str
-        Columns, quoted.
+        Quoted key columns.
     wanted : CountRange
     """
     if wanted.empty:
@@ -153,7 +153,7 @@ def frames_with(rows: str, keys: list[str], wanted: CountRange) -> str:
 
 
 def _summed(rows: str, keys: list[str], wanted: CountRange) -> str:
-    """For buckets with few rows: by sums of masks."""
+    """Return SQL for buckets with few rows, which adds masks."""
     sums = [
         f'CAST(sum(("mask" >> {shift}) & {_ONES}) AS BIGINT) AS {_sum(shift)}'
         for shift in range(WIDTH)
@@ -177,7 +177,7 @@ def _sum(shift: int) -> str:
 
 
 def _reached(bound: int) -> str:
-    """The mask of the frames whose counts reach a bound."""
+    """Return SQL for the mask of the frames whose counts reach a bound."""
     less = bound * _ONES
     parts = [
         f"((({_sum(shift)} | {_TOPS}) - {less}) & {_TOPS}) >> {WIDTH - 1 - shift}"
@@ -187,7 +187,7 @@ def _reached(bound: int) -> str:
 
 
 def _one_by_one(rows: str, keys: list[str], wanted: CountRange) -> str:
-    """For buckets with many rows, or a bound beyond what sums can say: frame by frame."""
+    """Return SQL for buckets with many rows or for large bounds, which counts frame by frame."""
     group = ['"bucket"', *keys]
     crowded = Select(group, [quoted(rows)], group=group)
     if wanted.least <= MOST:
@@ -204,7 +204,7 @@ def _one_by_one(rows: str, keys: list[str], wanted: CountRange) -> str:
 
 
 def folded(text: str, keys: list[str]) -> str:
-    """A relation of frames and keys as one of buckets, masks and keys."""
+    """Convert a relation of frames and keys to buckets, masks and keys."""
     bit = bit_of('"frame_id"')
     select = Select(['"frame_id" >> 6 AS "bucket"', *keys, f'bit_or({bit}) AS "mask"'])
     select.join(nested(text, ":frames"), [])
@@ -213,13 +213,13 @@ def folded(text: str, keys: list[str]) -> str:
 
 
 def merged(text: str, values: Mapping[str, str]) -> str:
-    """A relation of buckets and masks as one with each bucket and combination of values once.
+    """Merge the rows of a relation with the same bucket and values, and combine their masks.
 
     Parameters
     ----------
     text : str
     values : mapping of str to str
-        Column, quoted → its text in terms of the relation as ``":rows"``.
+        Quoted column → its SQL, in terms of the relation ``":rows"``.
     """
     columns = [f"{value} AS {column}" for column, value in values.items()]
     select = Select(['"bucket"', *columns, 'bit_or("mask") AS "mask"'])
@@ -228,55 +228,55 @@ def merged(text: str, values: Mapping[str, str]) -> str:
     return select.text()
 
 
-# Bound patterns → SQL, first phase: what can be answered on masks, 60 frames at a time ----------
-# A row of ``edge`` or ``node`` says with the bits of a mask in which frames of a bucket it holds. So edges join
-# on bucket and node ids, and the frames of a match are the bits that all masks have in common. Conditions on
-# the attributes of one node become masks too, and so do blocks (``EXISTS``, ``COUNT``), which are answered
-# once for all bindings of the nodes outside that they speak of.
+# SQL of the first phase: conditions that can be evaluated on masks, 60 frames at a time ----------
+# The mask of a row of ``edge`` or ``node`` marks the frames of a bucket in which the row holds. So edges join
+# on bucket and node ids, and the frames of a match are the common bits of all masks. Conditions on attributes
+# of one node also become masks, and so do blocks (``EXISTS``, ``COUNT``), which are evaluated once for all
+# bindings of their outer nodes.
 #
-# What needs values of single frames is left to the second phase (:mod:`sgstore.lang._sql_frames`). Masks are
-# known here and in the store, and nowhere else.
+# Conditions that need values of single frames are evaluated in the second phase
+# (:mod:`sgstore.lang._sql_frames`). Only this module and the store use masks.
 #
-# A relation of this phase has the columns ``bucket``, ``mask``, ``"x.id"`` for each node x and ``"d.type"`` for
-# each edge d; one of the second phase has ``frame_id`` in place of the first two.
+# A relation of this phase has the columns ``bucket``, ``mask``, ``"x.id"`` for each node x and ``"d.type"``
+# for each edge d. A relation of the second phase has ``frame_id`` instead of the first two.
 
 OUTSIDE: Final = '":outside"'
 BUCKET: Final = '":bucket"'
 _MANY: Final = 5
-"""Up to so many masks are compared in pairs, so that each join sheds what it can."""
+"""Largest number of masks that are compared in pairs, so that each join removes rows early."""
 
 _BRANCHES: Final = 8
-"""A pattern with paths is joined so many times at most, once for each length of its paths."""
+"""Largest number of joins of a pattern with paths, one for each combination of path lengths."""
 
 
 @dataclass(slots=True)
 class Base:
-    """The join of the first phase in the making.
+    """Join of the first phase during its construction.
 
     Attributes
     ----------
     select : Select
     nodes : dict of str to str
-        Node → the column that binds it.
+        Column of the id by node.
     edges : dict of str to str
-        Edge → the column of its relation.
+        Column of the relation by edge.
     bucket : str
-        The column of the bucket; empty as long as there is none.
+        Column of the bucket; empty until a table has it.
     masks : list of str
-        Columns, or other terms.
+        Columns or SQL terms of masks.
     present : set of str
-        Nodes that a mask of their own edges makes present.
+        Nodes whose presence follows from the mask of an edge.
     repeats : bool
-        Whether a binding may come in several rows whose masks overlap.
+        True if a binding may have several rows with overlapping masks.
     knows_map : bool
-        Whether the row of the bucket is joined, which knows the map.
+        True if the row of the bucket is joined, which has the map.
     stops : list of (str, str)
-        Columns of nodes on the way that must be present, too, and tables that say so; NULL where a way has
-        fewer.
+        Columns of the inner nodes of paths, which must be present, and the tables of their presence; NULL if
+        a path has fewer nodes.
     several : set of str
-        Edges of several relations: without their relation, a binding may come in several rows.
+        Edges with several relations. If their relation is not a column, a binding may have several rows.
     kinds : dict of str to str
-        Node → a column with its kind.
+        Column of the kind by node.
     """
 
     select: Select = field(default_factory=Select)
@@ -294,7 +294,7 @@ class Base:
     def join(
         self, table: str, alias: str, ends: Mapping[str, str], conditions: Iterable[str] = ()
     ) -> None:
-        """Join a table with masks on the bucket and on the nodes that are bound; bind the others."""
+        """Join a table with masks on the bucket and on bound nodes. Its other nodes become bound."""
         on = [f'{alias}."bucket" = {self.bucket}'] if self.bucket else []
         self.bucket = self.bucket or f'{alias}."bucket"'
         self.masks.append(f'{alias}."mask"')
@@ -302,7 +302,7 @@ class Base:
         self.tie(table, ends, [*conditions, *on])
 
     def tie(self, table: str, ends: Mapping[str, str], conditions: Iterable[str]) -> None:
-        """Join a table on the nodes that are bound; bind the others."""
+        """Join a table on bound nodes. Its other nodes become bound."""
         on = list(conditions)
         for key, column in ends.items():
             if key in self.nodes:
@@ -312,7 +312,7 @@ class Base:
         self.select.join(table, on)
 
     def need_bucket(self) -> None:
-        """Join the row of the bucket, if it is not yet."""
+        """Join the row of the bucket, unless it is already joined."""
         if not self.knows_map:
             self.knows_map = True
             on = [f'{BUCKET}."bucket" = {self.bucket}'] if self.bucket else []
@@ -322,22 +322,22 @@ class Base:
 
 @dataclass(slots=True)
 class SqlBuilder:
-    """SQL of one query in the making: its values, and relations that stand before it.
+    """Builder of the SQL of one query: its bound values and its shared relations.
 
     Attributes
     ----------
     query : Query
-        Rewritten.
+        Rewritten query.
     catalog : Catalog
     window : Window or None
-        The buckets to look at; ``None``: all.
+        Buckets to search; ``None`` means all.
     values : BoundValues
     shared : list of (str, str)
-        Names and texts of relations that are used more than once.
+        Names and SQL of relations that are used more than once.
     found : SharedRelation or None
-        What is known already of the matches of the outermost scope.
+        Known matches of the outermost scope.
     gathered : tuple of Gathered
-        Tables that are spoken of and the store has not.
+        Temporary tables used by the SQL that are not in the store.
     """
 
     query: Query
@@ -350,25 +350,26 @@ class SqlBuilder:
 
     @property
     def standing(self) -> frozenset[str]:
-        """Kinds of what is present by masks: static entities and parts of the map."""
+        """Kinds whose presence is stored as masks: static entities and parts of the map."""
         return self.catalog.fixed | self.catalog.mapped
 
     def edges_of(self, edge: Edge) -> str:
-        """Return the table of the edges of frames that an edge is looked up in: those known, or of graphs."""
+        """Return the table in which an edge is searched: all known edges, or edges of graphs."""
         return '"known_edge"' if self.catalog.world and edge.known else '"edge"'
 
     def nodes_of(self, edge: Edge) -> str:
-        """Return the table of what stands, of which an edge of the map takes its ends."""
+        """Return the table with the presence of static nodes, for the ends of a map edge."""
         return '"graph_node"' if self.catalog.world and not edge.known else '"node"'
 
     def found_in(self, scope: Scope) -> SharedRelation | None:
-        """Matches of a scope, if they are known already."""
+        """Return the known matches of a scope, or None."""
         return self.found if scope is self.query.scope else None
 
     def within(self, column: str, per: int = 1, *, met: bool = False) -> list[str]:
-        """Conditions that keep a column of buckets, or of frames (``per`` 64), in the window.
+        """Return conditions that limit a column of buckets or frames (``per`` 64) to the window.
 
-        ``met``: rows meet others of its traces, so the range is enough, unless matches are given.
+        ``met``: the rows are joined with rows of the selected traces. Then the range is sufficient, unless
+        matches are known.
         """
         if self.window is None:
             return []
@@ -380,13 +381,13 @@ class SqlBuilder:
         return found
 
     def share(self, text: str, name: str) -> str:
-        """The name under which a relation stands before the statement, to be used more than once."""
+        """Add a shared relation before the statement, and return its name."""
         full = f"{name} {len(self.shared) + 1}"
         self.shared.append((full, text))
         return full
 
     def of_traces(self, trace: str, scope: Scope) -> list[str]:
-        """Conditions on a trace id that keep the traces that are asked, in the outermost scope."""
+        """Return conditions that limit the outermost scope to the selected traces."""
         if scope is not self.query.scope:
             return []
         chosen, left = traces_of(self.query, self.catalog)
@@ -398,12 +399,12 @@ class SqlBuilder:
 
 
 def if_bound(sql: SqlBuilder, node: str, value: str) -> str:
-    """A value that would be known of what is NULL, too, as a node of an ``OPTIONAL MATCH`` may be."""
+    """Return the SQL of a value that is NULL for an absent node of an ``OPTIONAL MATCH``."""
     return f"CASE WHEN {node} IS NOT NULL THEN {value} END" if sql.query.stages else value
 
 
 def expanded(text: str, nodes: frozenset[str], edges: frozenset[str], kinds: frozenset[str]) -> str:
-    """A relation of the first phase, one row a frame, with the kinds of some nodes."""
+    """Convert a relation of the first phase to one row for each frame, with kinds of some nodes."""
     columns = [*columns_of(nodes, edges), *(quoted(f"{key}.kind") for key in sorted(kinds))]
     keep = [f'":pattern".{column}' for column in columns]
     select = Select(['":pattern"."bucket" * 64 + ":bit"."bit" AS "frame_id"', *keep])
@@ -413,25 +414,25 @@ def expanded(text: str, nodes: frozenset[str], edges: frozenset[str], kinds: fro
 
 
 def in_mask(alias: str, frame: str) -> str:
-    """Tell whether a frame of the same bucket is one of those in which a row of the first phase holds."""
+    """Return the SQL condition that a frame of the same bucket is in the mask of a row."""
     return f'({alias}."mask" & ({bit_of(frame)})) <> 0'
 
 
 def stands_text(frame: str, node: str) -> str:
-    """Return the SQL that what stands is in the graph of a frame, not beyond it."""
+    """Return the SQL condition that a static node is in the graph of a frame, and not beyond it."""
     on = [f'":g"."bucket" = {frame} >> 6', f'":g"."node_id" = {node}', in_mask('":g"', frame)]
     rows = Select(["1"], ['"graph_node" AS ":g"'], on)
     return f"EXISTS ({rows.text()})"
 
 
 def number_of_frames(text: str) -> str:
-    """Return the number of frames of a first-phase relation that binds nothing, as ``frames``."""
+    """Return SQL for the number of frames of a first-phase relation without bound nodes."""
     total = 'coalesce(sum(bit_count("mask")), 0) AS "frames"'
     return Select([total], [nested(text, ":pattern")]).text()
 
 
 def found_masks(found: SharedRelation) -> str:
-    """Runs of matches that are known, each within a bucket, as rows of the first phase."""
+    """Convert runs of known matches, each within a bucket, to rows of the first phase."""
     mask = (
         '((1::BIGINT << ("last" - "first" + 1)::INTEGER) - 1) << ("first" & 63)::INTEGER AS "mask"'
     )
@@ -440,12 +441,12 @@ def found_masks(found: SharedRelation) -> str:
 
 
 def in_which(alias: str) -> list[str]:
-    """The columns that say in which frames a row of a relation of the first phase holds."""
+    """Return the columns with the frames of a first-phase row: bucket and mask."""
     return [f'{alias}."bucket"', f'{alias}."mask"']
 
 
 def held(alias: str) -> str:
-    """In how many frames a row of a relation of the first phase holds."""
+    """Return the SQL of the number of frames of a first-phase row."""
     return f'bit_count({alias}."mask")'
 
 
@@ -455,12 +456,12 @@ def with_blocks(
     nodes: frozenset[str],
     edges: frozenset[str],
 ) -> str:
-    """A relation of the first phase with the frames in which blocks are true (or, of some, are not).
+    """Limit a first-phase relation to the frames in which blocks are true, or not true.
 
     Parameters
     ----------
     blocks : iterable of (str, frozenset of str, bool)
-        Relation of each, the nodes outside that it speaks of, and whether it is to be true.
+        Relation of each block, its outer nodes, and true if the block must be true.
     given : SharedRelation
     nodes, edges : frozenset of str
     """
@@ -491,7 +492,7 @@ def base_rows(  # noqa: C901 - a step each
     edges: frozenset[str],
     kinds: frozenset[str] = frozenset(),
 ) -> str:
-    """The join of nodes and edges: one row a bucket and binding of some, with the kinds of some nodes."""
+    """Return the join of nodes and edges: one row for each bucket and binding, with some kinds."""
     unfolded = _unfolded(sql, scope, parts, given, nodes, edges)
     if unfolded:
         return unfolded
@@ -512,7 +513,7 @@ def base_rows(  # noqa: C901 - a step each
         _join_conditions(sql, base, key, _kinds_to_test(scope, key), conditions)
     for key, conditions in parts.lane.items():
         _join_lane(sql, base, next(e for e in scope.edges if e.key == key), conditions)
-    if not base.masks:  # all nodes wait for the second phase
+    if not base.masks:  # all nodes are bound in the second phase
         base.need_bucket()
         base.masks.append(f'{BUCKET}."valid"')
     where, bound = base.select.where, set(base.nodes)
@@ -529,7 +530,7 @@ def base_rows(  # noqa: C901 - a step each
 
 
 def _join_given(sql: SqlBuilder, base: Base, scope: Scope, given: SharedRelation) -> None:
-    """The bindings of the nodes outside that a block speaks of."""
+    """Join the bindings of the outer nodes of a block."""
     columns = columns_of(frozenset(scope.outer))
     table = f"{quoted(given.name)} AS {OUTSIDE}"
     if given.edges or given.nodes != frozenset(scope.outer):
@@ -579,7 +580,7 @@ def _join_edge(sql: SqlBuilder, base: Base, scope: Scope, edge: Edge) -> None:
 
 
 def _join_graph_nodes(sql: SqlBuilder, base: Base, edge: Edge, ends: Mapping[str, str]) -> None:
-    """The frames in which both ends of an edge of a pattern are in the graph; without scope all are."""
+    """Limit the frames to those in which both ends of an edge are in the graph."""
     if sql.nodes_of(edge) == '"node"':
         return
     for key in ends:
@@ -588,7 +589,7 @@ def _join_graph_nodes(sql: SqlBuilder, base: Base, edge: Edge, ends: Mapping[str
 
 
 def _join_alone(sql: SqlBuilder, base: Base, scope: Scope, block: BlockValue) -> None:
-    """The frames in which a block has a match, and what it binds of the nodes outside."""
+    """Join a block as its own relation: frames with a match, and the bindings of outer nodes."""
     outer = {key: kinds & scope.kinds(key) for key, kinds in block.scope.outer.items()}
     inner = replace(block.scope, outer=outer)
     keys, alias = frozenset(outer), quoted(f":alone {block.number}")
@@ -602,7 +603,7 @@ def _join_alone(sql: SqlBuilder, base: Base, scope: Scope, block: BlockValue) ->
 
 
 def _join_happened(sql: SqlBuilder, base: Base, happened: Happened, name: str) -> None:
-    """The frames in which something happens; that those to whom it does are there is another matter."""
+    """Join the frames of an event with its nodes. Presence of the nodes is tested separately."""
     keys = [quoted(f":{place}") for place in range(len(happened.nodes))]
     rows, alias = happened_rows(happened), quoted(name)
     inner = Select(['"frame_id"', *keys], [nested(rows, ":events")], sql.within('"frame_id"', 64))
@@ -614,7 +615,7 @@ def _join_happened(sql: SqlBuilder, base: Base, happened: Happened, name: str) -
 
 
 def told_kinds(sql: SqlBuilder, scope: Scope, parts: Phases) -> frozenset[str]:
-    """Nodes whose kind the rows of an edge say, so that :func:`base_rows` can have it as a column."""
+    """Return nodes whose kind is in the rows of an edge, so that :func:`base_rows` can return it."""
     if parts.blocks or any(edge.high > 1 for edge in scope.edges):
         return frozenset()
     found = set[str]()
@@ -627,7 +628,7 @@ def told_kinds(sql: SqlBuilder, scope: Scope, parts: Phases) -> frozenset[str]:
 
 
 def _rows(sql: SqlBuilder, scope: Scope, edge: Edge, *, moving: bool, lasting: bool) -> str:
-    """Rows of an edge that may run either way, or hold in frames as well as on the map."""
+    """Return the rows of an edge that is undirected, or that is stored for frames and for maps."""
     directions = (False, True) if edge.both else (False,)
     branches: list[str] = []
     for swapped in directions:
@@ -645,7 +646,7 @@ def _rows(sql: SqlBuilder, scope: Scope, edge: Edge, *, moving: bool, lasting: b
 
 
 def _lasting_rows(sql: SqlBuilder, scope: Scope, edge: Edge, *, swapped: bool) -> str:
-    """Rows of a map's edges with the frames in which both ends are present."""
+    """Return the rows of map edges, with the frames in which both ends are present."""
     mask = '"p"."mask" & "q"."mask"'
     select = Select(_row_columns('"m"', mask, swapped=swapped))
     select.columns[0] = '"p"."bucket" AS "bucket"'
@@ -669,9 +670,9 @@ def _unfolded(
     nodes: frozenset[str],
     edges: frozenset[str],
 ) -> str:
-    """The join, once for each length that its paths may have; empty if that is no use, or too often.
+    """Return the join once for each combination of path lengths, or an empty text if unsuitable.
 
-    So a path begins where other edges lead, rather than anywhere.
+    Then the search for a path begins at nodes that other edges bind.
     """
     paths = [edge for edge in scope.edges if edge.high > 1 and not _ways(sql, scope, edge)]
     lengths = list(product(*(range(path.low, path.high + 1) for path in paths)))
@@ -696,7 +697,7 @@ def _unfolded(
 
 
 def _chains(sql: SqlBuilder, scope: Scope, edge: Edge) -> list[Scope]:
-    """A path of ``low`` to ``high`` edges as patterns of single ones, one for each length that it can have."""
+    """Return a path as patterns of single edges, one for each length that the store allows."""
     nodes = {key: Node(key, scope.kinds(key), "hidden", edge.span) for key in (edge.src, edge.dst)}
     single = replace(edge, low=1, high=1)
     alone = Scope(nodes, {}, (single,), (), frozenset())
@@ -709,10 +710,10 @@ def _chains(sql: SqlBuilder, scope: Scope, edge: Edge) -> list[Scope]:
 
 
 def _ways(sql: SqlBuilder, scope: Scope, edge: Edge) -> str:
-    """Ways on the maps that a path may be, with the nodes on them; empty if it may lead over edges of frames.
+    """Return SQL for the map routes of a path, or an empty text if it can use edges of frames.
 
-    There are few of them, whatever the number of frames: other edges are joined to them, and then it is
-    looked up whether the nodes on the way are present.
+    Their number does not depend on the number of frames. Other edges are joined to these routes. Then the
+    presence of the inner nodes is tested.
     """
     if edge.both or len(scope.edges) == 1:
         return ""
@@ -727,7 +728,7 @@ def _ways(sql: SqlBuilder, scope: Scope, edge: Edge) -> str:
 
 
 def _ways_along(sql: SqlBuilder, scope: Scope, path: Edge) -> str:
-    """Ways on the maps that a chain of edges may be."""
+    """Return SQL for the map routes along a chain of edges."""
     base, first = Base(), f'{quoted(alias_of(scope.edges[0]))}."map_id"'
     for edge in scope.edges:
         alias = quoted(alias_of(edge))
@@ -747,7 +748,7 @@ def _ways_along(sql: SqlBuilder, scope: Scope, path: Edge) -> str:
 
 
 def _paths(sql: SqlBuilder, scope: Scope, edge: Edge) -> str:
-    """Rows of a path of ``low`` to ``high`` edges: the ends, and in which frames some path joins them."""
+    """Return SQL for a path of several edges: its ends and the frames in which it exists."""
     ends = ((edge.src, "src"), (edge.dst, "dst"))
     keys = frozenset((edge.src, edge.dst))
     branches: list[str] = []
@@ -765,7 +766,7 @@ def _paths(sql: SqlBuilder, scope: Scope, edge: Edge) -> str:
 def _join_presence(
     sql: SqlBuilder, base: Base, key: str, kinds: Kinds, conditions: list[Bound]
 ) -> None:
-    """The frames in which a node is present and meets conditions on its attributes."""
+    """Join the frames in which a node is present and meets its conditions."""
     alias = quoted(f"{key}:")
     profile = Profile.of(kinds, sql.catalog)
     if profile.moving or conditions:
@@ -777,7 +778,7 @@ def _join_presence(
 
 
 def _kinds_to_test(scope: Scope, key: str) -> Kinds:
-    """Kinds that states of a node are kept to: of the ego any, where the rows of an edge say its kind."""
+    """Return the kinds to test in states of a node. An ego with known kind needs no test."""
     kinds = scope.kinds(key)
     said = any(edge.high == 1 and key in {edge.src, edge.dst} for edge in scope.edges)
     return ego_kinds() if said and kinds.one_a_frame else kinds
@@ -786,7 +787,7 @@ def _kinds_to_test(scope: Scope, key: str) -> Kinds:
 def _join_conditions(
     sql: SqlBuilder, base: Base, key: str, kinds: Kinds, conditions: list[Bound]
 ) -> None:
-    """The frames in which a node that is present meets conditions on its attributes."""
+    """Join the frames in which a present node meets its conditions."""
     profile, alias = Profile.of(kinds, sql.catalog), quoted(f"{key}:")
     constant = all(is_constant(leaf) for c in conditions for leaf in leaves(c))
     if profile.mapped and profile.places == 1:
@@ -805,7 +806,7 @@ def _join_conditions(
 
 
 def _join_lane(sql: SqlBuilder, base: Base, edge: Edge, conditions: list[Bound]) -> None:
-    """The frames in which an edge meets conditions on its attributes."""
+    """Join the frames in which an edge meets conditions on its attributes."""
     bucket, bit = '"l"."bucket"', f'"l".{_BIT}'
     table, nodes = edge_table(edge, base.nodes[edge.src], base.nodes[edge.dst])
     ends = [f'"l".{quoted(column)}' for column in nodes]
@@ -825,7 +826,7 @@ def _join_lane(sql: SqlBuilder, base: Base, edge: Edge, conditions: list[Bound])
 
 
 def _present(sql: SqlBuilder, kinds: Kinds, profile: Profile, conditions: list[Bound]) -> str:
-    """Frames in which nodes are present and meet conditions, for each place where they may live."""
+    """Return SQL for frames in which nodes are present and meet conditions, one part for each table."""
     branches: list[str] = []
     if (
         profile.moving
@@ -896,7 +897,7 @@ def _standing(sql: SqlBuilder, kinds: Kinds, conditions: list[Bound], place: str
 
 
 def _join_trace(sql: SqlBuilder, select: Select, trace: str, conditions: list[Bound]) -> str | None:
-    """The row of the trace, if a condition is on a position, which is stored about the trace's origin."""
+    """Join the trace and return its alias if a condition uses a position, otherwise None."""
     if not any(is_position(leaf) for c in conditions for leaf in leaves(c)):
         return None
     select.join('"trace" AS "t"', [f'"t"."trace_id" = {trace}'])
@@ -904,7 +905,7 @@ def _join_trace(sql: SqlBuilder, select: Select, trace: str, conditions: list[Bo
 
 
 def _masked(sql: SqlBuilder, base: Base, keep: Mapping[str, str]) -> str:
-    """The join as a relation of some columns, by their names; each combination once."""
+    """Return the join as a relation with the given columns, without duplicates."""
     select, masks = base.select, base.masks
     mask = " & ".join(masks)
     named = [f"{column} AS {name}" for name, column in keep.items()]
@@ -924,7 +925,7 @@ def _masked(sql: SqlBuilder, base: Base, keep: Mapping[str, str]) -> str:
 def _on_the_way(
     sql: SqlBuilder, join: Select, stops: list[tuple[str, str]], keys: list[str]
 ) -> str:
-    """The rows of a join, in those frames in which the nodes on the way are present; each key once."""
+    """Limit the rows of a join to frames in which the inner nodes of paths are present."""
     names = [f"stop {number}" for number in range(1, len(stops) + 1)]
     tables = {name: table for name, (_, table) in zip(names, stops, strict=True)}
     join.columns += [

@@ -1,7 +1,6 @@
-"""``sgql('MATCH …')`` in SQL: patterns as tables of a statement.
+"""SQL table function ``sgql('MATCH …')``: patterns as tables of a statement.
 
-A statement of SQL is not parsed here. Texts, quoted names and comments are passed over, so that only a call is
-taken for one.
+The SQL statement is not parsed. Texts, quoted names and comments are skipped, so only real calls are found.
 """
 
 from __future__ import annotations
@@ -19,16 +18,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PatternTable:
-    """A call of ``sgql``.
+    """Call of ``sgql`` in an SQL statement.
 
     Attributes
     ----------
     name : str
-        Of the table that stands for it in the statement.
+        Name of the table that replaces the call.
     text : str
-        The query.
+        Text of the query.
     values : tuple of (str, value)
-        Values of its parameters by name.
+        Values of the query parameters by name.
     """
 
     name: str
@@ -53,18 +52,18 @@ _EXAMPLE: Final = "SELECT * FROM sgql('MATCH (e:Ego) RETURN FRAMES')"
 
 
 def pattern_tables(sql: str, taken: Collection[str] = ()) -> tuple[str, tuple[PatternTable, ...]]:
-    """A statement of SQL with tables in place of the calls of ``sgql``, and what these tables are.
+    """Replace the calls of ``sgql`` in a statement by tables. Return the SQL and these tables.
 
     Parameters
     ----------
     sql : str
     taken : collection of str
-        Names that no such table may have.
+        Names that these tables must not have.
 
     Raises
     ------
     QueryError
-        A call is not ``sgql('…')`` or ``sgql('…', name := value)``; it says where.
+        A call is not ``sgql('…')`` or ``sgql('…', name := value)``. The error has the place.
     """
     found: dict[tuple[str, tuple[tuple[str, Any], ...]], PatternTable] = {}
     parts: list[str] = []
@@ -84,7 +83,7 @@ def pattern_tables(sql: str, taken: Collection[str] = ()) -> tuple[str, tuple[Pa
 
 
 def _free(taken: Collection[str], number: int) -> str:
-    """A name for a table: the first one is called as the function, as in SQL."""
+    """Return an unused table name. The first table has the name of the function, as in SQL."""
     name = f"sgql {number + 1}" if number else "sgql"
     while name in taken:
         name += "_"
@@ -92,13 +91,13 @@ def _free(taken: Collection[str], number: int) -> str:
 
 
 class _Arguments:
-    """Reads the arguments of a call, and ends behind its bracket.
+    """Reader of the arguments of a call. It stops after the closing bracket.
 
     Parameters
     ----------
     sql : str
     start, at : int
-        Where the call begins, and where its arguments do.
+        Start of the call, and start of its arguments.
     """
 
     def __init__(self, sql: str, start: int, at: int) -> None:
@@ -160,7 +159,7 @@ class _Arguments:
         return tuple(items)
 
     def _value(self) -> Any:
-        """A constant; ``None`` if there is none."""
+        """Read a constant, or return None if there is none."""
         found = _VALUE.match(self.sql, self._next())
         if found is None:
             return None

@@ -1,9 +1,9 @@
-"""Parts of a pattern, each a query of its own, for nodes that are given.
+"""Splitting of a pattern into independent parts, each a query, for given nodes.
 
-Which parts may stand alone follows from logic: "there is an x so that A and B" may be split where only one of
-A and B speaks of x. Nodes that are given are constants, so what speaks of nothing else stands alone; conditions
-and edges that share a node that is not given, or an edge that is bound, stay together, and so do nodes that
-must differ from one another. Then a frame matches exactly if all parts hold in it.
+The split follows from logic: "there is an x such that A and B" can be split if only one of A and B uses x.
+Given nodes are constants, so conditions on given nodes are separate parts. Conditions and edges that share a
+node that is not given, or a bound edge, stay together. So do nodes that must differ. A frame matches exactly
+if all parts hold in it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class DrawnEdge:
-    """An edge of a pattern as it is drawn: ends by key, what is written on it, whether it has a direction."""
+    """Edge of a pattern for a drawing: keys of its ends, label, and true if undirected."""
 
     src: str
     dst: str
@@ -35,18 +35,18 @@ class DrawnEdge:
 
 @dataclass(frozen=True, slots=True)
 class PatternPart:
-    """A part of a pattern.
+    """Independent part of a pattern.
 
     Attributes
     ----------
     text : str
-        As it would be written in a query.
+        Text in the query language.
     step : int
-        Number of its step in a sequence, from 1; 0 in a pattern of single frames.
+        Number of the step in a sequence, from 1; 0 for a single-frame pattern.
     query : Query
-        What finds the frames in which it holds for the given nodes; not rewritten.
+        Query for the frames in which the part holds for the given nodes; not rewritten.
     nodes : mapping of str to str
-        Nodes that it speaks of by key, with their labels.
+        Labels of the nodes of the part, by key.
     edges : tuple of DrawnEdge
     conditions : tuple of str
     """
@@ -63,19 +63,19 @@ _Atom = b.Edge | b.Node | b.Bound
 
 
 def parts_of(query: b.Query, given: Mapping[str, int]) -> Iterator[PatternPart]:
-    """Parts of a bound query, step by step, for given nodes.
+    """Yield the independent parts of a bound query for given nodes, step by step.
 
     Parameters
     ----------
     query : Query
-        As the binder gave it.
+        Query from the binder.
     given : mapping of str to int
-        Node ids of some of its variables. Of the others it is asked that there be some.
+        Node ids of some variables. For other variables, at least one node must exist.
 
     Raises
     ------
     QueryNameError
-        The pattern has no such variable.
+        Unknown variable.
     """
     keys = _keys_of(query)
     for name in given:
@@ -92,7 +92,7 @@ def parts_of(query: b.Query, given: Mapping[str, int]) -> Iterator[PatternPart]:
 
 
 def has_nodes(query: b.Query, names: Iterable[str]) -> bool:
-    """Tell whether a pattern has nodes of some names."""
+    """True if a pattern has nodes with the given names."""
     return {name.lower() for name in names} <= _keys_of(query).keys()
 
 
@@ -164,13 +164,13 @@ def _label(edge: b.Edge) -> str:
     return label if edge.high == 1 else f"{label}*{edge.low}..{edge.high}"
 
 
-# What stays together ----------------------------------------------------------------------------------------
+# Grouping ---------------------------------------------------------------------------------------------------
 
 
 def _groups(
     scope: b.Scope, when: tuple[b.Bound, ...], pins: Mapping[str, int]
 ) -> Iterator[list[_Atom]]:
-    """Atoms of a scope in reading order: those of a group are joined by what is not given."""
+    """Yield groups of atoms that share variables that are not given, in reading order."""
     conditions = [part for one in scope.where for part in b.conjuncts(one)]
     atoms: list[_Atom] = [*scope.edges, *conditions, *when]
     said = {key for atom in atoms for key in _nodes(atom)}
@@ -198,7 +198,7 @@ def _groups(
 
 
 def _ties(atom: _Atom, pins: Mapping[str, int], asked: set[str]) -> set[str]:
-    """Ties of an atom to others: nodes that are not given, and edges that conditions speak of."""
+    """Return the shared variables of an atom: nodes that are not given, and bound edges."""
     ties = {f"node {key}" for key in _nodes(atom) if key not in pins}
     if isinstance(atom, b.Edge):
         return ties | ({f"edge {atom.key}"} if atom.named or atom.key in asked else set())
@@ -208,7 +208,7 @@ def _ties(atom: _Atom, pins: Mapping[str, int], asked: set[str]) -> set[str]:
 
 
 def _apart(scope: b.Scope, pins: Mapping[str, int]) -> Iterator[tuple[str, str]]:
-    """Nodes, neither of them given, that must differ and could be the same."""
+    """Yield pairs of nodes, neither given, that must differ and could be the same."""
     for one, other in scope.distinct:
         if one not in pins and other not in pins and (scope.kinds(one) & scope.kinds(other)):
             yield one, other
@@ -225,7 +225,7 @@ def _nodes(atom: _Atom) -> frozenset[str]:
 
 
 def _spoken_of(atoms: Iterable[_Atom], scope: b.Scope) -> list[str]:
-    """Keys of the nodes that atoms speak of, in the order of the scope; where they speak of none, of one."""
+    """Return the node keys that atoms use, in scope order. If none are used, return one key."""
     found = {key for atom in atoms for key in _nodes(atom)}
     keys = [key for key in scope.nodes if key in found]
     anyone = sorted(scope.nodes, key=lambda key: bool(scope.nodes[key].kinds.other))
@@ -239,7 +239,7 @@ def _narrowed(
     pins: Mapping[str, int],
     when: tuple[b.Bound, ...],
 ) -> b.Scope:
-    """The scope of some atoms; nodes that are given are those with their ids, others are none of these."""
+    """Return the scope of some atoms, with given nodes fixed to their ids."""
     edges = tuple(atom for atom in atoms if isinstance(atom, b.Edge))
     where = [
         atom
@@ -263,7 +263,7 @@ _ID: Final = NODE_ATTRIBUTES["id"]
 
 
 def _relations(edges: list[b.Edge], conditions: list[b.Bound]) -> frozenset[str]:
-    """Relations of edges, and of those in blocks of conditions."""
+    """Return the relations of edges, including edges in blocks of conditions."""
     found = frozenset[str]().union(*(edge.relations for edge in edges))
     for condition in conditions:
         for block in b.blocks_of(condition):

@@ -1,8 +1,8 @@
-"""Conditions under which a value of one frame is unknown, though its entities are there.
+"""Conditions under which a value of a frame is unknown, although its entities are present.
 
-A value is *unknown* where something that is measured (a speed, a size, the weather) is not recorded of an
-entity, or where a relation was not computed, as an entity is beyond the graph. A value that does not exist is
-not unknown: two vehicles that draw apart have no time to collision.
+A value is *unknown* if a measured quantity (a speed, a size, the weather) was not recorded, or if a relation
+was not computed because an entity is beyond the graph. A value that does not exist is not unknown: two
+vehicles that move apart have no time to collision.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ CONNECTIVES: Final = frozenset({"AND", "OR", "NOT", "XOR", "IMPLIES"})
 """Words that join conditions."""
 
 _ANSWERS: Final = frozenset({"IS NULL", "IS NOT NULL", "coalesce", "case"})
-"""Operations whose value is known even of unknown operands."""
+"""Operations with a known value even for unknown operands."""
 
 _FLIPPED: Final = {"<": ">=", "<=": ">", ">": "<=", ">=": "<", "=": "<>", "<>": "="}
 _EVERYWHERE: Final = frozenset({*BEYOND, *MAP_ONLY, "mayAffect"})
-"""Relations that are known beyond the graphs as they are in them."""
+"""Relations that are also known beyond the graphs."""
 _OF_PAIRS: Final = frozenset({*DIRECTIONS, *SIDES})
-"""Relations of all pairs that settings relate."""
+"""Relations of all pairs selected by the settings."""
 _BOX: Final = frozenset({"heading", "length", "width"})
 _NONE: Final = frozenset[str]()
 _MADE_OF: Final = {
@@ -48,29 +48,28 @@ _MADE_OF: Final = {
     "sees": (frozenset({"height"}), _BOX),
     "isIn": (_BOX, _NONE),
 }
-"""What is measured of source and destination, without which it is not known that a relation does not hold.
-
-Others count as they are recorded: who hides another one, or drives between two.
+"""Measured attributes of source and destination. Without them, a missing edge does not mean that the relation
+does not hold. Other relations are taken as recorded.
 """
 _FALSE: Final = b.Value(value=False, type=Type.boolean)
 _LOOSE: Final = 1 << 20
-"""Added to the number of a block that also has the matches of which too little is known."""
+"""Offset of the number of a block that also includes matches with unknown values."""
 
 
 def unknown(value: b.Bound) -> b.Bound | None:
-    """Return the condition that a value of one frame is unknown; ``None``: it never is.
+    """Return the condition that a value of a frame is unknown. ``None`` means that it is always known.
 
     Parameters
     ----------
     value : Bound
-        A value or a condition whose entities are in the frame.
+        Value or condition whose entities are in the frame.
     """
     found = list(dict.fromkeys(_unknown(value)))
     return b.any_of(found) if found else None
 
 
 def has_pairs(value: b.Bound) -> bool:
-    """Tell whether a value is made of numbers of pairs, which some pairs do not have."""
+    """True if a value uses pair numbers, which some pairs do not have."""
     match value:
         case b.PairNumber():
             return True
@@ -81,7 +80,7 @@ def has_pairs(value: b.Bound) -> bool:
 
 
 def negated(condition: b.Bound) -> b.Bound:  # noqa: PLR0911 - a case each
-    """Return the contrary of a condition, with negations before its smallest parts only."""
+    """Return the negation of a condition, with ``NOT`` only before its smallest parts."""
     match condition:
         case b.Operation("NOT", (operand,)):
             return pushed(operand)
@@ -101,7 +100,7 @@ def negated(condition: b.Bound) -> b.Bound:  # noqa: PLR0911 - a case each
 
 
 def pushed(condition: b.Bound) -> b.Bound:
-    """Return an equal condition with negations before its smallest parts only."""
+    """Return an equivalent condition, with ``NOT`` only before its smallest parts."""
     match condition:
         case b.Operation("NOT", (operand,)):
             return negated(operand)
@@ -116,7 +115,7 @@ def pushed(condition: b.Bound) -> b.Bound:
 
 
 def spelled_out(operands: tuple[b.Bound, ...]) -> b.Bound:
-    """Exclusive *or* by ``AND``, ``OR`` and ``NOT``."""
+    """Return an ``XOR`` expressed by ``AND``, ``OR`` and ``NOT``."""
     first, *rest = operands
     for second in rest:
         ways = (
@@ -130,15 +129,15 @@ def spelled_out(operands: tuple[b.Bound, ...]) -> b.Bound:
 def certain(  # noqa: PLR0911 - a case each
     condition: b.Bound, *, decided: bool = False
 ) -> b.Bound:
-    """Return the condition that a pushed condition is true, whatever is unknown.
+    """Return the condition that a pushed condition is true for all possible unknown values.
 
-    A comparison without a value is false, and so is its contrary if it is of numbers of pairs.
+    A comparison without a value is false. If it compares pair numbers, its negation is false too.
 
     Parameters
     ----------
     condition : Bound
     decided : bool
-        Whether unknown values count as values that do not exist.
+        True if unknown values count as values that do not exist.
     """
     again = partial(certain, decided=decided)
     match condition:
@@ -162,12 +161,12 @@ def certain(  # noqa: PLR0911 - a case each
 
 
 def possible(condition: b.Bound) -> b.Bound:
-    """Return the condition that a pushed condition may be true, if unknown values allow it."""
+    """Return the condition that a pushed condition is true for some possible unknown values."""
     match condition:
         case b.Operation("AND" | "OR", operands):
             return replace(condition, operands=tuple(map(possible, operands)))
         case b.Operation("NOT", (b.BlockValue() as block,)):
-            return b.inverse(_sure(block))  # a match that is known is one
+            return b.inverse(_sure(block))  # only certain matches count
         case b.Operation("NOT", (operand,)):
             doubt = unknown(operand)
             return certain(condition) if doubt is None else b.any_of((certain(condition), doubt))
@@ -177,9 +176,9 @@ def possible(condition: b.Bound) -> b.Bound:
 
 
 def undecided(condition: b.Bound) -> b.Bound | None:
-    """Return the condition that a pushed condition may be true as far as it is known; ``None``: it is known.
+    """Return the condition that a pushed condition is possible but unknown. ``None`` means always known.
 
-    It also holds where the condition is true and one of its parts is unknown.
+    It also holds if the condition is true and one of its parts is unknown.
     """
     doubts = [doubt for part in _smallest(condition) if (doubt := unknown(part)) is not None]
     return b.all_of(b.any_of(dict.fromkeys(doubts)), possible(condition)) if doubts else None
@@ -194,7 +193,7 @@ def _smallest(condition: b.Bound) -> Iterable[b.Bound]:
 
 
 def _of_blocks(condition: b.Bound) -> bool:
-    """Tell whether a condition is of matches in braces, which are counted however much is known of them."""
+    """True if a condition contains blocks, which count matches even with unknown values."""
     return any(isinstance(part, b.BlockValue) for part in b.walk(condition))
 
 
@@ -237,7 +236,7 @@ def _attribute(node: str, name: str) -> b.Bound:
 
 
 def _unmeasured(node: str, name: str, value: b.Bound) -> b.Bound:
-    """The condition that something measured of a node is not recorded."""
+    """Return the condition that a measured attribute of a node was not recorded."""
     if name not in MOTION:
         return _is_null(value)
     still = b.Operation("coalesce", (_attribute(node, "is_static"), _FALSE), Type.boolean)
@@ -246,7 +245,7 @@ def _unmeasured(node: str, name: str, value: b.Bound) -> b.Bound:
 
 @lru_cache(maxsize=1024)
 def _of_block(block: b.BlockValue) -> tuple[b.Bound, ...]:
-    """The conditions that braces have a match of which too little is known, each once as one object."""
+    """Return the conditions that a block has a match with unknown values. The result is cached."""
     where = tuple(map(pushed, block.scope.where))
     doubts = [one for part in where for leaf in _smallest(part) for one in _unknown(leaf)]
     if block.value is not None:
@@ -266,7 +265,7 @@ def _of_block(block: b.BlockValue) -> tuple[b.Bound, ...]:
 
 @lru_cache(maxsize=1024)
 def _sure(block: b.BlockValue) -> b.BlockValue:
-    """``EXISTS`` with only those matches that are certain."""
+    """Return an ``EXISTS`` limited to certain matches."""
     doubted = any(_of_blocks(one) and unknown(one) is not None for one in block.scope.where)
     loose = [
         b.inverse(b.any_of(doubts))
@@ -274,7 +273,7 @@ def _sure(block: b.BlockValue) -> b.BlockValue:
         if "isIn" in edge.relations
         and "off_road" in block.scope.kinds(edge.dst).every
         and (doubts := [*_unmeasured_ends(edge, block.scope)])
-    ]  # what has a size reaches farther than its centre, onto a road perhaps
+    ]  # a body with a size may reach onto a road although its centre does not
     if block.word != "EXISTS" or not (loose or doubted):
         return block
     where = tuple(certain(pushed(one)) for one in block.scope.where)
@@ -285,7 +284,7 @@ def _sure(block: b.BlockValue) -> b.BlockValue:
 def _exists(
     block: b.BlockValue, edges: tuple[b.Edge, ...], where: tuple[b.Bound, ...], number: int
 ) -> b.Bound:
-    """The condition that braces have a match, with other edges and conditions."""
+    """Return the condition that a block has a match, with other edges and conditions."""
     asked = frozenset().union(*({edge.src, edge.dst} for edge in edges), *map(b.nodes_of, where))
     nodes = {key: node for key, node in block.scope.nodes.items() if key in asked}
     if not nodes and not edges:
@@ -309,22 +308,22 @@ def _exists(
 
 
 def _edges_of(condition: b.Bound) -> frozenset[str]:
-    """Keys of the edges that a condition speaks of."""
+    """Return the keys of the edges used in a condition."""
     parts = (part for part in b.walk(condition))
     return frozenset(p.edge for p in parts if isinstance(p, b.EdgeRelation | b.EdgeAttribute))
 
 
 def _not_computed(edge: b.Edge, block: b.BlockValue) -> b.Bound | None:
-    """The condition that it is not known whether there is an edge in braces; ``None``: it always is."""
+    """Return the condition that an edge in braces is unknown. ``None`` means that it is always known."""
     found = [*_beyond(edge, block.scope), *_unmeasured_ends(edge, block.scope)]
     return b.any_of(found) if found else None
 
 
 def _beyond(edge: b.Edge, scope: b.Scope) -> Iterable[b.Bound]:
-    """The condition that an edge was not computed, as an end of it is beyond the graph.
+    """Yield the condition that an edge was not computed because an end is beyond the graph.
 
-    A relation of pairs does not hold of two that settings do not relate, nor one of distance of two that are
-    farther apart.
+    A relation does not hold between entities that the settings do not relate. A distance relation does not
+    hold beyond its distance.
     """
     names = edge.relations - _EVERYWHERE
     ends = [scope.kinds(key).every & entity_kinds() for key in (edge.src, edge.dst)]
@@ -344,7 +343,7 @@ def _related(edge: b.Edge, reach: RelationScope | None) -> b.Bound:
 
 
 def _unmeasured_ends(edge: b.Edge, scope: b.Scope) -> Iterable[b.Bound]:
-    """The conditions that something was not measured of an end of an edge, so that it may be missing."""
+    """Yield conditions that a missing measurement of an end may hide an edge."""
     for forward in (True, False) if edge.both else (True,):
         for end, key in enumerate((edge.src, edge.dst) if forward else (edge.dst, edge.src)):
             every = scope.kinds(key).every

@@ -1,8 +1,7 @@
 """Explanation of a failed match: the first part of a pattern that a graph does not have.
 
-Bound patterns as text of the language, part by part: what is printed of them can be pasted and asked again.
-
-What has no name in the query gets one where it is spoken of: a lane ``lane``, a second one ``lane2``.
+Parts of bound patterns are printed in the query language, so users can paste them into a query. Nodes and
+edges without a name get one if the text needs it: ``lane`` for a lane, ``lane2`` for the second.
 """
 
 from __future__ import annotations
@@ -34,12 +33,12 @@ _ESCAPES: Final = {"\\": "\\\\", "'": "\\'", "\n": "\\n", "\t": "\\t", "\r": "\\
 
 
 def text_written(text: str) -> str:
-    """A text in quotes."""
+    """Return a text in quotes, with escapes."""
     return "'" + "".join(_ESCAPES.get(letter, letter) for letter in text) + "'"
 
 
 def label_written(kinds: b.Kinds) -> str:
-    """The label that leaves these kinds; empty where it would leave any."""
+    """Return the label for a set of kinds. It is empty if all kinds are allowed."""
     if kinds == b.any_kinds():
         return ""
     if not kinds.other:
@@ -56,7 +55,7 @@ def label_written(kinds: b.Kinds) -> str:
 
 
 def kind_label(kind: str) -> str:
-    """The label that leaves one kind."""
+    """Return the label for a single kind."""
     return _label(frozenset({kind}))
 
 
@@ -68,7 +67,7 @@ def _label(kinds: frozenset[str]) -> str:
     whole = [n for n in whole if not any(groups[n] < groups[other] for other in whole)]
     rest = kinds.difference(*(groups[name] for name in whole))
     names = [*whole]
-    if "vehicle" in rest:  # as a label it stands for all of them
+    if "vehicle" in rest:  # as a label it means all vehicle kinds
         others = groups["vehicle"] - rest
         names.append(f"(Vehicle&!({'|'.join(_camel(k) for k in KINDS if k in others)}))")
         rest -= groups["vehicle"]
@@ -82,12 +81,12 @@ def _camel(name: str) -> str:
 
 
 class Writer:
-    """Writes the parts of one pattern.
+    """Writer of the parts of one pattern in the query language.
 
     Parameters
     ----------
     scope : Scope
-        The whole pattern.
+        Scope of the whole pattern.
     """
 
     def __init__(self, scope: b.Scope) -> None:
@@ -99,7 +98,7 @@ class Writer:
             named += [edge.key for edge in inner.edges if edge.named]
             self._spoken_of |= _edges_spoken_of(inner)
         self._taken = {*named, "ego", "env", "frame", "trace"}
-        for key in named:  # one of a block may be called as one of another
+        for key in named:  # different blocks may use the same name
             self._names[key] = key if "~" not in key else self._free(key.split("~")[0])
 
     def _free(self, base: str) -> str:
@@ -119,12 +118,12 @@ class Writer:
     # Patterns
 
     def node(self, key: str, kinds: b.Kinds) -> str:
-        """``(lane:Lane)``."""
+        """Return a node as text, such as ``(lane:Lane)``."""
         label = label_written(kinds)
         return f"({self.name(key, kinds)}{':' if label else ''}{label})"
 
     def edge(self, edge: b.Edge, scope: b.Scope) -> str:
-        """``(e)-[:isIn]->(lane)``; its nodes are written elsewhere."""
+        """Return an edge as text, such as ``(e)-[:isIn]->(lane)``, without the labels of its nodes."""
         ends = (f"({self.name(key, scope.kinds(key))})" for key in (edge.src, edge.dst))
         return self._arrow(edge).join(ends)
 
@@ -146,7 +145,7 @@ class Writer:
         tests = [one for one in scope.where if isinstance(one, b.LabelTest)]
         paths = [self.node(test.node, test.kinds) for test in tests]
         said = {test.node for test in tests}.union(*((e.src, e.dst) for e in scope.edges))
-        # Its own nodes differ from those outside that it speaks of.
+        # The own nodes differ from the outer nodes that the block uses.
         paths += [f"({self.name(key)})" for key in sorted(set(scope.outer) - said)]
         paths += [self.node(key, node.kinds) for key, node in scope.nodes.items()]
         paths += [self.edge(edge, scope) for edge in scope.edges]
@@ -156,7 +155,7 @@ class Writer:
     # Expressions
 
     def expression(self, value: b.Bound, *, inner: bool = False) -> str:
-        """An expression; ``inner``: in brackets, if an operator beside it could take a part of it."""
+        """Return an expression as text. ``inner`` adds brackets where neighbouring operators need them."""
         match value:
             case b.Value():
                 return _constant(value, inner=inner)
@@ -245,7 +244,7 @@ def _of_frame(value: b.FrameAttribute) -> str:
 
 
 def _scopes(scope: b.Scope) -> Iterator[b.Scope]:
-    """A scope and those of all blocks in it."""
+    """Yield a scope and the scopes of all its blocks."""
     yield scope
     for block in _blocks(scope.where):
         yield from _scopes(block.scope)
@@ -264,19 +263,19 @@ def _edges_spoken_of(scope: b.Scope) -> set[str]:
     return {edge for value in values for edge in b.edges_of(value)}
 
 
-# Why a graph does not match a pattern: the first part that fails with those before it, and how near it came
+# Explanation of a failed match: the first part that fails together with earlier parts
 # ------------------------------------------------------------------------------------------------
-# The parts of a pattern are taken in reading order: its nodes, each edge as soon as both its ends are there,
-# then the conditions. So the answer names one part, and the parts before it do hold together.
+# The parts of a pattern are tested in reading order: its nodes, each edge as soon as both its ends are bound,
+# then the conditions. So the result names one part, and the parts before it hold together.
 
 _WRITTEN_NUMBER: Final = re.compile(
     r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|--[^\n]*|(?<![\w.])(\d+(?:\.\d+)?(?:[eE][-+]?\d+)?)"""
 )
-"""Texts and comments, which are passed over, and numbers."""
+"""Texts and comments, which are skipped, and numbers."""
 
 
 def _beyond(sign: str, limit: float, value: float) -> float:
-    """A number of few digits with which a comparison of a value is true."""
+    """Return a number with few digits for which a comparison with a value is true."""
     if sign == "=":
         return value
     up = sign in {"<", "<="}
@@ -289,7 +288,7 @@ def _beyond(sign: str, limit: float, value: float) -> float:
 
 
 MOST_LOOKED_AT: Final = 10_000
-"""Ways to bind the parts that hold, among which the nearest to a match is looked for."""
+"""Largest number of bindings of the valid parts that are searched for the nearest match."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,18 +300,18 @@ class WhyNot:
     held : tuple of str
         Parts of the pattern that hold together, in reading order.
     failed : str
-        The first part that does not hold with these; empty if the whole pattern holds.
+        First part that does not hold together with ``held``; empty if the whole pattern holds.
     nearest : mapping of str to str
-        What the variables are bound to where the failed part comes nearest to be true (or where all of it is).
+        Binding for which the failed part is nearest to true, or a match if the whole pattern holds.
     found : str
-        What is there instead: the values in the failed condition, the relations between the two nodes, the
-        kinds of nodes in the graph.
+        Actual facts: the values in the failed condition, the relations between the two nodes, or the kinds of
+        nodes in the graph.
 
-    All of them are text of the language: what ``held`` and ``failed`` say can be asked again, as patterns
+    All of them are text of the query language. ``held`` and ``failed`` can be used in queries, as patterns
     after ``MATCH`` and as conditions after ``WHERE``.
 
-    ``gaps`` says of each comparison with a number in the failed condition that is false, what the value is
-    where it comes nearest: the comparison, the number that it is compared with, and the value.
+    ``gaps`` lists each false comparison with a number in the failed condition, for the nearest binding: the
+    comparison sign, the number in the query, and the actual value.
     """
 
     held: tuple[str, ...]
@@ -322,14 +321,15 @@ class WhyNot:
     gaps: tuple[tuple[str, float, float], ...] = ()
 
     def relaxed(self, text: str) -> Iterator[tuple[int, int, str]]:
-        """Numbers of a query, by first and last place, and what to write there so that the part may hold.
+        """Yield replacements for numbers in a query that could make the failed part true.
 
-        A number may stand in several places: whoever takes one asks again whether it was the right one.
+        Each result is the start, the end and the new text. A number may occur several times in the query, so
+        the caller must test each replacement.
 
         Parameters
         ----------
         text : str
-            The query as it was written.
+            Text of the query.
         """
         for sign, limit, value in self.gaps:
             for found in _WRITTEN_NUMBER.finditer(text):
@@ -343,7 +343,7 @@ class WhyNot:
                         yield start, found.end(1), f"{new:.12g}"
 
     def as_dict(self) -> dict[str, Any]:
-        """The same as plain values."""
+        """Return the explanation as plain values."""
         return {
             "matches": not self.failed,
             "held": list(self.held),
@@ -367,21 +367,21 @@ class WhyNot:
 
 @dataclass(frozen=True, slots=True)
 class WhyNotSteps:
-    """Longest part of each step of a sequence that holds in one graph; durations and order are left aside.
+    """Longest part of each sequence step that holds in one graph. Durations and order are ignored.
 
     Attributes
     ----------
     texts : tuple of str
-        The steps as they were written.
+        Text of each step.
     steps : tuple of WhyNot
-        Each by itself: its variables are bound anew.
+        Explanation of each step, with its own bindings.
     """
 
     texts: tuple[str, ...]
     steps: tuple[WhyNot, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """The same as plain values."""
+        """Return the explanation as plain values."""
         pairs = zip(self.texts, self.steps, strict=True)
         return {"steps": [{"step": text, **step.as_dict()} for text, step in pairs]}
 
@@ -396,7 +396,7 @@ class WhyNotSteps:
 
 
 def why_not(query: b.Query, view: FrameView, text: str = "") -> WhyNot | WhyNotSteps:
-    """Explain how far a bound pattern, written as ``text``, holds in a graph; of a sequence, each step."""
+    """Explain how far a bound pattern holds in a graph. For a sequence, explain each step."""
     if not query.steps:
         return _in_frame(query.first, query, view)
     texts = (" ".join(text[step.span.start : step.span.end].split()) for step in query.steps)
@@ -417,7 +417,7 @@ def _in_frame(asked: b.Scope, query: b.Query, view: FrameView) -> WhyNot:
 
 
 def looked_up(query: b.Query) -> list[b.FrameAttribute]:
-    """Return the values of a frame that only the store can tell: its weather, users' own tables."""
+    """Return the frame attributes of a query that only the store has: weather and user tables."""
     found: dict[str, b.FrameAttribute] = {}
 
     def look(scope: b.Scope) -> None:
@@ -434,19 +434,19 @@ def looked_up(query: b.Query) -> list[b.FrameAttribute]:
 
 
 def events_in(query: b.Query, frame_id: int, ask: Ask) -> dict[str, list[NodePair]]:
-    """Events of a frame of which a query speaks, by kind: to whom they happen.
+    """Return the events of a frame that a query uses, by kind, with the nodes involved.
 
     Parameters
     ----------
     query : Query
     frame_id : int
     ask : function
-        Gives the rows of a statement with its values.
+        Function that runs a statement with its values and returns the rows.
 
     Returns
     -------
     dict
-        Kind, or the name of a user's own table → nodes. A kind that the trace does not record is left out.
+        Kind, or name of a user table → nodes. Kinds that the trace does not record are omitted.
     """
     found: dict[str, list[NodePair]] = {}
     for one in _happened_anywhere(query):
@@ -459,7 +459,7 @@ def events_in(query: b.Query, frame_id: int, ask: Ask) -> dict[str, list[NodePai
 
 
 def _happened_anywhere(query: b.Query) -> list[b.Happened]:
-    """Return what a query asks whether it has happened, each kind once, of as many nodes as may be."""
+    """Return the event tests of a query, one for each kind, with the largest number of nodes."""
     found: dict[str, b.Happened] = {}
 
     def look(scope: b.Scope) -> None:
@@ -498,7 +498,7 @@ def _parts(scope: b.Scope) -> list[_Part]:
 
 
 def _growing(whole: b.Scope, scope: b.Scope, parts: list[_Part]) -> Iterator[tuple[_Part, b.Scope]]:
-    """Each part, with the scope of all parts up to it."""
+    """Yield each part, with the scope of all parts up to it."""
     for part in parts:
         if isinstance(part, b.Node):
             scope = replace(scope, nodes={**scope.nodes, part.key: part})
@@ -536,7 +536,7 @@ def _failure(
         at = _first(scope, query, view)
         nearest = _named(at, scope) if at else {}
         return WhyNot(held, _text(part, scope, writer), nearest, _population(view))
-    # A condition on an edge needs the edge bound, which a scope without conditions on it does not do.
+    # A condition on an edge needs a bound edge. A scope without such conditions does not bind it.
     edges = tuple(replace(edge, named=True) if edge.high == 1 else edge for edge in scope.edges)
     for at in islice(_bindings(replace(scope, edges=edges), query, view), MOST_LOOKED_AT):
         short = _apart(part, at) if isinstance(part, b.Edge) else shortfall(part, at, query)
@@ -549,7 +549,7 @@ def _failure(
 
 
 def _gaps(condition: b.Bound, at: Binding, query: b.Query) -> Iterator[tuple[str, float, float]]:
-    """Comparisons in a condition with a number that are false: sign, number, and value."""
+    """Yield the false comparisons with a number in a condition: sign, number and actual value."""
     for part in b.walk(condition):
         match part:
             case b.Operation(word=word, operands=(left, right)) if word in _COMPARED:
@@ -566,7 +566,7 @@ def _gaps(condition: b.Bound, at: Binding, query: b.Query) -> Iterator[tuple[str
 
 
 def _constant_of(value: b.Bound) -> float | None:
-    """The number that an expression is, if it is one."""
+    """Return the number of a constant expression, or None."""
     match value:
         case b.Value(shown=int() | float() as number) if not isinstance(number, bool):
             return float(number)
@@ -604,23 +604,23 @@ def _value(of: b.Bound, at: Binding, query: b.Query) -> Any:
 
 
 def _apart(edge: b.Edge, at: Binding) -> float:
-    """Return the distance between the ends of an edge; inf where they have none."""
+    """Return the distance between the ends of an edge, or inf if unknown."""
     distance = at.view.pair("dist", at.nodes[edge.src], at.nodes[edge.dst])
     return math.inf if distance is None else distance
 
 
-# As text: each part is one of the language -------------------------------------------------------------------
+# Text of parts in the query language --------------------------------------------------------------------------
 
 
 def _text(part: _Part, scope: b.Scope, writer: Writer) -> str:
-    """A part as it would be written in a query; what has no name is given one."""
+    """Return a part as text in the query language, with names for unnamed nodes."""
     if isinstance(part, b.Node):
         return writer.node(part.key, part.kinds)
     return writer.edge(part, scope) if isinstance(part, b.Edge) else writer.expression(part)
 
 
 def _named(at: Binding, scope: b.Scope) -> dict[str, str]:
-    """Names of the nodes that the named variables are bound to."""
+    """Return the names of the nodes bound to the named variables."""
     return {
         key: _name(at.view, at.nodes[key])
         for key, node in scope.nodes.items()
@@ -633,14 +633,14 @@ def _name(view: FrameView, node: int) -> str:
 
 
 def _population(view: FrameView) -> str:
-    """Return the number of nodes of each kind."""
+    """Return the number of nodes of each kind, as text of the query language."""
     counts = Counter(attributes["kind"] for attributes in view.nodes.values())
     found = [(kind_label(kind), counts[kind]) for kind in KINDS if counts[kind]]
     return " AND ".join(f"COUNT {{(:{label})}} = {many}" for label, many in found)
 
 
 def _between(edge: b.Edge, at: Binding, writer: Writer) -> str:
-    """The relations that there are between the ends of an edge, both ways."""
+    """Return the relations between the ends of an edge in both directions, as text."""
     src, dst = at.nodes[edge.src], at.nodes[edge.dst]
     called = {src: writer.name(edge.src), dst: writer.name(edge.dst)}
     ways = []
@@ -661,7 +661,7 @@ def _between(edge: b.Edge, at: Binding, writer: Writer) -> str:
 
 
 def _values(condition: b.Bound, at: Binding, query: b.Query, writer: Writer) -> str:
-    """Return the values in a condition."""
+    """Return the values in a condition, as text of the query language."""
     texts: dict[str, str] = {}
     for leaf in leaves(condition):
         name = writer.expression(leaf)
@@ -673,7 +673,7 @@ def _values(condition: b.Bound, at: Binding, query: b.Query, writer: Writer) -> 
 
 
 def _shown(name: str, value: Any) -> str:
-    """``e.speed = 5.697``."""
+    """Return a value as text, such as ``e.speed = 5.697``."""
     if value is None:
         return f"{name} IS NULL"
     if isinstance(value, bool):
