@@ -1,8 +1,9 @@
-"""Clips of recordings and their graphs → files: one file for each format, listed in :data:`EXPORTERS`.
+"""Exporters of clips and their graphs: one file per format, listed in :data:`EXPORTERS`.
 
-Each export is written aside first, then all of it is there or nothing, with a manifest. A format is a function
-from an :class:`Export` and a folder to what it wrote there; other packages add theirs as entry points of the
-group ``sgstore.exporters``: the name of the format, and an :class:`Exporter`.
+Each export is first written to a temporary folder, then moved completely or not at all, with a
+manifest. A format is a function from an :class:`Export` and a folder to the written files. Other
+packages add formats with an entry point of the group ``sgstore.exporters``: the name of the format,
+and an :class:`Exporter`.
 """
 
 import lazy_loader

@@ -1,9 +1,9 @@
-"""Shared parts of the exporters: sources and names of clips, and folders that appear complete or not at all.
+"""Shared parts of the exporters: sources and names of clips, and atomic output folders.
 
-An export is whole or it is not there: its files are written into a folder of their own beside their
-place, and moved there, one after another, when all of them are finished, the manifest last: where there is
-none, there is no export. Nothing that exists is ever overwritten, and nothing is written outside the folder
-that the user names.
+An export is complete or absent. Its files are written to a temporary folder next to their place.
+When all are finished, they are moved there one after another, the manifest last: a folder without a
+manifest has no export. Existing files are never overwritten, and only the folder of the user is
+written to.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MANIFEST: Final = "manifest.json"
 _PREFIX: Final = ".export-"
 _FILES: Final = "files"
 _MOVING: Final = "moving.json"
-"""In the folder of an export on its way: its files, and what they are once they begin to be moved."""
+"""Journal in the temporary folder: its files, and their identities once they are being moved."""
 
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9._-]+")
 _RESERVED: Final = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")
@@ -42,7 +42,7 @@ _LONGEST_NAME: Final = 80
 
 @dataclass(frozen=True, slots=True)
 class ChannelCount:
-    """Messages of a channel in a clip. ``id``, ``topic``, ``schema`` as the source has them."""
+    """Messages of a channel in a clip; ``id``, ``topic`` and ``schema`` are those of the source."""
 
     id: int
     topic: str
@@ -52,25 +52,25 @@ class ChannelCount:
 
 @dataclass(frozen=True, slots=True)
 class WrittenClip:
-    """A clip that was written.
+    """Description of a written clip.
 
     Attributes
     ----------
     file : Path
     sha256 : str
-        Of the file.
+        Hash of the file.
     trace, source, source_sha256 : str
         Name of the trace; name and SHA-256 of its file.
     start_ns, end_ns : int
         Log times, both included.
     messages : tuple of ChannelCount
-        Every channel of the source, those without a message too.
+        Every channel of the source, including empty ones.
     context : int
-        Messages among them that stand outside the interval: what later ones depend on.
+        Number of context messages among them: outside the interval, but needed by later ones.
     losses : tuple of Loss
-        What of the source could not be read where the clip was cut.
+        Unreadable parts of the source in the clip.
     provenance : dict
-        What the caller wants to be known of it: the query and its hash, the version of the tool.
+        Values of the caller about the origin: the query and its hash, the version of the tool.
     """
 
     file: Path
@@ -86,13 +86,13 @@ class WrittenClip:
     provenance: dict[str, str]
 
     def as_dict(self) -> dict[str, Any]:
-        """The clip as plain values, as it stands in a manifest."""
+        """Return the clip as plain values for a manifest."""
         values = asdict(self)
         values["file"] = self.file.name
         return values
 
     def as_row(self) -> dict[str, Any]:
-        """Row of a table for people."""
+        """Return a row for the table of the command line."""
         return {
             "clip": str(self.file),
             "trace": self.trace,
@@ -104,20 +104,20 @@ class WrittenClip:
 
 @dataclass(frozen=True, slots=True)
 class WrittenFile:
-    """A file, or a folder of files, that was written.
+    """Description of a written file or folder.
 
     Attributes
     ----------
     file : Path
-        In the folder of the export.
+        Path in the folder of the export.
     sha256 : str
-        Of a file; empty for a folder: a table beside it has those of its files.
+        Hash of a file; empty for a folder, whose files have hashes in a table.
     holds : str
-        What it holds: ``nodes``, ``pictures``, ….
+        Kind of its content: ``nodes``, ``pictures``, ….
     count : int
-        How many of these.
+        Number of these.
     losses : tuple of Loss
-        What of the graphs or of the recordings is not in it.
+        Parts of the graphs or recordings that are missing in it.
     """
 
     file: Path
@@ -128,65 +128,65 @@ class WrittenFile:
 
     @classmethod
     def of(cls, file: Path, holds: str, count: int, losses: Sequence[Loss] = ()) -> WrittenFile:
-        """A file or a folder that is there, with its hash."""
+        """Describe an existing file or folder, with its hash."""
         digest = digest_of(file) if file.is_file() else ""
         return cls(file, digest, holds, count, tuple(losses))
 
     def as_dict(self) -> dict[str, Any]:
-        """The file as plain values, as it stands in a manifest."""
+        """Return the file as plain values for a manifest."""
         return asdict(self) | {"file": self.file.name}
 
     def as_row(self) -> dict[str, Any]:
-        """Row of a table for people."""
+        """Return a row for the table of the command line."""
         return {"file": str(self.file), "holds": self.holds, "count": self.count}
 
 
 def provenance_of(told: dict[str, str]) -> dict[str, str]:
-    """Provenance of an export: the caller's values, the hash of its query, and the version of the tool."""
+    """Return the origin of an export: the caller's values, the hash of its query, the tool version."""
     query = told.get("query", "")
     digest = {"query_sha256": hashlib.sha256(query.encode()).hexdigest()} if query else {}
     return {**told, **digest, "tool": tool()}
 
 
 def tool() -> str:
-    """Name and version of this package."""
+    """Return name and version of this package."""
     return f"sgstore {version('sgstore')}"
 
 
 def clip_name(trace: str, number: int, ending: str) -> str:
-    """A file name for a clip, safe on every system: ``swarm_Town04_003.mcap``.
+    """Return a portable file name for a clip: ``swarm_Town04_003.mcap``.
 
-    Whatever may not stand in a name becomes ``_``; the number, unique in an export, keeps names apart.
+    Invalid characters become ``_``; the number, unique in an export, prevents collisions.
     """
     return f"{safe_name(trace, 'clip')}_{number:03d}{ending}"
 
 
 def safe_name(text: str, otherwise: str) -> str:
-    """A name for a file or a folder, safe on every system: no separators, no dots in front, nothing reserved.
+    """Return a portable name of a file or folder, without separators, leading dots and reserved names.
 
     Parameters
     ----------
     text : str
-        Whatever may not stand in a name becomes ``_``.
+        Invalid characters become ``_``.
     otherwise : str
-        The name, if nothing is left.
+        Default for an empty name.
     """
     name = _UNSAFE.sub("_", text)[:_LONGEST_NAME].strip("._-") or otherwise
     return f"_{name}" if _RESERVED.fullmatch(name) else name
 
 
 def check_folder(to: Path) -> None:
-    """Refuse a folder that no export can be written into, before anything is searched.
+    """Reject a folder that cannot take an export, before the search starts.
 
     Parameters
     ----------
     to : Path
-        It need not exist.
+        The folder may be missing.
 
     Raises
     ------
     ExportError
-        It is a file, or there is an export in it.
+        It is a file, or contains an export.
     """
     if os.path.lexists(to) and not to.is_dir():
         raise ExportError(f"{to}: a file; an export needs a folder")
@@ -195,17 +195,17 @@ def check_folder(to: Path) -> None:
 
 @contextmanager
 def export_folder(to: Path) -> Generator[Path]:
-    """A folder to write the files of an export into; they are moved to ``to`` if all goes well.
+    """Yield a temporary folder for the files of an export; move them to ``to`` on success.
 
     Parameters
     ----------
     to : Path
-        Made if it does not exist, and gone again if the export is not complete.
+        Created if missing, and removed again if the export fails.
 
     Raises
     ------
     ExportError
-        One of the files exists, or nothing can be written there.
+        One of the files exists, or the folder is not writable.
     """
     made = [folder for folder in (to, *to.parents) if not folder.exists()]
     try:
@@ -225,21 +225,21 @@ def export_folder(to: Path) -> Generator[Path]:
         raise ExportError(f"{to}: cannot be written: {error.strerror or error}") from error
     finally:
         for folder in made:
-            with suppress(OSError):  # what holds something stays
+            with suppress(OSError):  # folders with content stay
                 folder.rmdir()
 
 
 def _mark(thing: Path) -> list[int]:
-    """Identity of a file or a folder, which stays when it is moved."""
+    """Return the identity of a file or folder, which a move preserves."""
     about = thing.lstat()
     return [about.st_dev, about.st_ino]
 
 
 def _undo(left: Path) -> None:
-    """Take back what a killed export had moved to its place when it was not complete."""
+    """Remove the partly moved files of a killed export."""
     try:
         marks = json.loads((left / _MOVING).read_text(encoding="utf-8"))
-    except (OSError, ValueError):  # it had not begun to move
+    except (OSError, ValueError):  # the move had not begun
         return
     to = left.parent
     if _is_the(to / MANIFEST, marks[MANIFEST]):
@@ -258,7 +258,7 @@ def _is_the(thing: Path, mark: list[int]) -> bool:
 
 
 def _is_kept_free(target: Path, thing: Path) -> bool:
-    """Return True for a placeholder whose file has not come yet."""
+    """True for a placeholder whose file has not been moved yet."""
     if target.is_symlink() or not (target.exists() and thing.exists()):
         return False
     return not any(target.iterdir()) if target.is_dir() else not target.stat().st_size
@@ -280,20 +280,20 @@ def _refuse_taken(to: Path, names: Sequence[str]) -> None:
 
 
 def write_manifest(folder: Path, form: str, content: Mapping[str, Any]) -> None:
-    """Write the manifest of an export: the same bytes for the same content."""
+    """Write the manifest of an export; equal content gives equal bytes."""
     told = {"format": form, "tool": tool(), **content}
     text = json.dumps(told, indent=2, sort_keys=True, ensure_ascii=False)
     (folder / MANIFEST).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
 def _move(things: Sequence[Path], to: Path) -> None:
-    """Move files and folders to a folder, all or none; what came into being meanwhile is not overwritten."""
+    """Move files and folders to a folder, all or none, without overwriting."""
     moved: list[Path] = []
     try:
         for thing in things:
             target = to / thing.name
             if thing.is_dir():
-                target.mkdir()  # unlike a renaming, it fails where something is
+                target.mkdir()  # unlike a rename, it fails for an existing target
                 moved.append(target)
                 thing.replace(target)
             else:
@@ -307,10 +307,10 @@ def _move(things: Sequence[Path], to: Path) -> None:
 
 def _move_file(file: Path, target: Path) -> None:
     try:
-        target.hardlink_to(file)  # unlike a renaming, it fails where something is
+        target.hardlink_to(file)  # unlike a rename, it fails for an existing target
     except FileExistsError:
         raise
-    except OSError:  # a file system without links
+    except OSError:  # a file system without hard links
         with target.open("xb"):
             pass
         file.replace(target)

@@ -1,10 +1,10 @@
-"""Conversion to Foxglove messages: sensor data and scene graphs.
+"""Conversion of sensor data and scene graphs to Foxglove messages.
 
-Foxglove, Lichtblick and the reader of this package show them. Pictures are PNG; a measurement that is neither
-a picture nor points is JSON. In a scene graph entities are boxes with their names, parts of the map are dots,
-edges are lines from centre to centre; those of one relation are one thing, so that a viewer can show and hide
-them. Each message replaces the one before it. Places are those of the scene graph: metres, in the axes of the
-road map.
+Foxglove, Lichtblick and the reader of this package display them. Pictures are PNG; other
+measurements than pictures and points are JSON. In a scene graph, entities are boxes with names, map
+parts are dots, and edges are lines between centres. All edges of one relation are one scene entity,
+so that a viewer can show and hide them. Each message replaces the previous one. Places are those of
+the scene graph: metres, in the axes of the road map.
 
 Source: foxglove-sdk, schemas (public lists of fields).
 """
@@ -75,7 +75,7 @@ _TYPES: Final = {
     " translation=4:Vector3 rotation=5:Quaternion",
     "FrameTransforms": "transforms=1:FrameTransform*",
 }
-"""Fields of the messages, ``name=number:type``, with * if repeated; each after those that it needs."""
+"""Fields of the messages, ``name=number:type``, with * if repeated; dependencies first."""
 _ENUMS: Final = {
     "PackedElementField.NumericType": "UNKNOWN UINT8 INT8 UINT16 INT16 UINT32 INT32 FLOAT32 FLOAT64",
     "LinePrimitive.Type": "LINE_STRIP LINE_LOOP LINE_LIST",
@@ -89,13 +89,13 @@ SCENE, TRANSFORMS = "SceneUpdate", "FrameTransforms"
 
 
 def schema(name: str) -> bytes:
-    """Return the descriptors of a message and of all that it needs, as an MCAP file carries them."""
+    """Return the descriptors of a message and its dependencies, as in MCAP files."""
     return _descriptors(name).SerializeToString()
 
 
 @cache
 def _descriptors(name: str) -> descriptor_pb2.FileDescriptorSet:
-    """Descriptors of a message, of the messages that it is made of, and of Google's files for them."""
+    """Return descriptors of a message, its nested messages, and Google's files for them."""
     kinds = {one: set(re.findall(r":(\w+)", fields)) for one, fields in _TYPES.items()}
     needed, found = set[str](), {name}
     while found:
@@ -119,7 +119,7 @@ def _descriptors(name: str) -> descriptor_pb2.FileDescriptorSet:
 
 
 def _add_message(message: descriptor_pb2.DescriptorProto) -> None:
-    """Fill in the fields and enumerations of a message, by its name."""
+    """Add the fields and enumerations of a message, by its name."""
     google = dict.fromkeys(_GOOGLE, "google.protobuf")
     add_fields(message, _TYPES[message.name], _ENUMS, "foxglove", google)
     for name_of, words in _ENUMS.items():
@@ -140,14 +140,14 @@ def message_type(name: str) -> type[Any]:
 
 
 def image(pixels: NDArray[np.uint8], time_ns: int, frame_id: str) -> bytes:
-    """A picture, (height, width, 3), as ``foxglove.CompressedImage``."""
+    """Convert a picture (height, width, 3) to ``foxglove.CompressedImage``."""
     out = message_type(IMAGE)(format="png", frame_id=frame_id, data=png(pixels))
     stamp(out, time_ns)
     return out.SerializeToString()
 
 
 def calibration(width: int, height: int, fov: float, time_ns: int, frame_id: str) -> bytes:
-    """A pinhole camera without distortion, by its field of view across, in degrees."""
+    """Return a pinhole camera without distortion, from its horizontal field of view in degrees."""
     focal = width / (2 * math.tan(math.radians(fov) / 2))
     x, y = width / 2, height / 2
     out = message_type(CALIBRATION)(
@@ -161,7 +161,7 @@ def calibration(width: int, height: int, fov: float, time_ns: int, frame_id: str
 
 
 def cloud(points: NDArray[Any], time_ns: int, frame_id: str) -> bytes:
-    """Points, a structured array, as ``foxglove.PointCloud`` in the sensor's own axes."""
+    """Convert points (a structured array) to ``foxglove.PointCloud`` in the sensor's axes."""
     out = message_type(CLOUD)(frame_id=frame_id, data=points.tobytes())
     out.point_stride = points.dtype.itemsize
     out.pose.orientation.w = 1.0
@@ -172,7 +172,7 @@ def cloud(points: NDArray[Any], time_ns: int, frame_id: str) -> bytes:
 
 
 def values(told: dict[str, Any], time_ns: int) -> bytes:
-    """Values by name, as JSON with their time."""
+    """Return values by name as JSON, with their time."""
     about = {"timestamp": {"sec": time_ns // 10**9, "nsec": time_ns % 10**9}} | told
     return json.dumps(finite(about), allow_nan=False).encode()
 
@@ -183,14 +183,14 @@ def stamp(message: Any, time_ns: int) -> None:
 
 
 AXES: Final = "map"
-"""Name of the axes of all scene graphs: as CARLA's bridge and most ROS systems call the world."""
+"""Name of the axes of all scene graphs, as in CARLA's bridge and most ROS systems."""
 
 _ALL, _LINE_LIST = 1, 2
 
 Colour = tuple[float, float, float, float]
 
-# Viewers have a white or a black ground. Each colour has a contrast of at least 3 to both, those of faint edges
-# of 1.5, of texts of 4.5. (WCAG 2.2, relative luminance and contrast ratio, 1.4.3 and 1.4.11.)
+# Viewers have a white or a black background. Each colour has a contrast of at least 3 to both;
+# faint edges 1.5, texts 4.5. (WCAG 2.2, relative luminance and contrast ratio, 1.4.3 and 1.4.11.)
 EGO_COLOUR: Final[Colour] = (0.1, 0.45, 0.95, 1.0)
 TEXT_COLOUR: Final[Colour] = (0.46, 0.46, 0.46, 1.0)
 COLOURS: Final[dict[str, Colour]] = {
@@ -223,7 +223,7 @@ RELATION_COLOURS: Final[dict[str, Colour]] = {
 OTHER_RELATIONS: Final[Colour] = (0.55, 0.55, 0.55, 0.5)
 
 DOT: Final = 0.5
-"""Diameter of what has no size; m."""
+"""Diameter of nodes without a size; m."""
 LINE: Final = 2.0
 """Width of edges; pixels."""
 TEXT: Final = 12.0
@@ -231,7 +231,7 @@ TEXT: Final = 12.0
 
 
 def message(graph: SceneGraph, log_time_ns: int) -> bytes:
-    """A scene graph as a message; a node without a place is not drawn, nor are its edges."""
+    """Convert a scene graph to a message, without nodes that have no place and without their edges."""
     update = message_type(SCENE)()
     gone = update.deletions.add(type=_ALL)
     stamp(gone, log_time_ns)
@@ -289,12 +289,12 @@ def _add_node(
 
 
 def is_solid(node: int, about: Mapping[str, Any]) -> bool:
-    """Tell whether a node is an entity whose box is known."""
+    """True if a node is an entity with a known box."""
     return node >= 0 and all(about.get(side) for side in ("length", "width", "height"))
 
 
 def colour_of(about: Mapping[str, Any]) -> Colour:
-    """Return the colour of a node, by what it is and what it shows."""
+    """Return the colour of a node, by its kind and light state."""
     if about.get("is_ego"):
         return EGO_COLOUR
     return LIGHTS.get(about.get("light_state", ""), COLOURS.get(about["kind"], OTHERS))
@@ -302,7 +302,7 @@ def colour_of(about: Mapping[str, Any]) -> Colour:
 
 @dataclass(frozen=True, slots=True)
 class AxesTransform:
-    """The place of axes in others.
+    """Pose of axes relative to parent axes.
 
     Attributes
     ----------
@@ -321,7 +321,7 @@ class AxesTransform:
 
 
 def transforms(told: Iterable[AxesTransform], log_time_ns: int) -> bytes:
-    """Places of axes at a time, as ``foxglove.FrameTransforms``."""
+    """Convert poses of axes at a time to ``foxglove.FrameTransforms``."""
     out = message_type(TRANSFORMS)()
     for one in told:
         found = out.transforms.add(parent_frame_id=one.parent, child_frame_id=one.child)
@@ -332,7 +332,7 @@ def transforms(told: Iterable[AxesTransform], log_time_ns: int) -> bytes:
 
 
 def turn_of(about: Mapping[str, Any]) -> tuple[float, float, float]:
-    """Heading, pitch and roll of a node; rad. What is not known is 0."""
+    """Return heading, pitch and roll of a node; rad. Unknown angles are 0."""
     heading, pitch, roll = (
         math.radians(about.get(angle, 0.0)) for angle in ("heading", "pitch", "roll")
     )
@@ -340,7 +340,7 @@ def turn_of(about: Mapping[str, Any]) -> tuple[float, float, float]:
 
 
 def quaternion(yaw: float, pitch: float, roll: float) -> tuple[float, float, float, float]:
-    """A turn about z, then about the new y, then about the new x, as x, y, z, w; rad."""
+    """Return the quaternion x, y, z, w of turns about z, the new y, and the new x; rad."""
     cy, cp, cr = (math.cos(angle / 2) for angle in (yaw, pitch, roll))
     sy, sp, sr = (math.sin(angle / 2) for angle in (yaw, pitch, roll))
     return (
@@ -356,7 +356,7 @@ def _turn(orientation: Any, turn: tuple[float, float, float, float]) -> None:
 
 
 def place_of(about: Mapping[str, Any]) -> tuple[float, float, float] | None:
-    """Return where a node is; m. ``None``: not known."""
+    """Return the position of a node; m. ``None`` means unknown."""
     if "x" not in about or "y" not in about:
         return None
     return about["x"], about["y"], about.get("z", 0.0)

@@ -1,13 +1,13 @@
-"""Export of sensor messages as files: pictures, clouds of points, videos.
+"""Export of sensor messages as files: pictures, point clouds, videos.
 
-For each clip there is a folder with one of each sensor: ``CLIP/SENSOR/000123.jpg`` is the message that belongs
-to frame 123 (the first frame that it belongs to: several frames may share one). Files of pictures are copied
-as they are; bare pixels become PNG; clouds ``.pcd``, ``.npy`` or ``.bin``; of a video there is one file,
-``CLIP/SENSOR.h264``, from the key frame that its first picture needs to its last, as it was recorded.
+Each clip has a folder with one subfolder per sensor: ``CLIP/SENSOR/000123.jpg`` is the message of
+frame 123 (the first such frame: several frames can share a message). Picture files are copied; raw
+pixels become PNG; clouds become ``.pcd``, ``.npy`` or ``.bin``. A video is one file,
+``CLIP/SENSOR.h264``, from the key frame before its first picture to its last picture, as recorded.
 
-``files.csv`` says which file belongs to which frame and sensor, ``frames.csv`` has the frames and their labels,
-``channels.csv`` all channels of sensors with what came of them: messages that are neither pictures nor clouds
-stay in the recording.
+``files.csv`` lists the file of each frame and sensor, ``frames.csv`` the frames and their labels,
+and ``channels.csv`` all sensor channels with counts. Messages other than pictures and clouds are
+not exported.
 """
 
 from __future__ import annotations
@@ -44,16 +44,16 @@ if TYPE_CHECKING:
 
 
 WINDOW: Final = 2400
-"""Frames whose messages are looked for in one walk over a recording."""
+"""Frames whose messages are searched in one pass over a recording."""
 
 ENDINGS: Final = {"jpeg": "jpg", "tiff": "tif"}
-"""Forms whose files end otherwise than they are called."""
+"""Forms whose file ending differs from their name."""
 
 FILE_COLUMNS: Final = (
     *("clip", "frame_id", "trace", "seq", "channel", "log_time_ns", "file", "holds", "form"),
     *("picture", "sha256"),
 )
-"""``picture``: which one in the file of a video, from 0."""
+"""``picture``: index in the file of a video, from 0."""
 CHANNEL_COLUMNS: Final = ("trace", "channel", "schema", "holds", "frames", "files", "lost")
 
 _PAYLOADS: Final = """
@@ -63,12 +63,12 @@ ORDER BY frame_id, channel, log_time_ns, chunk_offset, message_offset
 """
 
 Place = tuple[int, int]
-"""Where a message stands: offset of its chunk, and in it."""
+"""Place of a message: offset of its chunk, and offset in the chunk."""
 
 
 @dataclass(slots=True)
 class _FrameMessage:
-    """A message that belongs to a frame."""
+    """Message of a frame."""
 
     frame_id: int
     seq: int
@@ -78,14 +78,14 @@ class _FrameMessage:
 
 
 File = tuple[str, str, str, str, str]
-"""A file that was written, as the last columns of :data:`FILE_COLUMNS`: name, holds, form, picture, hash."""
+"""A written file, as the last columns of :data:`FILE_COLUMNS`: name, holds, form, picture, hash."""
 Found = dict[tuple[str, Place], File | None]
-"""Files of messages, by channel and place; ``None`` where one is neither picture nor cloud."""
+"""Files of messages, by channel and place; ``None`` means neither picture nor cloud."""
 
 
 @dataclass(slots=True)
 class _Film:
-    """The file of a video, where its latest picture stands in the recording, and how many there are."""
+    """File of a video, the place of its latest picture in the recording, and the picture count."""
 
     path: Path
     form: str
@@ -93,7 +93,7 @@ class _Film:
     count: int
 
     def as_file(self) -> File:
-        """The latest picture."""
+        """Return the table columns of the latest picture."""
         name = f"{self.path.parent.name}/{self.path.name}"
         return name, "video", self.form, str(self.count - 1), ""
 
@@ -111,7 +111,7 @@ class _Count:
 
 @dataclass(slots=True)
 class _Tables:
-    """The tables of an export, and what was counted."""
+    """Tables of an export, and counts."""
 
     files: Any
     frames: Any
@@ -123,7 +123,7 @@ class _Tables:
     frame_rows: int = 0
 
     def losses(self) -> list[Loss]:
-        """Losses of each channel: the first reason, and their number."""
+        """Return the losses of each channel: the first reason, and their number."""
         return [
             Loss(
                 f"{trace}, {topic!r}: {count} messages are not there; the first: {reason}", count, 0
@@ -133,7 +133,7 @@ class _Tables:
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
-    """Write files and tables; pictures are opened again where Pillow is installed."""
+    """Write files and tables; pictures are checked with Pillow if it is installed."""
     _check_channels(export)
     names = list(export.labels.texts) if export.labels is not None else []
     places: list[Path] = []
@@ -182,7 +182,7 @@ def _check_channels(export: Export) -> None:
 
 @contextmanager
 def _recording(export: Export, frames: ClipFrames) -> Generator[tuple[StoredTrace, Recording]]:
-    """The recording of a clip, if it is the one that was ingested."""
+    """Open the recording of a clip; reject a file that has changed since ingest."""
     trace = export.trace(frames.clip.trace)
     with open_recording(trace.path) as recording:
         if (recording.size, recording.mtime_ns) != (trace.size, trace.mtime_ns):
@@ -202,7 +202,7 @@ def _write_frames(export: Export, frames: ClipFrames, tables: _Tables) -> None:
 
 
 def _by_trace(of: dict[tuple[str, str], _Count]) -> list[tuple[tuple[str, str], _Count]]:
-    """By name of the trace and topic."""
+    """Sort by trace name and topic."""
     return sorted(of.items(), key=lambda one: (natural(one[0][0]), one[0][1]))
 
 
@@ -218,7 +218,7 @@ def _write_channels(file: Path, tables: _Tables) -> None:
 
 @dataclass(slots=True)
 class _Writing:
-    """A clip on its way into its folder."""
+    """Writer of one clip into its folder."""
 
     export: Export
     trace: StoredTrace
@@ -240,7 +240,7 @@ class _Writing:
             wanted: dict[tuple[str, Place], _FrameMessage] = {}
             for row in rows:
                 wanted.setdefault((row.channel, row.place), row)
-            # A message that frames of two windows share has been written already.
+            # A message shared by frames of two windows is already written.
             found = {key: before[key] for key in wanted if key in before}
             self._fetch({k: row for k, row in wanted.items() if k not in found}, found)
             for row in rows:
@@ -264,14 +264,12 @@ class _Writing:
         wanted: dict[tuple[str, Place], _FrameMessage],
         found: Found,
     ) -> None:
-        """Write the messages at some places into files; ``None`` where one is neither picture nor cloud."""
+        """Write the messages at these places to files; ``None`` means neither picture nor cloud."""
         chunks = {place[0] for _, place in wanted}
         if not chunks:
             return
         low, high = min(chunks), max(chunks)
-        if (
-            self._films
-        ):  # all pictures between two that are wanted are needed to decode the later one
+        if self._films:  # all pictures between two wanted ones are needed to decode the later one
             low = min(low, *(film.last[0] for film in self._films.values()))
         ends: dict[str, Place] = {}
         for topic, place in wanted:
@@ -297,7 +295,7 @@ class _Writing:
         found: Found,
         ends: dict[str, Place],
     ) -> None:
-        """Write a message, if it is wanted, or if a video goes on with it up to one that is."""
+        """Write a message if it is wanted, or if a video needs it for a later picture."""
         channel = self.recording.channels.get(int(run.channel[at]))
         if channel is None:
             return
@@ -356,7 +354,7 @@ class _Writing:
         return f"{self.folder.name}/{name}", holds, form, "", digest
 
     def _begin(self, row: _FrameMessage, video: Sensed) -> File | None:
-        """Begin the file of a video with the key frame that a picture needs, and all between."""
+        """Start a video file with the key frame before a picture, and all pictures between."""
         try:
             carried = self.export.store.file.carried(row.frame_id, row.channel)
         except (TraceError, StoreError) as error:
@@ -377,7 +375,7 @@ class _Writing:
         return film.as_file()
 
     def _tell(self, row: _FrameMessage, file: File | None) -> None:
-        """A row of the table of files."""
+        """Write a row of the table of files."""
         count = self._count(row)
         count.frames += 1
         if file is None:
@@ -408,7 +406,7 @@ class _Writing:
         self.tables.lost[key] = first, count + 1
 
     def _name(self, topic: str) -> str:
-        """The name of the folder of a sensor: safe, and unlike those of the others."""
+        """Return a unique, portable folder name for a sensor."""
         if topic not in self._names:
             name, number = safe_name(topic, "sensor"), 1
             taken = {other.lower() for other in self._names.values()}
@@ -419,7 +417,7 @@ class _Writing:
 
 
 def _test_picture(path: Path, data: bytes) -> None:
-    """Open a picture that was written, where Pillow is installed.
+    """Open a written picture with Pillow, if it is installed.
 
     Raises
     ------
@@ -440,27 +438,25 @@ def _test_picture(path: Path, data: bytes) -> None:
             raise ExportError(f"{path.name}: cannot be opened again: {error}") from error
 
 
-# What a message of a sensor holds: a picture or a cloud of points, by the schema in the file ----
-# Messages that wrap the file of a picture (``data`` and ``format``) give that file; those that hold pixels
-# (``width``, ``height``, ``encoding``, ``data``) give a PNG, or an array where a PNG cannot hold them; those
-# that hold points (``fields`` and their places in ``data``) give columns. Of anything else nothing is known
-# here.
-#
-# Source: ROS 2, ``sensor_msgs`` (``Image``, ``PointCloud2``; ``image_encodings.hpp``); Foxglove's schemas
-# ``RawImage``, ``CompressedImage``, ``PointCloud``, ``PackedElementField``.
+# Content of a sensor message: a picture or a point cloud, by the schema in the file. Messages with
+# the file of a picture (``data`` and ``format``) give that file. Messages with pixels (``width``,
+# ``height``, ``encoding``, ``data``) give a PNG, or an array if PNG cannot hold them. Messages with
+# points (``fields`` and their offsets in ``data``) give columns. Other messages are not supported.
+# Source: ROS 2, ``sensor_msgs`` (``Image``, ``PointCloud2``; ``image_encodings.hpp``); Foxglove's
+# schemas ``RawImage``, ``CompressedImage``, ``PointCloud``, ``PackedElementField``.
 
 VIDEO: Final = re.compile("26[45]|avc|hevc|av1|vp9", re.IGNORECASE)
-"""What formats of video are called."""
+"""Names of video formats."""
 
 MAX_POINTS: Final = 20_000_000
-"""Most points of a cloud."""
+"""Greatest number of points of a cloud."""
 
 _ROS: Final = dict(enumerate(("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"), 1))
 _FOXGLOVE: Final = dict(enumerate(("u1", "i1", "u2", "i2", "u4", "i4", "f4", "f8"), 1))
 _FOXGLOVE_WORDS: Final = (
     *("UNKNOWN", "UINT8", "INT8", "UINT16", "INT16", "UINT32", "INT32", "FLOAT32", "FLOAT64"),
 )
-"""Types of the numbers of points."""
+"""Number types of points."""
 
 _LAYOUTS: Final = {
     **dict.fromkeys(("mono8", "8uc1"), ("u1", 1, "")),
@@ -475,21 +471,21 @@ _LAYOUTS: Final = {
     "bgra16": ("u2", 4, "bgr"),
     **dict.fromkeys(("yuv422", "uyvy", "yuv422_yuy2", "yuyv"), ("u1", 2, "array")),
 }
-"""Encodings of pixels: type and number of their values; whether their order is turned, or no PNG has them."""
+"""Encodings of pixels: type and number of their values; and the order reversed, or no PNG possible."""
 _BAYER: Final = re.compile(r"bayer_[a-z]{4}(8|16)")
 _OPENCV: Final = re.compile(r"(8|16|32|64)([usf])c(\d)")
 
 
 class Sensed(NamedTuple):
-    """Content of a message.
+    """Content of a sensor message.
 
     Attributes
     ----------
     holds : str
-        ``picture``: the content of a file; ``video``: one of its pictures; ``cloud``: points.
+        ``picture``: content of a file; ``video``: one of its pictures; ``cloud``: points.
     form : str
-        Of a picture ``jpeg``, ``png``, ``webp``, ``tiff``, ``bmp`` or ``npy``; of a video as the message
-        calls it.
+        For a picture ``jpeg``, ``png``, ``webp``, ``tiff``, ``bmp`` or ``npy``; for a video the
+        name in the message.
     data : bytes or structured array
         Points are little endian, without gaps.
     """
@@ -503,9 +499,9 @@ Record = Mapping[str, Any]
 
 
 def sensor_of(channel: Channel, schema: Schema | None) -> Callable[[bytes], Sensed | None]:
-    """A function that says what is in a message of a channel; ``None``: neither picture nor points.
+    """Return a function from messages of a channel to their content; it returns ``None`` for other data.
 
-    It raises ``TraceError`` where a message looks like a picture or a cloud and is not what it says.
+    It raises ``TraceError`` for an inconsistent picture or cloud.
     """
     read = record_reader(channel, schema)
 
@@ -517,21 +513,21 @@ def sensor_of(channel: Channel, schema: Schema | None) -> Callable[[bytes], Sens
 
 
 def cloud_of(file: StoreFile, frame: int | str, channel: str) -> NDArray[Any]:
-    """The points in the message of a channel that belongs to a frame.
+    """Return the points in a channel's message of a frame.
 
     Returns
     -------
     (N,) structured array
-        A field for each number that the message has of a point, as it calls them; little endian.
+        One field per number of a point, with its name in the message; little endian.
 
     Raises
     ------
     StoreError
-        There is no such frame or channel, or no message of the channel belongs to the frame.
+        The frame or channel is missing, or the frame has no message of the channel.
     TraceError
-        The recording is gone, was replaced, or is damaged there.
+        The recording is missing, was replaced, or is damaged at this place.
     ExportError
-        The message holds no points.
+        The message has no points.
     """
     known, schema, data = file.recorded(frame, channel)
     found = sensor_of(known, schema)(data)
@@ -595,7 +591,7 @@ def _layout(encoding: str) -> tuple[str, int, str]:
     if encoding in _LAYOUTS:
         return _LAYOUTS[encoding]
     bayer = _BAYER.fullmatch(encoding)
-    if bayer is not None:  # as the sensor has it: grey
+    if bayer is not None:  # stored as grey, like the sensor's values
         return f"u{int(bayer[1]) // 8}", 1, ""
     opencv = _OPENCV.fullmatch(encoding)
     if opencv is not None:
@@ -649,7 +645,7 @@ def _points(data: bytes, record: Record) -> NDArray[Any]:
 
 
 def _field(told: Any, order: str, *, ros: bool) -> tuple[str, Any, int]:
-    """Name, type and place of a number of points."""
+    """Return name, type and offset of a number of points."""
     number = told["datatype"] if ros else told["type"]
     if isinstance(number, str):
         number = _FOXGLOVE_WORDS.index(number)
@@ -664,14 +660,14 @@ def _field(told: Any, order: str, *, ros: bool) -> tuple[str, Any, int]:
 
 
 def cloud_file(points: NDArray[Any], form: str) -> bytes:
-    """Points as the content of a file.
+    """Return points as the content of a file.
 
     Parameters
     ----------
     points : structured array
     form : str
-        ``pcd``: the Point Cloud Library's format 0.7, binary. ``npy``: numpy's, structured. ``bin``: as KITTI
-        has them, x, y, z and intensity in float32, 0 where there is none.
+        ``pcd``: the Point Cloud Library's format 0.7, binary. ``npy``: numpy's, structured.
+        ``bin``: as in KITTI, x, y, z and intensity in float32, 0 for missing ones.
     """
     if form == "npy":
         return _npy(points)
@@ -685,7 +681,7 @@ def cloud_file(points: NDArray[Any], form: str) -> bytes:
 
 
 def _pcd(points: NDArray[Any]) -> bytes:
-    """Source: Point Cloud Library, "The PCD (Point Cloud Data) file format", version 0.7."""
+    """Return points in the format PCD 0.7 (Point Cloud Library, "The PCD file format")."""
     names = points.dtype.names or ()
     kinds = [points.dtype[name] for name in names]
     letters = {"f": "F", "i": "I", "u": "U"}

@@ -1,12 +1,12 @@
-"""Clips of a store to be exported, and labels of their frames by queries.
+"""Clips of a store for an export, and labels of their frames by queries.
 
-Labels from queries: a value for each frame, by name.
+A label from a query is a named value for each frame.
 
 A label is an expression of the language about a frame (``ego.speed * 3.6``, ``EXISTS
-{(ego)-[:near]->(:Person)}``), or a whole query, which is true in the frames that it finds and false in the
-others; one that returns a value over each match (``MIN(gap(e, v)) OVER match``) gives that in the frames of
-the match. What is not known stays so: a label has no value in a frame without an ego if it speaks of the ego,
-nor in traces that cannot answer.
+{(ego)-[:near]->(:Person)}``), or a complete query, which is true in its matching frames and false
+in the others. A query that returns a value over each match (``MIN(gap(e, v)) OVER match``) gives
+this value in the frames of the match. Unknown values stay unknown: a label about the ego has no
+value in a frame without an ego, and no label has a value in traces that cannot answer.
 """
 
 from __future__ import annotations
@@ -37,21 +37,21 @@ if TYPE_CHECKING:
 NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,62}")
 
 _QUERY: Final = re.compile(r"\s*(MATCH|USING|DEFINE|HOLDS|NOT\s+MATCH)\b", re.IGNORECASE)
-"""How a whole query begins; whatever else is an expression."""
+"""Start of a complete query; other texts are expressions."""
 
 TAKEN: Final = frozenset(
     {"clip", "frame_id", "trace", "trace_id", "seq", "time_ns", "log_time_ns", "t", "ego", "map"}
 )
-"""Names of columns of frames."""
+"""Reserved names: columns of frames."""
 
 
 def parse_labels(pairs: Iterable[str]) -> dict[str, str]:
-    """``NAME=TEXT`` as names and texts.
+    """Parse texts ``NAME=TEXT`` into names and texts.
 
     Raises
     ------
     ExportError
-        A name is missing, no name, taken, or comes twice.
+        A name is missing, invalid, reserved or repeated.
     """
     found: dict[str, str] = {}
     for pair in pairs:
@@ -76,11 +76,11 @@ class Labels:
     Attributes
     ----------
     texts : mapping of str to str
-        What each label asks.
+        Text of each label.
     frame_id : int64, shape (n,)
         Ascending.
     values : mapping of str to object, shape (n,)
-        Truth values, numbers or texts; ``None`` where nothing is known.
+        Truth values, numbers or texts; ``None`` means unknown.
     """
 
     texts: Mapping[str, str]
@@ -95,7 +95,7 @@ class Labels:
         frame_id: Ints,
         **parameters: object,
     ) -> Labels:
-        """Ask a store for the labels of some frames.
+        """Evaluate labels for some frames of a store.
 
         Parameters
         ----------
@@ -103,7 +103,7 @@ class Labels:
         texts : mapping
             Name → expression or query.
         frame_id : int64
-            The frames, in any order; repetitions do not matter.
+            The frames, in any order; repetitions are allowed.
         **parameters
             Values of ``$name`` in them.
 
@@ -121,7 +121,7 @@ class Labels:
         return cls(texts, wanted, values)
 
     def of(self, frame_id: Ints) -> dict[str, list[Any]]:
-        """The labels of frames, all of which were asked for, by name."""
+        """Return the labels of these frames by name; all must have been evaluated."""
         rows = np.searchsorted(self.frame_id, frame_id)
         return {name: values[rows].tolist() for name, values in self.values.items()}
 
@@ -157,7 +157,7 @@ def _over_matches(
     matches: AnyMatches,
     wanted: Ints,
 ) -> np.ndarray[Any, np.dtype[np.object_]]:
-    """A value of each match in its frames; nothing in the others."""
+    """Return the value of each match in its frames; unknown in the others."""
     values = np.full(len(wanted), None, object)
     taken = np.zeros(len(wanted), np.bool_)
     traces = _trace_ids(store)
@@ -177,7 +177,7 @@ def _over_matches(
 def _answers(
     store: Store | Collection, text: str, wanted: Ints, parameters: Mapping[str, object]
 ) -> Iterator[tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]]:
-    """Rows of frames and values of an expression: of those with an ego, then of those without."""
+    """Yield rows of frames and values of an expression: frames with an ego, then the others."""
     value = f"{text}) AS label"
     try:
         matches = store.find(_OF_EGO + value, **parameters)
@@ -198,11 +198,11 @@ def _answers(
 _RETURNED: Final = "RETURN DISTINCT frame.id AS frame_of_label, ("
 _OF_EGO: Final = f"MATCH (:Ego) {_RETURNED}"
 _OF_ANYTHING: Final = f"MATCH (anything) {_RETURNED}"
-"""What comes before an expression."""
+"""Query text before an expression."""
 
 
 def _of_expression(error: QueryError, text: str) -> QueryError:
-    """Error of an expression, shown in the text of the user and not in the query made of it."""
+    """Convert an error of the internal query to one that points into the user's expression."""
     if error.span is None:
         return QueryError(error.reason, text=text, hint=error.hint)
     before, end = len(_OF_EGO), len(text)
@@ -214,7 +214,7 @@ def _of_expression(error: QueryError, text: str) -> QueryError:
 def _columns(
     matches: AnyMatches, wanted: Ints
 ) -> tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]:
-    """Rows of the frames that are wanted, and what was found of them."""
+    """Return rows of the wanted frames, and their values."""
     found = matches.numpy()
     of, row = _rows(wanted, found["frame_of_label"].astype(np.int64))
     values = found["label"].astype(object)
@@ -223,7 +223,7 @@ def _columns(
 
 
 def _rows(wanted: Ints, frame_id: Ints) -> tuple[Ints, Ints]:
-    """Rows of the wanted frames, and their rows among all."""
+    """Return indices of the wanted frames, and their rows among all."""
     row = np.minimum(np.searchsorted(wanted, frame_id), max(len(wanted) - 1, 0))
     of = np.flatnonzero(wanted[row] == frame_id) if len(wanted) else row[:0]
     return of, row[of]
@@ -234,7 +234,7 @@ def _rows(wanted: Ints, frame_id: Ints) -> tuple[Ints, Ints]:
 WINDOW: Final = 240
 """Frames that are read from the store at once, as columns."""
 FEW: Final = 60
-"""The same, where single graphs are made of them: records take ten times the space of columns."""
+"""Frames at once for single graphs, which take ten times the memory of columns."""
 
 _FRAMES: Final = """
 SELECT frame_id, seq, time_ns, log_time_ns, t FROM frames
@@ -245,7 +245,7 @@ ORDER BY frame_id
 
 @dataclass(frozen=True, slots=True)
 class Export:
-    """An export: which clips of which store, and how.
+    """Description of an export: store, clips and options.
 
     Attributes
     ----------
@@ -255,23 +255,23 @@ class Export:
     labels : Labels, optional
         Values of the frames, by name; see :mod:`sgstore.exporters._labels`.
     abstraction : str
-        What the graphs are seen as; empty: as the format has it by itself.
+        Abstraction of the graphs; empty means the default of the format.
     with_graph : bool
-        Whether clips of recordings bring the scene graphs with them.
+        True if clips of recordings include the scene graphs.
     mounts : tuple of Mount
-        Where sensors sit: what clips with graphs tell of it; see :func:`sgstore.exporters.parse_mounts`.
+        Poses of sensors, for clips with graphs; see :func:`sgstore.exporters.parse_mounts`.
     rebase_context : bool
-        Whether messages from outside a clip, which later ones depend on, get log times at its ends.
+        True if context messages from outside a clip get log times at its ends.
     graphml : bool
-        Whether graphs for networkx come as GraphML, too: a file for each frame.
+        True for additional GraphML files of networkx graphs, one per frame.
     channels : tuple of str
-        Topics of the sensors that are wanted; empty: all.
+        Topics of the wanted sensors; empty means all.
     clouds : str
-        What clouds of points are written as: ``pcd``, ``npy`` or ``bin``.
+        File format of point clouds: ``pcd``, ``npy`` or ``bin``.
     provenance : mapping
-        What is to be known of it: ``query``, and whatever else the caller has.
+        Values about the origin: ``query``, and others of the caller.
     progress : callable, optional
-        Called with the number of frames done and of all.
+        Called with the number of finished frames and the total.
     """
 
     store: Store
@@ -288,16 +288,16 @@ class Export:
     progress: Callable[[int, int], None] | None = None
 
     def trace(self, name: str) -> StoredTrace:
-        """A trace of the store."""
+        """Return a trace of the store."""
         return self.store.file.trace(name)
 
     def frames(self) -> Iterator[ClipFrames]:
-        """The frames of the clips, clip by clip; a frame comes with each clip that it is in.
+        """Yield the frames of each clip; a frame in several clips occurs several times.
 
         Raises
         ------
         ExportError
-            There is no frame in a clip.
+            A clip has no frames.
         """
         for number, clip in enumerate(self.clips, 1):
             frames = ClipFrames.of(self, number, clip)
@@ -308,13 +308,13 @@ class Export:
             yield frames
 
     def windows(self, size: int = WINDOW) -> Iterator[ClipFrames]:
-        """The frames of the clips, at most ``size`` at a time, of one clip each; tells the progress."""
+        """Yield the frames of the clips in windows of ``size``, and report the progress."""
         for frames in self.frames():
             yield from frames.windows(size)
             self.tell(frames.number, len(self.clips))
 
     def fresh_windows(self) -> Iterator[ClipFrames]:
-        """As :meth:`windows`, but a frame comes with the first clip alone that it is in."""
+        """Yield windows of frames, each frame only with its first clip."""
         for frames in self.windows():
             time = frames.log_time_ns
             slack = tolerance_ns(self.trace(frames.clip.trace).period_ns)
@@ -327,24 +327,24 @@ class Export:
                 yield frames.take(np.flatnonzero(~known))
 
     def tell(self, done: int, of: int) -> None:
-        """Tell how far it is."""
+        """Report the progress."""
         if self.progress is not None:
             self.progress(done, of)
 
     def named_graphs(
         self, frames: ClipFrames, abstraction: str
     ) -> Iterator[tuple[dict[str, str], list[tuple[str, str, str]]]]:
-        """Nodes and edges of the graphs of some frames by names, as an abstraction has them."""
+        """Yield nodes and edges of the graphs of frames by names, under an abstraction."""
         found, _, graphs = self.store.file.abstracted.frames(abstraction, **frames.bounds)
         for row in np.searchsorted(found, frames.seq).tolist():
             yield graphs.named(row)
 
     def label_columns(self, frame_id: Ints) -> dict[str, list[Any]]:
-        """The labels of frames, by name."""
+        """Return the labels of frames, by name."""
         return {} if self.labels is None else self.labels.of(frame_id)
 
     def label_cells(self, frame_id: Ints) -> Iterator[list[Any]]:
-        """The labels of one frame after another, as cells of CSV."""
+        """Yield the labels of each frame as CSV cells."""
         columns = self.label_columns(frame_id).values()
         for values in zip(*columns, strict=True) if columns else [()] * len(frame_id):
             yield [
@@ -352,7 +352,7 @@ class Export:
             ]
 
     def about(self) -> dict[str, Any]:
-        """Values of the manifest: clips, labels, and their sources."""
+        """Return the values of the manifest: clips, labels, and their sources."""
         traces = {clip.trace: self.trace(clip.trace) for clip in self.clips}
         return {
             "clips": [
@@ -372,16 +372,16 @@ class Export:
 
 @dataclass(frozen=True, slots=True)
 class ClipFrames:
-    """Frames of a clip, in order of their numbers; shape (n,).
+    """Frames of a clip, ordered by number; shape (n,).
 
     Attributes
     ----------
     number : int
-        Of the clip in its export, counted from 1.
+        Number of the clip in its export, from 1.
     clip : Clip
     frame_id, seq, time_ns, log_time_ns : int64
     t : float64
-        Since the trace began; s.
+        Time since the start of the trace; s.
     """
 
     number: int
@@ -394,7 +394,7 @@ class ClipFrames:
 
     @classmethod
     def of(cls, export: Export, number: int, clip: Clip) -> ClipFrames:
-        """The frames of the trace of a clip whose log times lie in it."""
+        """Return the frames of a clip's trace with log times in the clip."""
         trace = export.trace(clip.trace)
         trace_id, reach = trace.trace_id, clip.widened(tolerance_ns(trace.period_ns))
         found = export.store.file.arrays(
@@ -420,16 +420,16 @@ class ClipFrames:
         return len(self.frame_id)
 
     def take(self, rows: slice | Ints) -> ClipFrames:
-        """Some of them, in their order."""
+        """Return these frames, in their order."""
         columns = ("frame_id", "seq", "time_ns", "log_time_ns", "t")
         return replace(self, **{name: getattr(self, name)[rows] for name in columns})
 
     def windows(self, size: int = WINDOW) -> Iterator[ClipFrames]:
-        """All of them, ``size`` at a time."""
+        """Yield the frames in windows of ``size``."""
         for start in range(0, len(self), size):
             yield self.take(slice(start, start + size))
 
     @property
     def bounds(self) -> dict[str, int]:
-        """The first and the last ``frame_id``, as values of ``$first`` and ``$last``."""
+        """Return the first and the last ``frame_id``, as values of ``$first`` and ``$last``."""
         return {"first": int(self.frame_id[0]), "last": int(self.frame_id[-1])}

@@ -1,14 +1,15 @@
-"""Clips as MCAP files: the messages of an interval as they were recorded, and what they depend on.
+"""Clips as MCAP files: the recorded messages of an interval, and their context.
 
-A clip has the schemas, channels, metadata and attachments of its source, and its messages with their
-bytes, times and sequence numbers; ids of schemas and channels are numbered anew. Messages that later ones
-depend on (the map, static data that was told only once) are carried in from before its start. The metadata
-record ``sgstore.clip`` says which interval the clip is, so that a reader takes them for context and not for
-frames. With ``rebase_context`` they stand a nanosecond beside it, at log times of their own, so that players do
-not show the time between. The same clip of the same source is the same bytes.
+A clip has the schemas, channels, metadata and attachments of its source, and its messages with
+their bytes, times and sequence numbers; ids of schemas and channels are renumbered. Messages that
+later ones depend on (the map, static data that is sent once) are copied from before its start. The
+metadata record ``sgstore.clip`` has the interval of the clip, so that a reader treats them as
+context and not as frames. With ``rebase_context`` their log times are a nanosecond outside the
+interval, so that players do not show the gap. The same clip of the same source gives the same
+bytes.
 
-A recording is read once as a whole, to see where everything is, and then once for each of its clips,
-only where that clip is; no more than one chunk, or one attachment, of it is in memory.
+A recording is read once completely, to index it, and then once for each of its clips, only in the
+range of the clip. At most one chunk or attachment is in memory.
 """
 
 from __future__ import annotations
@@ -59,16 +60,16 @@ _COMPRESSION: Final = {
     "": CompressionType.NONE,
 }
 _FIXED: Final = 8 + 8 + 4 + 4 + 8 + 4
-"""Bytes of an attachment besides its texts and its data."""
+"""Bytes of an attachment without its texts and its data."""
 _MALFORMED: Final = "an attachment is malformed and was left out"
 _DAMAGED: Final = "an attachment has another checksum than it says"
 
 
 def write(export: Export, folder: Path) -> list[WrittenClip]:
-    """Cut the clips of an export out of their recordings, recording by recording.
+    """Cut the clips of an export from their recordings, recording by recording.
 
-    With ``with_graph`` or labels, every clip has channels more: see :mod:`sgstore.exporters._mcap_graphs`. With
-    graphs there is a layout for viewers beside them.
+    With ``with_graph`` or labels, every clip has additional channels: see
+    :mod:`sgstore.exporters._mcap_graphs`. With graphs there is also a viewer layout.
     """
     if export.mounts and not export.with_graph:
         raise ExportError("--mount is told in clips with graphs: add --with-graph")
@@ -102,17 +103,17 @@ def write(export: Export, folder: Path) -> list[WrittenClip]:
 
 @contextmanager
 def _near(path: Path) -> Generator[None]:
-    """Read a recording that lies elsewhere from a copy: it is read several times."""
+    """Copy a recording on a slow disk to a local file, because it is read several times."""
     with working_folder("recording") as held, near(path, held):
         yield
 
 
 @dataclass(slots=True)
 class _Surveyed:
-    """A recording that was read once: its digest, and where which times are.
+    """Index of a recording: its digest, and the time ranges of its chunks.
 
-    ``context``: messages that later ones depend on. ``spans``: offset of each chunk → least and greatest log
-    time in it. ``losses``: what could not be read.
+    ``context``: messages that later ones depend on. ``spans``: offset of each chunk → least and
+    greatest log time. ``losses``: unreadable parts.
     """
 
     trace: StoredTrace
@@ -130,7 +131,7 @@ def _survey(recording: RecordingFile, trace: StoredTrace, context: MessageRefs) 
     for rank in (
         channel_rank(recording),
         None,
-    ):  # the second where messages are not in order of time
+    ):  # the second condition covers messages out of time order
         report = TraceReport()
         found.spans.clear()
         with suppress(OutOfOrder):
@@ -146,17 +147,18 @@ def _survey(recording: RecordingFile, trace: StoredTrace, context: MessageRefs) 
 def _context_of(
     refs: MessageRefs, reach: Clip
 ) -> tuple[dict[int, list[int]], set[tuple[int, int]]]:
-    """Messages that a clip needs from outside its interval.
+    """Find the context messages of a clip outside its interval.
 
-    Context from before the start belongs to it. Where a channel's context begins only after the end, as
-    a map that was recorded last, its first message does, if nothing else of the channel is there.
+    Context from before the start is included. If the context of a channel begins only after the
+    end, as for a map that is recorded last, its first message is included, unless the clip has
+    other messages of the channel.
 
     Returns
     -------
     context : dict
         Chunk → offsets of the messages in it.
     late : set
-        Chunk and offset of those that come behind the interval.
+        Chunk and offset of the messages after the interval.
     """
     carried = refs.log_time_ns < reach.start_ns
     late: set[tuple[int, int]] = set()
@@ -172,10 +174,10 @@ def _context_of(
 
 
 class _Cutting:
-    """One clip on its way into a file.
+    """Writer of one clip into a file.
 
-    The official writer numbers schemas and channels from 1 on, in the order in which they are registered. A
-    clip's source has numbers of its own, by which its messages name their channels; ``_numbers`` translates.
+    The official writer numbers schemas and channels from 1 in order of registration. ``_numbers``
+    maps the numbers of the source to them.
     """
 
     def __init__(
@@ -194,7 +196,7 @@ class _Cutting:
         self._clip = clip
         self._told = told
         self._added = added
-        # All channels of the source, but for those that this clip brings anew.
+        # All channels of the source, except those that this clip writes anew.
         self._kept = {
             number: channel
             for number, channel in sorted(recording.channels.items())
@@ -206,7 +208,7 @@ class _Cutting:
         self._carried = 0
 
     def write(self, file: Path, number: int) -> WrittenClip:
-        """Write it, test it, and tell of it. ``number``: in its export, counted from 1."""
+        """Write the clip, verify it, and return its description; ``number`` counts from 1."""
         clip, source, recording = self._clip, self._source, self._recording
         losses = [
             loss
@@ -251,15 +253,15 @@ class _Cutting:
         )
 
     def _own_channels(self) -> Iterator[tuple[int, str, str]]:
-        """Number, topic and schema of each channel of the source."""
+        """Yield number, topic and schema of each channel of the source."""
         for number, channel in self._kept.items():
             schema = self._recording.schemas.get(channel.schema_id)
             yield number, channel.topic, schema.name if schema else ""
 
     def _write_head(self, reach: Clip) -> list[Loss]:
-        """Definitions, metadata and attachments of the source, and what makes the file a clip of it.
+        """Write definitions, metadata and attachments of the source, and the clip record.
 
-        ``reach`` is the interval with the tolerance of times at its ends, as whoever reads the clip wants it.
+        ``reach`` is the interval with a time tolerance at its ends, as readers of the clip need it.
         """
         losses: list[Loss] = []
         recording = self._recording
@@ -272,7 +274,7 @@ class _Cutting:
                 self._define(record)
         for place in sorted(recording.metadata, key=lambda place: place.offset):
             record = recording.metadata[place]
-            if record.name != CLIP:  # of a source that is a clip itself: this one takes its place
+            if record.name != CLIP:  # the clip record of a source clip is replaced
                 self._writer.add_metadata(record.name, record.metadata)
         own = {
             "trace": self._clip.trace,
@@ -289,7 +291,7 @@ class _Cutting:
         return losses
 
     def _define(self, record: Schema | Channel) -> None:
-        """Register a schema, or a channel whose schema is registered."""
+        """Register a schema, or a channel with a registered schema."""
         if isinstance(record, Schema):
             number = self._writer.register_schema(record.name, record.encoding, record.data)
             self._schemas[record.id] = number
@@ -301,12 +303,12 @@ class _Cutting:
         self._counts[record.id] = 0
 
     def _write_attachment(self, pieces: Iterable[memoryview]) -> str:
-        """Write an attachment of the source, given as pieces of its record with its head.
+        """Write an attachment of the source from the pieces of its record.
 
         Returns
         -------
         str
-            What is wrong with it; empty: nothing. One that is malformed is not written.
+            Its defect, or empty. A malformed attachment is not written.
         """
         stream = BytesIO(b"".join(pieces))
         stream.seek(HEAD.size)
@@ -321,14 +323,14 @@ class _Cutting:
             record.release()
         if length != _FIXED + len(one.data) + len((one.name + one.media_type).encode()):
             return _MALFORMED
-        del stream  # one copy of a large attachment less while it is written
+        del stream  # free one copy of a large attachment before it is written
         self._writer.add_attachment(
             one.create_time, one.log_time, one.name, one.media_type, one.data
         )
         return _DAMAGED if damaged else ""
 
     def _write_messages(self, reach: Clip, number: int) -> None:
-        """The messages of the clip, and what is added to them: before the first of a later log time."""
+        """Write the messages of the clip and the added messages, merged by log time."""
         added = () if self._added is None else self._added.messages(number)
         every = heapq.merge(self._messages(reach), added, key=lambda message: message[2])
         for channel, sequence, log_time, publish_time, data in every:
@@ -337,10 +339,10 @@ class _Cutting:
             self._counts[channel] += 1
 
     def _messages(self, reach: Clip) -> Iterator[ClipMessage]:
-        """The messages of the source that belong to the clip, in order of time; counts those that are context.
+        """Yield the messages of the clip in order of time; count the context messages.
 
-        A source without log times keeps the order of its file: while its clock is behind, log times stand
-        still.
+        A source without log times keeps the order of its file: while its clock runs backwards, log
+        times stay constant.
         """
         context, late = _context_of(self._source.context, reach)
         chunks = set(context) | {
@@ -361,7 +363,7 @@ class _Cutting:
                 self._carried += bool(carried[row])
                 log_time = int(time[row])
                 if carried[row] and self._rebased:
-                    # A nanosecond beside the clip: so whoever reads it still takes it for context.
+                    # A nanosecond outside the clip: readers still treat it as context.
                     log_time = reach.end_ns + 1 if behind else reach.start_ns - 1
                 elif inside[row]:
                     log_time = latest = max(log_time, latest)
@@ -370,7 +372,7 @@ class _Cutting:
 
 
 def _among(run: Messages, places: dict[int, list[int]]) -> NDArray[np.bool_]:
-    """Which messages of a run stand at some places: offsets by their chunk."""
+    """Return a mask of the messages of a run at these places (offsets by chunk)."""
     chunks, found = run.chunks, np.zeros(len(run), np.bool_)
     for chunk in np.unique(chunks).tolist():
         found |= (chunks == chunk) & np.isin(run.offset, places.get(chunk, ()))
@@ -384,12 +386,12 @@ def _validate(file: Path, expected: Counter[int]) -> None:
     ----------
     file : Path
     expected : Counter
-        Channel id in the file → messages that were written, if any were.
+        Channel id in the file → number of written messages, without empty channels.
 
     Raises
     ------
     ExportError
-        It is not what was to be written.
+        The content differs from the written messages.
     """
     try:
         with file.open("rb") as stream:

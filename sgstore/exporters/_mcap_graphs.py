@@ -1,13 +1,13 @@
-"""Channels that an export adds to clips: scene graphs, and labels of frames; and a layout to see them.
+"""Additional channels of exported clips: scene graphs, frame labels; and a viewer layout.
 
 Channels, each with one message a frame, at the frame's log time:
 
 * ``/sgstore/graph``: the scene graph as JSON (:data:`GRAPH_SCHEMA`), with the labels;
-* ``/sgstore/scene``: the same to be drawn, ``foxglove.SceneUpdate`` in protobuf;
-* ``/sgstore/tf``: where the ego and its sensors are in it, ``foxglove.FrameTransforms`` in protobuf;
-* ``/sgstore/labels``: the labels alone, as JSON, where no graph is wanted.
+* ``/sgstore/scene``: the scene graph for viewers, ``foxglove.SceneUpdate`` in protobuf;
+* ``/sgstore/tf``: poses of the ego and its sensors, ``foxglove.FrameTransforms`` in protobuf;
+* ``/sgstore/labels``: only the labels, as JSON, in clips without graphs.
 
-The metadata of these channels says ``sgstore: derived``: they are made of the recording and no part of it.
+The metadata of these channels has ``sgstore: derived``: they are not part of the recording.
 """
 
 from __future__ import annotations
@@ -109,12 +109,12 @@ ClipMessage = tuple[int, int, int, int, bytes | memoryview]
 
 
 def is_added(channel: Channel) -> bool:
-    """Return True for a channel that an export made, and that is no part of the recording."""
+    """True for a channel that an export has added to the recording."""
     return all(channel.metadata.get(key) == value for key, value in DERIVED.items())
 
 
 class Added:
-    """The channels that clips of an export bring with them.
+    """Additional channels of exported clips.
 
     Parameters
     ----------
@@ -136,17 +136,17 @@ class Added:
                 (TRANSFORMS, "foxglove.FrameTransforms", "protobuf", tree, "protobuf"),
             ]
         self.transforms = FrameTransforms((), export.mounts)
-        self._first = 0  # the number of the first channel in the clip that is written
+        self._first = 0  # number of the first added channel in the current clip
 
     def definitions(
         self, schemas: Mapping[int, Schema], channels: Mapping[int, Channel]
     ) -> Iterator[Schema | Channel]:
-        """Schemas and channels of a recording's next clip, with numbers that it does not use.
+        """Yield schemas and channels for the next clip of a recording, with free numbers.
 
         Raises
         ------
         ExportError
-            It uses all numbers that there are.
+            The recording uses all possible numbers.
         """
         schema, channel = max(schemas, default=0), max(channels, default=0)
         if max(schema, channel) + len(self._kinds) >= 1 << 16:
@@ -160,16 +160,16 @@ class Added:
             yield Channel(channel + i, topic, encoding, dict(DERIVED), schema + i)
 
     def channels(self) -> list[tuple[int, str, str]]:
-        """Number, topic and schema of each, as they were defined last."""
+        """Return number, topic and schema of each channel, as last defined."""
         return [(i, topic, name) for i, (topic, name, *_) in enumerate(self._kinds, self._first)]
 
     def messages(self, number: int) -> Iterator[ClipMessage]:
-        """The messages of the frames of a clip, by its number, in order of log time."""
+        """Yield the messages of the frames of a clip, by its number, in order of log time."""
         frames = ClipFrames.of(self._export, number, self._export.clips[number - 1])
         order = frames.log_time_ns.argsort(kind="stable")
         sequence = 0
         for start in range(0, len(frames), FEW):
-            # Graphs are read by ranges of frames: those of a window are near each other.
+            # Graphs are read by ranges of frames: frames of a window are close together.
             rows = order[start : start + FEW]
             rows.sort()
             window = frames.take(rows)
@@ -218,13 +218,14 @@ def _graph(graph: SceneGraph) -> dict[str, Any]:
 
 
 def _as_json(value: Any) -> bytes:
-    """As JSON; numbers that are none are null."""
+    """Return a value as JSON; NaN and infinity become null."""
     return json_text(value).encode("utf-8", "backslashreplace")
 
 
 # A layout for Foxglove and Lichtblick: what a clip with graphs holds, in panels ------------------
-# To be taken by *Import from file* of their menu of layouts. The scene from above follows the ego, the camera
-# has the boxes of the scene drawn into it, the graph stands beside as text, and the ego's speed below.
+# For *Import from file* in the layout menu of viewers. The scene from above follows the ego; the
+# camera has the boxes of the scene overlaid; the graph is next to it as text, and the ego's speed
+# below.
 
 LAYOUT: Final = "layout.json"
 """Its name in the folder of an export."""
@@ -232,18 +233,18 @@ LAYOUT: Final = "layout.json"
 IMAGES: Final = ("CompressedImage", "CompressedVideo", "RawImage", "Image")
 CALIBRATIONS: Final = ("CameraCalibration", "CameraInfo")
 CLOUDS: Final = ("PointCloud", "PointCloud2", "LaserScan")
-"""Last words of the names of schemas."""
+"""Last words of schema names of point clouds."""
 
 
 def layout(channels: Sequence[ChannelCount], ego: str) -> str:
-    """The layout as JSON; the same text for the same channels.
+    """Return the viewer layout as JSON; equal channels give equal text.
 
     Parameters
     ----------
     channels : sequence of ChannelCount
         Of the clips.
     ego : str
-        Axes that the view from above follows.
+        Axes for the view from above.
     """
     clouds, images = _topics(channels, CLOUDS), _topics(channels, IMAGES)
     panels: dict[str, Any] = {"3D!scene": _above(clouds, ego)}
@@ -265,7 +266,7 @@ def layout(channels: Sequence[ChannelCount], ego: str) -> str:
 
 
 def _topics(channels: Sequence[ChannelCount], endings: tuple[str, ...]) -> list[str]:
-    """Topics of channels that have messages, by the last word of their schema."""
+    """Return topics of non-empty channels, by the last word of their schema."""
     found = [
         one.topic
         for one in channels
@@ -318,7 +319,7 @@ def _above(clouds: Sequence[str], ego: str) -> dict[str, Any]:
 
 
 def _camera(image: str, calibrations: Sequence[str]) -> dict[str, Any]:
-    """The camera with the calibration whose topic begins most alike."""
+    """Return the camera panel, with a calibration topic in the same namespace."""
     place = image.rpartition("/")[0]
     beside = [topic for topic in calibrations if topic.rpartition("/")[0] == place]
     mode = {"imageTopic": image} | ({"calibrationTopic": beside[0]} if beside else {})

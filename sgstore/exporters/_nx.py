@@ -1,12 +1,12 @@
-"""Export for networkx: node-link JSON, a graph a line, and where it is asked for GraphML, a file a frame.
+"""Export for networkx: node-link JSON, one graph per line, and optionally GraphML, one file per frame.
 
-For each clip there is ``CLIP.jsonl``, which ``networkx.node_link_graph(json.loads(line), edges="edges")``
-reads; with ``graphml`` also a folder ``CLIP`` of ``000123.graphml``, one for each frame, by its number in the
-trace. A graph's attributes say which frame it is, and have its labels as ``label_NAME``; what is not known is
-left out. Without an abstraction nodes are node ids with all that is known of them; with one they are names,
-with ``base_class``.
+Each clip has a file ``CLIP.jsonl`` for ``networkx.node_link_graph(json.loads(line),
+edges="edges")``; with ``graphml`` also a folder ``CLIP`` with ``000123.graphml``, one per frame, by
+its number in the trace. The attributes of a graph identify its frame, and contain its labels as
+``label_NAME``; unknown values are omitted. Without an abstraction, nodes are node ids with all
+attributes; with an abstraction they are names, with ``base_class``.
 
-Graphs are read from the store a window of frames at a time, as :meth:`sgstore.query.Store.graph` reads one.
+Graphs are read from the store in windows of frames, as by :meth:`sgstore.query.Store.graph`.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ if TYPE_CHECKING:
 
 
 def graphs_of(export: Export, frames: ClipFrames) -> Iterator[SceneGraph]:
-    """The scene graphs of some frames of a clip, their edges in order of source, relation and destination."""
+    """Yield the scene graphs of frames of a clip, edges ordered by source, relation and destination."""
     for graph in export.store.file.graphs(frames.frame_id):
         edges = sorted(graph.edges, key=lambda edge: (edge[0], RELATION_CODE[edge[1]], edge[2]))
         yield replace(graph, edges=edges)
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
-    """Write the graphs of all frames, each of which is read again by networkx."""
+    """Write the graphs of all frames, and read each again with networkx."""
     abstraction = export.abstraction
     if abstraction and not _is_derived(export):
         abstraction = abstraction_named(abstraction).name
@@ -67,7 +67,7 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
 
 
 def _is_derived(export: Export) -> bool:
-    """Return True if the abstraction is a derived set of relations that no abstraction hides by its name."""
+    """True if the abstraction is a derived set of relations, and not shadowed by an abstraction."""
     derived = {normalize_name(one.name) for one in export.store.file.deriving.sets()}
     name = normalize_name(export.abstraction)
     return name in derived and name not in abstractions()
@@ -104,7 +104,7 @@ def _of_window(export: Export, frames: ClipFrames, abstraction: str) -> Iterator
 
 
 def _line(graph: Graph) -> str:
-    """A graph as a line of node-link JSON, which is the same graph when it is read."""
+    """Return a graph as a line of node-link JSON, verified by reading it back."""
     for _, about in graph.nodes(data=True):
         _drop_unknown(about)
     for *_, about in graph.edges(data=True):
@@ -124,7 +124,7 @@ def _drop_unknown(about: dict[str, Any]) -> None:
 
 
 def _write_graphml(graph: Graph, file: Path) -> None:
-    """Write a graph as GraphML, and read it again: nodes, edges and their relations."""
+    """Write a graph as GraphML, and verify nodes, edges and relations by reading it back."""
     drawn: Graph = nx.MultiDiGraph(**_drawable(graph.graph))
     for node, about in graph.nodes(data=True):
         drawn.add_node(node, **_drawable(about))
@@ -141,7 +141,7 @@ def _write_graphml(graph: Graph, file: Path) -> None:
 
 
 def _drawable(about: dict[str, Any]) -> dict[str, Any]:
-    """Attributes as GraphML has them: numbers, truth values, and texts for everything else."""
+    """Convert attributes for GraphML: numbers, truth values, and texts for all others."""
     return {
         name: value if isinstance(value, (bool, int, float)) else _readable(str(value))
         for name, value in about.items()
@@ -149,7 +149,7 @@ def _drawable(about: dict[str, Any]) -> dict[str, Any]:
 
 
 def _readable(text: str) -> str:
-    """A text that XML can hold."""
+    """Replace characters that XML cannot hold."""
     return "".join(
         c if c.isprintable() or c in "\t\n" else "\N{REPLACEMENT CHARACTER}" for c in text
     )

@@ -1,12 +1,12 @@
-"""Clips as ASAM OpenLABEL 1.0.0: who is there, in which frames, in which box, and the relations among them.
+"""Clips as ASAM OpenLABEL 1.0.0: objects, their frames and boxes, and relations among them.
 
-An object is an entity, called as the simulator calls it; its boxes stand in the frames, those of entities that
-never move at the object. Numbers of frames are those of the trace. A relation of two entities is one relation
-with the intervals of frames in which it holds. Parts of the road map are not in it.
+An object is an entity, named by the simulator's id. Boxes are in the frames; boxes of static
+entities are at the object. Frames have the numbers of the trace. A relation between two entities is
+one relation with the intervals of its frames. Parts of the road map are not exported.
 
-What was imported from OpenLABEL has the keys, numbers of frames, metadata and attributes that it had there.
-Places are rounded to 0.1 mm, which a store keeps up to a kilometre from its middle, so that what is imported is
-exported as it was.
+Data imported from OpenLABEL keeps its keys, frame numbers, metadata and attributes. Places are
+rounded to 0.1 mm, which a store preserves up to a kilometre from its middle, so that an import is
+exported unchanged.
 
 Source: ASAM OpenLABEL 1.0.0, its JSON schema.
 """
@@ -62,7 +62,7 @@ _PLACE_DIGITS: Final = 4
 _TURN_DIGITS: Final = 9
 _UID: Final = "uid"
 _SECTIONS: Final = {"action": "actions", "event": "events", "context": "contexts", "tag": "tags"}
-"""Kinds of imported elements that are no objects, and where they stand."""
+"""Kinds of imported elements other than objects, and their sections."""
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
@@ -80,25 +80,25 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
 
 
 class _Spans:
-    """Frames in which something is the case, as intervals; told in the order of time."""
+    """Set of frames as intervals, added in the order of time."""
 
     def __init__(self) -> None:
         self.spans: list[list[int]] = []
 
     def add(self, place: int) -> None:
-        """Take note of a frame, by its place in the clip."""
+        """Add a frame by its place in the clip."""
         if self.spans and self.spans[-1][1] >= place - 1:
             self.spans[-1][1] = place
         else:
             self.spans.append([place, place])
 
     def told(self, numbers: list[int]) -> list[dict[str, int]]:
-        """The intervals, by the numbers of frames."""
+        """Return the intervals in frame numbers."""
         return [{"frame_start": numbers[a], "frame_end": numbers[b]} for a, b in self.spans]
 
 
 class _Labelling:
-    """One clip on its way into a file.
+    """Writer of one clip into a file.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class _Labelling:
     Attributes
     ----------
     seen : dict
-        Node of each entity → the frames that it is in.
+        Node of each entity → its frames.
     """
 
     def __init__(self, export: Export, frames: ClipFrames) -> None:
@@ -125,14 +125,14 @@ class _Labelling:
         self._numbers = self._numbered()
 
     def _known(self) -> list[dict[str, Any]]:
-        """What does not change of the entities of the trace."""
+        """Return the constant attributes of the entities of the trace."""
         rows = self._export.store.file.rows(_OBJECTS, {"trace": self._trace.trace_id})
         found = [dict(zip(rows.columns, row, strict=True)) for row in rows]
         self._kinds = {entity["node_id"]: entity["kind"] for entity in found}
         return found
 
     def _numbered(self) -> list[int]:
-        """Numbers of the frames."""
+        """Return the numbers of the frames."""
         numbers: list[int] = self._frames.seq.tolist()
         if not self._again or not numbers:
             return numbers
@@ -141,7 +141,7 @@ class _Labelling:
         return [int(one) for one in told] if all(one.isdecimal() for one in told) else numbers
 
     def write(self, stream: TextIO) -> None:
-        """Write it: frames as they are read, then what is known at their end."""
+        """Write the frames in reading order, then the objects and relations."""
         stream.write('{"openlabel": {\n"metadata": ')
         stream.write(_json(self._metadata()))
         axes = {AXES: {"type": "scene_cs", "parent": "", "children": []}}
@@ -180,7 +180,7 @@ class _Labelling:
         return told | trace.report.get("metadata", {}) if self._again else told
 
     def _window(self, frames: ClipFrames) -> Iterable[tuple[int, dict[str, Any]]]:
-        """Numbers of frames with what is in them."""
+        """Yield frame numbers with their content."""
         place = {int(one): i for i, one in enumerate(self._frames.frame_id.tolist())}
         ids: list[int] = frames.frame_id.tolist()
         own = self._own(frames)
@@ -200,7 +200,7 @@ class _Labelling:
                 section = _SECTIONS.get(kind, "objects")
                 key = f"{kind if kind in _SECTIONS else 'object'}_data"
                 uid = self._uids.get(node, str(node))
-                if kind != "tag":  # a tag is of the whole
+                if kind != "tag":  # a tag belongs to the whole file
                     within[frame_id].setdefault(section, {})[uid] = {key: data} if data else {}
                 else:
                     self._tags[node] = data
@@ -217,7 +217,7 @@ class _Labelling:
             yield number, {"frame_properties": properties, **within[frame_id]}
 
     def _own(self, frames: ClipFrames) -> dict[tuple[int, int], dict[str, Any]]:
-        """Attributes that no column has, by frame and node; keys of elements are taken note of."""
+        """Return attributes without a column, by frame and node; register keys of elements."""
         found: dict[tuple[int, int], dict[str, Any]] = {}
         if not self._trace.report.get("imported"):
             return found
@@ -230,7 +230,7 @@ class _Labelling:
         return found
 
     def _elements(self) -> dict[str, dict[str, Any]]:
-        """Objects and, where there are any, other elements."""
+        """Return objects and other elements, if any."""
         found: dict[str, dict[str, Any]] = {"objects": {}}
         for entity in self._entities:
             node, kind = entity["node_id"], entity["kind"]
@@ -263,7 +263,7 @@ class _Labelling:
         return found
 
     def objects(self) -> set[str]:
-        """Keys of the objects that are in it."""
+        """Return the keys of the exported objects."""
         nodes = [node for node in self.seen if self._kinds.get(node) not in _SECTIONS]
         return {self._uids.get(node, str(node)) for node in nodes}
 
@@ -294,7 +294,7 @@ class _Labelling:
 
 
 def _data(state: Mapping[str, Any]) -> dict[str, Any]:
-    """Box, speed and what a light shows; a place where the box is not known."""
+    """Return box, speed and light state; only the position without a known box."""
     place = [state["x"], state["y"], state["z"]]
     if None in place[:2]:
         return {}
@@ -321,7 +321,7 @@ def _data(state: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _typed(attributes: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """Attributes of a client's own as data of an element: by their form, which their values tell."""
+    """Convert the user's attributes to element data, typed by their values."""
     found: dict[str, list[dict[str, Any]]] = {}
     for name, value in attributes.items():
         form, told = "text", value
@@ -338,7 +338,7 @@ def _typed(attributes: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
 
 
 def _quaternion(heading: float, pitch: float, roll: float) -> list[float]:
-    """x, y, z, w of the turn about z, then y, then x; rad. Of the two that mean it the one with w >= 0."""
+    """Return the quaternion x, y, z, w of turns about z, y, x (rad), with w >= 0."""
     (sy, cy), (sp, cp), (sr, cr) = (
         (float(np.sin(a / 2)), float(np.cos(a / 2))) for a in (heading, pitch, roll)
     )
@@ -364,7 +364,7 @@ def _json(value: Any) -> str:
 
 
 def _test(file: Path, clip: _Labelling) -> None:
-    """Read a file again: its frames and objects are those that were written."""
+    """Read a file again, and compare its frames and objects with the written ones."""
     try:
         told = json.loads(file.read_text(encoding="utf-8"))["openlabel"]
         wrong = {*told["objects"]} != clip.objects() or not told["frames"]

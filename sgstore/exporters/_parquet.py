@@ -1,10 +1,10 @@
 """Tables of the clips as Parquet: ``clips``, ``frames``, ``nodes``, ``entities``, ``edges``, ``payloads``.
 
-Their columns are those of the public views, behind the number of the clip, so a frame that is in two clips
-comes twice; ``frames`` have their labels, ``edges`` the attributes of lanes and gaps. Rows are in order of
-clip and frame. ``entities`` has those that are in a clip, once each, with the names that the simulator
-gives them: it is joined to ``nodes`` by ``clip`` and ``node_id``. ``fields.json`` says of each column what
-it is, and ``README.md`` is the card by which the Hugging Face hub and ``datasets`` know the tables.
+The first column is the number of the clip, then the columns of the public views; a frame in two
+clips occurs twice. ``frames`` have their labels, ``edges`` the attributes of lanes and gaps. Rows
+are ordered by clip and frame. ``entities`` has the entities of each clip once, with the names of
+the simulator; it joins ``nodes`` by ``clip`` and ``node_id``. ``fields.json`` describes each
+column, and ``README.md`` is the card of the Hugging Face hub and ``datasets``.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ UNITS: Final = {
     **dict.fromkeys(("t", "offset_s"), "s"),
     **dict.fromkeys(("time_ns", "log_time_ns", "start_ns", "end_ns"), "ns"),
 }
-"""Units of columns; others are names, numbers of things, shares or truth values."""
+"""Units of columns; the others are names, counts, shares or truth values."""
 
 _CLIPS: Final = {
     "clip": "INTEGER",
@@ -101,14 +101,14 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
 
 
 class _Present:
-    """Entities that are in each clip, and the trace of each clip, by the clip's number."""
+    """Entities and trace of each clip, by the clip's number."""
 
     def __init__(self) -> None:
         self.nodes: defaultdict[int, set[int]] = defaultdict(set)
         self.trace: dict[int, int] = {}
 
     def see(self, name: str, clip: int, columns: Mapping[str, Any]) -> None:
-        """Take note of the rows of a table."""
+        """Register the rows of a table."""
         if name == "frames" and len(columns["trace_id"]):
             self.trace.setdefault(clip, int(columns["trace_id"][0]))
         elif name == "nodes":
@@ -149,7 +149,7 @@ def _of_clip(
     found: Mapping[str, np.ndarray[Any, Any]],
     labels: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Rows of a table that are in the clip, with its number and the labels."""
+    """Return the rows of a table in the clip, with its number and the labels."""
     frame_id = np.asarray(found["frame_id"]).astype(np.int64)
     rows = np.isin(frame_id, frames.frame_id)
     columns: dict[str, Any] = {name: values[rows] for name, values in found.items()}
@@ -165,7 +165,7 @@ def _types(file: StoreFile, sql: str, bounds: Mapping[str, int] = _NOWHERE) -> d
 
 
 def _label_types(export: Export) -> dict[str, str]:
-    """Types of the columns of labels: the narrowest that holds all of their values."""
+    """Return the types of label columns: the narrowest that holds all values."""
     if export.labels is None:
         return {}
     return {name: _type_of(values.tolist()) for name, values in export.labels.values.items()}
@@ -181,7 +181,7 @@ def _type_of(values: Sequence[Any]) -> str:
 
 
 def _tested(file: Path, name: str, count: int) -> WrittenFile:
-    """A table that was read again, by pyarrow if that is installed."""
+    """Verify a table by reading it again, with pyarrow if it is installed."""
     try:
         arrow: Any = import_module("pyarrow.parquet")
     except ImportError:
@@ -190,7 +190,7 @@ def _tested(file: Path, name: str, count: int) -> WrittenFile:
         try:
             with arrow.ParquetFile(file) as table:
                 found = sum(batch.num_rows for batch in table.iter_batches())
-        except (OSError, ValueError) as error:  # among them all errors of pyarrow
+        except (OSError, ValueError) as error:  # includes all errors of pyarrow
             raise ExportError(f"{file.name}: cannot be read back: {error}") from error
     if found != count:
         raise ExportError(f"{file.name}: {count} rows were written, {found} are read back")
@@ -206,7 +206,7 @@ _VIEWS: Final = "SELECT view_name, comment FROM duckdb_views() WHERE schema_name
 
 
 def _described(file: StoreFile, fields: Mapping[str, Mapping[str, str]]) -> bytes:
-    """Names, types and units of all columns, by table, with what is said of each table, as JSON."""
+    """Return names, types and units of all columns, by table, with table descriptions, as JSON."""
     about = {str(name): str(comment or "") for name, comment in file.rows(_VIEWS, {})}
     told = {
         table: {
@@ -232,7 +232,7 @@ def _unit(table: str, column: str) -> dict[str, str]:
 
 
 def _card(export: Export, counts: Mapping[str, int]) -> str:
-    """The card of a data set, with the head by which Hugging Face's hub finds the tables."""
+    """Return the card of a data set, with the head for the Hugging Face hub."""
     about = export.about()
     head = ["---", "tags:", "- autonomous-driving", "- scene-graph", "configs:"]
     for name in counts:
@@ -252,7 +252,7 @@ def _code(text: str) -> str:
 
 
 def _quoted(text: str) -> str:
-    """A text that stands as it is: indented, whatever is in it."""
+    """Return a text as an indented literal block."""
     return "\n".join(f"    {line}" for line in text.splitlines())
 
 

@@ -1,14 +1,14 @@
-"""Graphs to learn from, as columns that :mod:`sgstore.exporters.graph_data` hands to PyTorch Geometric.
+"""Graphs for machine learning, as columns for PyTorch Geometric (:mod:`sgstore.exporters.graph_data`).
 
-A folder ``graphs`` of ``.npy`` files, which are mapped into memory and nothing else (no pickle), and
-``graphs.json``, which says what the numbers mean. Graph i has the rows ``node_ptr[i]`` to ``node_ptr[i + 1]``
-of the columns of nodes, and of those of edges accordingly; its ``edge_index`` counts its own nodes from 0.
-Clips are ranges of graphs, and so sequences.
+A folder ``graphs`` of ``.npy`` files, which are memory-mapped (no pickle), and ``graphs.json`` with
+the meaning of the numbers. Graph i has the rows ``node_ptr[i]`` to ``node_ptr[i + 1]`` of the node
+columns, and likewise for edges; its ``edge_index`` counts its own nodes from 0. Clips are ranges of
+graphs, and therefore sequences.
 
-Graphs are as the abstraction ``roadscene2vec`` has them, with the types and relations of that tool in its order
-(so that a type is the column of its one-hot feature, and a relation the type of its edge), or as another
-abstraction has them, with its labels in alphabetical order. Beside its type, a node has its place as the ego
-sees it.
+By default graphs follow the abstraction ``roadscene2vec``, with the types and relations of that
+tool in its order (a type is the column of its one-hot feature, and a relation the type of its
+edge). Graphs of another abstraction have its labels in alphabetical order. A node has its type, and
+its position relative to the ego.
 
 Source: RoadScene2Vec (Malawade et al., 2022), its configuration (names of actors and relations, their order).
 """
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 BY_ITSELF: Final = "roadscene2vec"
-"""The abstraction without another one."""
+"""Default abstraction."""
 
 ACTORS: Final = ("ego_car", "car", "moto", "bicycle", "ped", "lane", "light", "sign", "road")
 RELATIONS: Final = (
@@ -57,7 +57,7 @@ FEATURES: Final = (
     ("up", "m", "above the ego's centre"),
     ("heading", "rad", "less the ego's heading, in (-pi, pi]"),
 )
-"""Columns of ``node_feature``: name, unit, meaning. NaN where a place, or the ego, is not known."""
+"""Columns of ``node_feature``: name, unit, meaning. NaN if the position or the ego is unknown."""
 
 
 _KINDS: Final = {
@@ -72,17 +72,17 @@ _KINDS: Final = {
     "edge_index": ("<i4", 2),
     "edge_type": ("<i2", 0),
 }
-"""Columns: type, and how many numbers a row has; 0: one, and no further axis."""
+"""Columns: type, and numbers per row; 0 means one number without a second axis."""
 
 
 class _TensorColumns:
-    """All columns, as ``.npy`` files that grow, and what is written of them so far.
+    """All columns as growing ``.npy`` files, with their row counts.
 
     Parameters
     ----------
     folder : Path
     labels : mapping
-        Name → the kind and the words of a label; see :func:`_kind_of`.
+        Name → kind and words of a label; see :func:`_kind_of`.
     """
 
     def __init__(self, folder: Path, labels: Mapping[str, tuple[str, list[str]]]) -> None:
@@ -109,10 +109,10 @@ class _TensorColumns:
             stream.close()
 
     def _write_head(self, name: str) -> None:
-        """Write how long a column is: at first without rows, in the end with the number that it has."""
+        """Write the length of a column: 0 at first, the final number at the end."""
         dtype, width = self._kinds[name]
         shape = (self._rows[name], width) if width else (self._rows[name],)
-        # Numpy leaves room in it for the largest number there is, so that its length stays the same.
+        # Numpy reserves room for the largest number, so that the length of the header is constant.
         np.lib.format.write_array_header_1_0(
             self._streams[name], {"descr": dtype, "fortran_order": False, "shape": shape}
         )
@@ -142,7 +142,7 @@ class _TensorColumns:
 
 
 def _kind_of(values: list[Any]) -> tuple[str, list[str]]:
-    """Kind of a label: ``bool``, ``number`` or ``text``; and of texts all words, which their numbers count."""
+    """Return the kind of a label (``bool``, ``number`` or ``text``), and the words of a text label."""
     known = [value for value in values if value is not None]
     if all(isinstance(value, bool) for value in known):
         return "bool", []
@@ -152,7 +152,7 @@ def _kind_of(values: list[Any]) -> tuple[str, list[str]]:
 
 
 def _numbers(values: list[Any], words: list[str]) -> NDArray[np.float64]:
-    """Values of a label as numbers; NaN where one is not known."""
+    """Convert values of a label to numbers; NaN means unknown."""
     place = {word: i for i, word in enumerate(words)}
     told = [place[str(v)] if words and v is not None else v for v in values]
     return np.array([np.nan if value is None else float(value) for value in told])
@@ -196,7 +196,7 @@ WHERE trace_id = $trace AND (ident IS NOT NULL OR type_name IS NOT NULL) ORDER B
 
 
 def _write_entities(export: Export, folder: Path) -> int:
-    """Write what the simulators call the entities of the traces, a line each; how many there are."""
+    """Write the simulator's names of the entities, one per line; return their number."""
     written = 0
     with (folder / ENTITIES).open("x", encoding="utf-8", newline="\n") as stream:
         for trace in dict.fromkeys(clip.trace for clip in export.clips):
@@ -233,7 +233,7 @@ def _about(export: Export, abstraction: str, columns: _TensorColumns) -> dict[st
 def _columns_of(
     export: Export, frames: ClipFrames, abstraction: str, columns: _TensorColumns
 ) -> dict[str, NDArray[Any]]:
-    """The columns of the graphs of some frames; ``nodes`` and ``edges`` say how many each has."""
+    """Return the columns of the graphs of frames; ``nodes`` and ``edges`` are counts per graph."""
     found, seen, labelled = export.store.file.abstracted.frames(abstraction, **frames.bounds)
     wanted = np.full(len(found), -1)
     wanted[np.searchsorted(found, frames.seq)] = np.arange(len(frames))
@@ -266,8 +266,8 @@ def _columns_of(
 
 
 def _edges(labelled: Labelled) -> tuple[NDArray[Any], ...]:
-    """Edges with one label each: frame, source, label, destination."""
-    bundles = labelled.bundles[::-1]  # a label below zero counts from the end
+    """Return edges with one label each: frame, source, label, destination."""
+    bundles = labelled.bundles[::-1]  # a negative label counts from the end
     several = [(i,) for i in range(len(labelled.labels))] + [tuple(of) for of in bundles]
     many = np.array([len(of) for of in several] or [0])
     flat = np.array([one for of in several for one in of] or [0], np.int64)
@@ -281,7 +281,7 @@ def _edges(labelled: Labelled) -> tuple[NDArray[Any], ...]:
 
 
 def _row(labelled: Labelled, frame: NDArray[Any], node: NDArray[Any]) -> NDArray[np.int64]:
-    """Rows of nodes in frames; they are in ascending order."""
+    """Return rows of nodes in frames; nodes must ascend."""
     low = int(labelled.node.min(initial=0))
     span = int(labelled.node.max(initial=0)) - low + 1
     keys = labelled.node_frame * span + (labelled.node - low)
@@ -291,7 +291,7 @@ def _row(labelled: Labelled, frame: NDArray[Any], node: NDArray[Any]) -> NDArray
 def _codes(
     known: list[str], labels: NDArray[np.object_], meaning: Mapping[str, str]
 ) -> NDArray[np.int64]:
-    """Numbers of labels; those that are new are appended to what is known."""
+    """Return numbers of labels; new labels are appended to ``known``."""
     texts, inverse = np.unique(labels.astype(str), return_inverse=True)
     place = {name: i for i, name in enumerate(known)}
     codes: list[int] = []
@@ -305,7 +305,7 @@ def _codes(
 
 
 def _features(seen: GraphColumns, frame: NDArray[Any], node: NDArray[Any]) -> NDArray[np.float64]:
-    """Places of nodes as the ego of their frame sees them; see :data:`FEATURES`."""
+    """Return positions of nodes relative to the ego of their frame; see :data:`FEATURES`."""
     row = seen.row_of(frame, node)
     ego = np.full(seen.frames, -1)
     own = np.flatnonzero(seen.is_ego)
@@ -323,7 +323,7 @@ def _features(seen: GraphColumns, frame: NDArray[Any], node: NDArray[Any]) -> ND
 
 
 def _sorted(file: Path, names: list[str]) -> list[str]:
-    """Names in alphabetical order; the numbers of them in a file are changed accordingly, in pieces."""
+    """Sort names alphabetically, and renumber them in a file piece by piece."""
     order = sorted(range(len(names)), key=names.__getitem__)
     place = np.zeros(len(names) + 1, np.int16)
     place[order] = np.arange(len(names))
@@ -335,12 +335,12 @@ def _sorted(file: Path, names: list[str]) -> list[str]:
 
 
 def _test(folder: Path, columns: _TensorColumns) -> None:
-    """Read all of it again.
+    """Read all columns again.
 
     Raises
     ------
     ExportError
-        It is not what was written.
+        The content differs from the written columns.
     """
     data = GraphData(folder)
     found = len(data), len(data.columns["node_type"]), len(data.columns["edge_type"])

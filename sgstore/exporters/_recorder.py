@@ -1,7 +1,7 @@
-"""A run as it goes → one MCAP file: frames as OSI, the road map, and what sensors measured.
+"""Recorder of a live run into one MCAP file: frames as OSI, the road map, and sensor readings.
 
-Everything bears simulation time as its log time, so that sensors and frames are joined by it to the nanosecond.
-The file is written aside and takes its name when it is finished; memory does not grow with its length.
+Log times are simulation times; they join sensors and frames to the nanosecond. The file has a
+temporary name until it is finished; memory does not grow with its length.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 TRUTH: Final = "ground_truth"
 MAP_TOPIC: Final = "ground_truth_map"
-"""Topics of the frames and of the road map, as other producers have them."""
+"""Topics of the frames and of the road map, as used by other producers."""
 
 PROTOBUF: Final = "protobuf"
 _JSON_SCHEMA: Final = b'{"type": "object", "properties": {"timestamp": {"type": "object"}}}'
@@ -38,7 +38,7 @@ _JSON_SCHEMA: Final = b'{"type": "object", "properties": {"timestamp": {"type": 
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """Content of a recording that was written.
+    """Content of a written recording.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class Written:
     messages : dict
         Topic → number of messages.
     start_ns, end_ns : int
-        Simulation time of the first and of the last frame; ns. 0 without any.
+        Simulation time of the first and of the last frame; ns. 0 without frames.
     """
 
     path: Path
@@ -58,26 +58,26 @@ class Written:
 
 
 class Recorder:
-    """Writes a run as it goes; to be used in a ``with``.
+    """Recorder of a live run; a context manager.
 
     Parameters
     ----------
     to : str or Path
-        ``….mcap``; nothing is overwritten.
+        ``….mcap``; existing files are not overwritten.
     map_text, map_name : str
-        The road map as OpenDRIVE; empty: none.
+        The road map as OpenDRIVE; empty for no map.
     sensors : mapping
         Name of each sensor → its blueprint, for the file's description.
 
     Raises
     ------
     ExportError
-        There is a file already, or none can be written there.
+        The file exists, or cannot be written.
 
     Notes
     -----
-    A run that is broken off, by an interrupt or an error, leaves what was recorded until then. If there is
-    no frame in it, there is no file.
+    An aborted run, by an interrupt or an error, keeps the recorded frames. Without frames there is
+    no file.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class Recorder:
         Raises
         ------
         ExportError
-            Its time is below 0, which MCAP has no number for, or the disk is full.
+            Its time is negative, which MCAP cannot store, or the disk is full.
         """
         time_ns = frame.time_ns
         if time_ns < 0:
@@ -143,7 +143,7 @@ class Recorder:
         self._frames += 1
 
     def reading(self, reading: SensorReading) -> None:
-        """Write what a sensor measured.
+        """Write a sensor reading.
 
         Raises
         ------
@@ -167,7 +167,7 @@ class Recorder:
             self._write(topic, schema, time_ns, foxglove.values(data, time_ns), "json")
 
     def close(self) -> None:
-        """Finish the file and give it its name."""
+        """Finish the file and rename it to its final name."""
         if self._stream.closed:
             return
         try:
@@ -222,16 +222,13 @@ class Recorder:
 
 
 # Frames → messages of ASAM OSI: an ``osi3.SensorView`` with the ground truth in it --------------
-# A sensor view and not a bare ground truth, because only that has the pedals of the host vehicle. What
-# OSI has no word for is not written: the steering input, the hand brake, taxis and electric
-# vehicles as special kinds, subkinds of its own.
-#
-# * What stands is written when it is first seen, as several producers do, and never again.
-# * A traffic light is three bulbs, each on or off, tied to the signal of the map by its id.
-# * OSI's ids are numbers: an id that is one is kept, and any other gets a number of its own and is written
-#   as the object's name.
-#
-# Source: open-simulation-interface 3.8.0; omega-prime specification (``MapAsamOpenDrive``).
+# The format is a sensor view, not a plain ground truth, because only a sensor view has the pedals
+# of the host vehicle. Values without an OSI field are not written: the steering input, the hand
+# brake, taxis and electric vehicles as special kinds, custom subkinds. Static objects are written
+# once, on first appearance, as several producers do. A traffic light is three bulbs, each on or
+# off, linked to the map's signal by its id. OSI's ids are numbers: a numeric id is kept, another id
+# gets a new number and is written as the object's name. Source: open-simulation-interface 3.8.0;
+# omega-prime specification (``MapAsamOpenDrive``).
 
 VERSION: Final = (3, 8, 0)
 SENSOR_VIEW: Final = "osi3.SensorView"
@@ -240,7 +237,7 @@ OPENDRIVE: Final = "net.asam.opendrive"
 """Type of a reference to the road map."""
 
 FIRST_NUMBER: Final = 1 << 40
-"""Numbers from here on are given to what has none; those of simulators are smaller."""
+"""First number for entities without a numeric id; numbers of simulators are smaller."""
 
 _VEHICLE_TYPES: Final = {
     "car": "TYPE_CAR",
@@ -278,7 +275,7 @@ _STATIONARY_TYPES: Final = {
     "prop speed_bump": "TYPE_SPEED_BUMP",
     "prop construction": "TYPE_CONSTRUCTION_SITE_ELEMENT",
 }
-"""Kind, or kind and subkind, of what stands → its type."""
+"""Kind, or kind and subkind, of static objects → their type."""
 _BULBS: Final = (("red", "COLOR_RED"), ("yellow", "COLOR_YELLOW"), ("green", "COLOR_GREEN"))
 _LIT: Final = {
     "red": {"red"},
@@ -299,7 +296,7 @@ _INDICATORS: Final = ("OFF", "LEFT", "RIGHT", "WARNING")
 
 @cache
 def types() -> tuple[type[Any], type[Any], bytes, bytes]:
-    """Classes of a sensor view and of a road map, and the descriptors that an MCAP file carries for them."""
+    """Return the classes of a sensor view and a road map, and their descriptors for MCAP."""
     view_schema = descriptors()
     file = descriptor_pb2.FileDescriptorProto(
         name="osi3/osi_mapasamopendrive.proto", package="osi3", syntax="proto2"
@@ -319,13 +316,13 @@ def types() -> tuple[type[Any], type[Any], bytes, bytes]:
 
 
 def map_message(text: str, name: str) -> bytes:
-    """The message that carries a road map."""
+    """Return the message with a road map."""
     message = types()[1](map_reference=name, open_drive_xml_content=text)
     return message.SerializeToString()
 
 
 class OsiFrames:
-    """Frames of one run → serialised ``osi3.SensorView``."""
+    """Converter of frames of one run to serialised ``osi3.SensorView``."""
 
     def __init__(self) -> None:
         self._numbers: dict[str, int] = {}
@@ -334,7 +331,7 @@ class OsiFrames:
         self._standing: set[str] = set()
 
     def message(self, frame: Frame) -> bytes:
-        """The message of the next frame."""
+        """Return the message of the next frame."""
         out = types()[0]()
         ground = out.global_ground_truth
         for part in (out, ground):
@@ -364,7 +361,7 @@ class OsiFrames:
                 self._write_standing(ground.stationary_object.add(), entity, kind)
 
     def _number(self, ident: str) -> int:
-        """The number of an entity: its id if that is one."""
+        """Return the number of an entity: its id if it is numeric."""
         number = self._numbers.get(ident)
         if number is None:
             plain = ident.isascii() and ident.isdecimal() and str(int(ident)) == ident
@@ -377,7 +374,7 @@ class OsiFrames:
         return self._given
 
     def _name(self, thing: Any, entity: Entity) -> None:
-        """Write an entity's number, its own id where that is none, its type, and what of the map it is."""
+        """Write an entity's number, its own id if it is not numeric, and its map reference."""
         number = self._number(entity.ident)
         thing.id.value = number
         if str(number) != entity.ident:
@@ -418,7 +415,7 @@ class OsiFrames:
         about.type = _number_of(about, "type", _SIGN_TYPES.get(kind, "TYPE_OTHER"))
 
     def _write_light(self, ground: Any, entity: Entity) -> None:
-        """Three bulbs, one above another, that make up the box of the light."""
+        """Write three bulbs, one above another, that fill the box of the light."""
         numbers = self._bulbs.get(entity.ident)
         if numbers is None:
             numbers = (self._number(entity.ident), self._fresh(), self._fresh())
@@ -460,9 +457,9 @@ def _write_base(base: Any, values: dict[str, float]) -> None:
 
 
 def _write_vector(out: Any, names: dict[str, str], values: dict[str, float]) -> None:
-    """Write what is known of a vector; the first of its numbers decides whether it is there at all.
+    """Write the known numbers of a vector; an unknown first number omits the vector.
 
-    In OSI a number that is missing from a vector is 0, and a vector that is missing is not known.
+    In OSI a missing number of a vector is 0, and a missing vector is unknown.
     """
     if math.isnan(values[next(iter(names.values()))]):
         return
@@ -491,7 +488,7 @@ def _write_lamps(out: Any, mask: int) -> None:
 
 
 def _mode(state: str, bulb: str) -> str:
-    """Mode of a bulb when its light shows a state."""
+    """Return the mode of a bulb for a light state."""
     if state == "flashing":
         return "MODE_FLASHING" if bulb == "yellow" else "MODE_OFF"
     if state == "unknown":
@@ -500,5 +497,5 @@ def _mode(state: str, bulb: str) -> str:
 
 
 def _number_of(message: Any, field: str, name: str) -> int:
-    """The number of an enumeration's value, by its name."""
+    """Return the number of an enumeration's value by name."""
     return message.DESCRIPTOR.fields_by_name[field].enum_type.values_by_name[name].number

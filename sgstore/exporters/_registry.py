@@ -1,7 +1,7 @@
-"""The registry of exporters: formats of this package, and those of others.
+"""Registry of exporters: built-in formats, and those of other packages.
 
-A format is a function from an :class:`Export` and a folder to what it wrote there. This module loads none of
-them, and is cheap to load: the command line names formats and their options in its help.
+A format is a function from an :class:`Export` and a folder to the written files. This module loads
+no formats, and is fast to load: the help of the command line lists formats and their options.
 """
 
 from __future__ import annotations
@@ -24,29 +24,29 @@ if TYPE_CHECKING:
 
 
 GROUP: Final = plugins.EXPORTERS.group
-"""Group of entry points by which an installed package adds formats."""
+"""Group of entry points for formats of other packages."""
 
 
 Write = Callable[["Export", Path], "Sequence[WrittenClip | WrittenFile]"]
-"""Writes an export into an empty folder, tests it with the format's own reader, and tells what is there.
+"""Writes an export into an empty folder, verifies it with the format's own reader, and returns the files.
 
-Its names are those of the export; the manifest is none of its business. It may raise
-:class:`~sgstore.errors.ExportError`: then nothing is left of it.
+The exporter chooses file names but does not write the manifest. It may raise
+:class:`~sgstore.errors.ExportError`; then all its files are removed.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class Exporter:
-    """A format.
+    """Export format.
 
     Attributes
     ----------
     name : str
-        What users call it.
+        Name for users.
     write : callable
         See :class:`Write`.
     options : frozenset of str
-        Which options of an :class:`Export` it minds: ``abstraction``, ``with_graph``, ``mounts``,
+        Supported options of an :class:`Export`: ``abstraction``, ``with_graph``, ``mounts``,
         ``rebase_context``, ``graphml``, ``channels``, ``clouds``.
     """
 
@@ -56,7 +56,7 @@ class Exporter:
 
 
 def _of(module: str, *options: str) -> Exporter:
-    """A format of ours; its module is not loaded before it is written."""
+    """Return a built-in format, whose module is loaded on first use."""
 
     def write(export: Export, folder: Path) -> Sequence[WrittenClip | WrittenFile]:
         found: Any = import_module(f"sgstore.exporters._{module}")
@@ -76,16 +76,16 @@ EXPORTERS: Final = (
     _of("openlabel"),
     _of("rrd", "mounts"),
 )
-"""The formats of this package."""
+"""Built-in formats."""
 
 
 def exporters() -> dict[str, Exporter]:
-    """All formats by name: those of this package, and those of others.
+    """Return all formats by name: built-in, and of other packages.
 
     Raises
     ------
     ExportError
-        A package names a format that cannot be loaded.
+        A format of another package cannot be loaded.
     """
     known = {exporter.name: exporter for exporter in EXPORTERS}
     for name, entry in plugins.EXPORTERS.others().items():
@@ -95,15 +95,15 @@ def exporters() -> dict[str, Exporter]:
 
 
 def exporter_named(name: str) -> Exporter:
-    """The exporter that a user's name means.
+    """Return the exporter with this name.
 
     Raises
     ------
     ExportError
-        There is none of that name.
+        The name is unknown.
     """
     known = next((one for one in EXPORTERS if one.name == name), None)
-    if known is not None:  # looking for those of other packages takes a while
+    if known is not None:  # the search for other packages is slow
         return known
     found = exporters()
     if name not in found:

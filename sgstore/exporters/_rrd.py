@@ -1,16 +1,16 @@
-"""Clips for Rerun: a file each, with the scene, the graph, cameras and clouds, on the time of the trace.
+"""Clips for Rerun: one file each, with scene, graph, cameras and point clouds over time.
 
-Entities of the recording, by their paths:
+Paths in the recording:
 
-* ``world/map/LANE_TYPE``: outlines of the road map; they do not change;
-* ``world/boxes``: entities as boxes with their names, ``world/edges/RELATION``: edges from middle to middle;
-* ``world/ego``: the axes of the ego, on the ground below the middle of its box; in them ``world/ego/AXES``,
-  which a mount places, and in these the clouds of points of their sensors. Clouds of which nobody said where
-  their sensor sits are ``sensors/TOPIC``, no part of the scene;
-* ``camera/TOPIC``: pictures; ``graph``: nodes and edges, where they are around the ego.
+* ``world/map/LANE_TYPE``: constant outlines of the road map;
+* ``world/boxes``: entities as boxes with names, ``world/edges/RELATION``: edges between centres;
+* ``world/ego``: the axes of the ego, on the ground below the middle of its box; in them
+  ``world/ego/AXES`` from mounts, with the point clouds of their sensors. Clouds of sensors without
+  a mount are ``sensors/TOPIC``, outside the scene;
+* ``camera/TOPIC``: pictures; ``graph``: nodes and edges, placed around the ego.
 
-The timelines are ``time``, seconds since the trace began, and ``frame``. Rerun writes into its files when they
-were made, so that the same export is not the same bytes.
+The timelines are ``time``, seconds since the start of the trace, and ``frame``. Rerun files contain
+their creation time, so that equal exports differ in bytes.
 
 Source: rerun-io/rerun, its Python SDK and its types of data.
 """
@@ -72,10 +72,10 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
 
 
 def _test(file: Path, paths: set[str], reader: Any) -> None:
-    """Read what was written: every path must be there."""
+    """Read the written file: every path must exist."""
     try:
         found = {str(chunk.entity_path) for chunk in reader(str(file)).stream().to_chunks()}
-    except Exception as error:  # whatever it raises
+    except Exception as error:  # any error of Rerun
         raise ExportError(f"{file.name}: Rerun cannot read it back: {error}") from error
     if not paths <= {path.lstrip("/") for path in found}:
         gone = ", ".join(sorted(paths - {path.lstrip("/") for path in found})[:5])
@@ -83,7 +83,7 @@ def _test(file: Path, paths: set[str], reader: Any) -> None:
 
 
 class RerunClip:
-    """One clip on its way into a file.
+    """Writer of one clip into a file.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class RerunClip:
     Attributes
     ----------
     paths : set of str
-        Entities that were written.
+        Written paths.
     losses : list of Loss
         Pictures, videos and clouds that are not written.
     """
@@ -109,7 +109,7 @@ class RerunClip:
         self._mounts = {one.child for one in export.mounts if one.parent == EGO}
 
     def write(self, file: Path) -> None:
-        """Write it."""
+        """Write the clip into a file."""
         clip = self._frames.clip
         ident = f"{clip.trace} {clip.start_ns} {clip.end_ns}"
         self._out = self._rerun.RecordingStream(APPLICATION, recording_id=ident)
@@ -127,7 +127,7 @@ class RerunClip:
             self._out.disconnect()
 
     def _view(self) -> Any:
-        """First view of the viewer: the scene, and beside it the camera and the graph."""
+        """Return the initial layout of the viewer: the scene, with the camera and the graph next to it."""
         views: Any = import_module("rerun.blueprint")
         return views.Blueprint(
             views.Horizontal(
@@ -152,7 +152,7 @@ class RerunClip:
             self._out.set_time("frame", sequence=frame)
 
     def _path(self, *parts: str) -> str:
-        """A path of names that may hold anything."""
+        """Return a path from arbitrary names."""
         return str(self._rerun.new_entity_path(list(parts))).lstrip("/")
 
     # The scene ------------------------------------------------------------------------------------
@@ -198,7 +198,7 @@ class RerunClip:
         self._write_graph(graph, places)
 
     def _clear_edges(self, graph: SceneGraph) -> None:
-        """Relations that were there and are no more."""
+        """Clear relations that have no more edges."""
         now = {self._path("world", "edges", relation) for _, relation, _, _ in graph.edges}
         for path in sorted(path for path in self.paths - now if path.startswith("world/edges/")):
             self._out.log(path, self._rerun.Clear(recursive=False))
@@ -215,7 +215,7 @@ class RerunClip:
             self._log(path, self._rerun.Transform3D(translation=one.place, quaternion=turn))
 
     def _write_graph(self, graph: SceneGraph, places: dict[int, Any]) -> None:
-        """Nodes where they are around the ego, as one looks from above: ahead is up."""
+        """Write nodes at their positions around the ego, ahead is up."""
         rerun = self._rerun
         known = [node for node in graph.nodes if places[node]]
         about = {} if graph.ego is None else graph.nodes.get(graph.ego, {})
@@ -258,7 +258,7 @@ class RerunClip:
     def _write_message(self, frame_id: int, topic: str) -> bool:
         channel, schema, data = self._export.store.file.recorded(frame_id, topic)
         told = sensor_of(channel, schema)(data)
-        if told is None:  # odometry and the like stay in the recording
+        if told is None:  # other sensors, such as odometry, are not exported
             return True
         if told.holds == "picture" and told.form in _KINDS_OF_PICTURES:
             shown = self._rerun.EncodedImage(contents=told.data, media_type=f"image/{told.form}")
@@ -269,7 +269,7 @@ class RerunClip:
             return False
         points = np.column_stack([told.data[axis].astype(np.float32) for axis in "xyz"])
         axes = _axes_of(record_reader(channel, schema)(data) or {})
-        # Where a sensor of no mount sits nobody knows: its points are no part of the scene.
+        # The pose of a sensor without a mount is unknown: its points are outside the scene.
         root = ("world", EGO, axes) if axes in self._mounts else ("sensors",)
         shown = self._rerun.Points3D(points[np.isfinite(points).all(axis=1)], radii=[0.04])
         self._log(self._path(*root, topic), shown)
@@ -277,11 +277,11 @@ class RerunClip:
 
 
 _SPREAD: Final = 8.0
-"""Units of the picture of a graph for a metre, so that names do not lie upon one another."""
+"""Units of the graph view per metre, so that names do not overlap."""
 
 
 def _axes_of(record: Mapping[str, Any]) -> str:
-    """The axes of a message: ``frame_id``, in ROS that of its header."""
+    """Return the axes of a message: ``frame_id``, for ROS from its header."""
     header = record.get("header")
     held = header if isinstance(header, Mapping) else record
     return str(held.get("frame_id", ""))
@@ -296,7 +296,7 @@ def _rgba(colour: drawn.Colour) -> list[int]:
 
 
 def _lines(graph: SceneGraph, places: dict[int, Any]) -> dict[str, list[Any]]:
-    """The two ends of the edges of each relation."""
+    """Return both ends of the edges of each relation."""
     found: dict[str, list[Any]] = {}
     for src, relation, dst, _ in graph.edges:
         if places.get(src) and places.get(dst):

@@ -1,10 +1,10 @@
-"""Graphs as rows (node, edge, node), under the header that S3C's scripts read.
+"""Graphs as rows (node, edge, node), with the header for S3C's scripts.
 
-The header is ``ds, sg, n_img, t_id, node1, edge, node2``.
-``ds`` is the trace, ``sg`` the frame as ``trace#seq``, ``n_img`` is 1 (every frame stands for itself), ``t_id``
-counts the rows of a graph. Graphs are as the abstraction ``RSV`` has them, which is S3C's ELR, or as another
-one does. A node without any edge stands in no row: such nodes are counted as a loss. Labels have a file of
-their own, because the header has no room for them.
+The header is ``ds, sg, n_img, t_id, node1, edge, node2``. ``ds`` is the trace, ``sg`` the frame as
+``trace#seq``, ``n_img`` is 1 (every frame counts once), ``t_id`` counts the rows of a graph. Graphs
+follow the abstraction ``RSV``, which is S3C's ELR, or another one. A node without edges has no row:
+such nodes are counted as a loss. Labels have their own file, because the header has no room for
+them.
 
 Source: S3C (Woodlief et al., ICSE 2024), its data sets of triples; "ELR" of its section 3.
 """
@@ -29,7 +29,7 @@ HEADER: Final = ("ds", "sg", "n_img", "t_id", "node1", "edge", "node2")
 GRAPHS: Final = "graphs.csv"
 LABELS: Final = "labels.csv"
 BY_ITSELF: Final = "RSV"
-"""The abstraction without another one."""
+"""Default abstraction."""
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:

@@ -1,14 +1,15 @@
-"""Transforms of clips: where the ego and its sensors are in the axes of the scene graphs.
+"""Transforms of clips: poses of the ego and its sensors in the axes of the scene graphs.
 
-A viewer draws what a sensor measured only if it knows where the axes of its messages lie. Each frame of a clip
-with graphs tells it, as ``foxglove.FrameTransforms``:
+A viewer can draw sensor data only with the pose of its axes. Each frame of a clip with graphs
+contains these poses, as ``foxglove.FrameTransforms``:
 
 * ``map`` → ``ego``: the middle of the underside of the ego's box, on the ground; x ahead, y left, z up;
-* ``ego`` → the axes of each sensor of which somebody said where it sits (:class:`Mount`);
-* ``map`` → ``global``, the same axes, for recordings of ASAM OSI: converters call the world so.
+* ``ego`` → the axes of each sensor with a known pose (:class:`Mount`);
+* ``map`` → ``global``, the same axes, for recordings of ASAM OSI: the name of the world in
+  converters.
 
-Where a recording has transforms of its own, the ego's axes are called ``sgstore/ego``, so that axes have no two
-parents.
+If a recording has its own transforms, the ego's axes are named ``sgstore/ego``, because axes cannot
+have two parents.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ if TYPE_CHECKING:
 
 EGO: Final = "ego"
 OWN_EGO: Final = "sgstore/ego"
-"""Axes of the ego; the second where a recording has transforms of its own."""
+"""Axes of the ego; the second name is for recordings with their own transforms."""
 GLOBAL: Final = "global"
-"""The world, as those call it who convert OSI for viewers."""
+"""The world axes, as named by converters of OSI."""
 
 FORM: Final = "[PARENT:]CHILD=X,Y,Z[,YAW[,PITCH,ROLL]]"
 TOLD: Final = frozenset(
@@ -42,24 +43,25 @@ TOLD: Final = frozenset(
         *("tf2_msgs/msg/TFMessage", "tf2_msgs/TFMessage"),
     }
 )
-"""Schemas by which recordings tell transforms."""
+"""Schemas of transforms in recordings."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """A place that does not change: of a sensor in the axes of the ego, or of any axes in others.
+    """Constant pose of a sensor relative to the ego, or of any axes relative to others.
 
     Attributes
     ----------
     child : str
-        Axes, as the messages of the sensor call them (``frame_id``).
+        Axes, by their name in the messages of the sensor (``frame_id``).
     place : tuple of float
         x, y, z of its origin; m.
     yaw, pitch, roll : float
-        How it is turned: about z, then about its new y (positive with the nose down), then about its new x;
-        degrees. Optical axes of a camera that looks ahead (z ahead, x to the right) are -90, 0, -90.
+        Turns about z, then about its new y (positive with the nose down), then about its new x;
+        degrees. Optical axes of a camera that looks ahead (z ahead, x to the right) are -90, 0,
+        -90.
     parent : str
-        Axes in which that is so.
+        Reference axes of the pose.
     """
 
     child: str
@@ -71,12 +73,12 @@ class Mount:
 
 
 def parse_mounts(texts: Iterable[str]) -> tuple[Mount, ...]:
-    """Mounts from texts of the form ``[PARENT:]CHILD=X,Y,Z[,YAW[,PITCH,ROLL]]``; m and degrees.
+    """Parse mounts from texts ``[PARENT:]CHILD=X,Y,Z[,YAW[,PITCH,ROLL]]``; m and degrees.
 
     Raises
     ------
     ExportError
-        One of them has another form, or axes have two parents.
+        A text is invalid, or axes have two parents.
     """
     found: dict[str, Mount] = {}
     for text in texts:
@@ -96,14 +98,14 @@ def parse_mounts(texts: Iterable[str]) -> tuple[Mount, ...]:
 
 
 def _ends(axes: str, mounts: Mapping[str, Mount]) -> str:
-    """The axes in which some lie at the last."""
+    """Follow the parents of axes to the root."""
     while axes in mounts:
         axes = mounts[axes].parent
     return axes
 
 
 def _numbers(text: str) -> list[float]:
-    """Finite numbers between commas; none if one of them is not."""
+    """Parse finite numbers between commas; return an empty list if one is invalid."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
@@ -112,7 +114,7 @@ def _numbers(text: str) -> list[float]:
 
 
 class FrameTransforms:
-    """Transforms that each frame of the clips of one recording tells.
+    """Transforms in each frame of the clips of one recording.
 
     Parameters
     ----------
@@ -139,7 +141,7 @@ class FrameTransforms:
             self._fixed.append(AxesTransform(AXES, GLOBAL, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
 
     def of(self, graph: SceneGraph) -> Iterator[AxesTransform]:
-        """The transforms of a frame; without an ego, those that do not change."""
+        """Yield the transforms of a frame; without an ego, only the constant ones."""
         about = graph.nodes.get(graph.ego) if graph.ego is not None else None
         if about is not None and "x" in about and "y" in about:
             yield _of_ego(about, self.ego)
@@ -155,7 +157,7 @@ def _of_ego(about: dict[str, Any], name: str) -> AxesTransform:
 
 
 def matrix(yaw: float, pitch: float, roll: float) -> NDArray[np.float64]:
-    """A turn about z, then about the new y, then about the new x, as a matrix; rad.
+    """Return the rotation matrix of turns about z, the new y, and the new x; rad.
 
     Its columns are the turned x, y and z.
     """

@@ -1,4 +1,4 @@
-"""Export from a store: clips around frames that are named, labels, and all files or none, with a manifest."""
+"""Export from a store: clips around frames, labels, and atomic writing with a manifest."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ OPTIONS: Final = {
     "channels": "channel",
     "clouds": "clouds",
 }
-"""Options of an export that only some formats mind, and what the command line calls them."""
+"""Options that only some formats support, and their names on the command line."""
 
 
 def around_frames(
     store: Store, frames: Iterable[int | str], before: float, after: float
 ) -> list[Clip]:
-    """Clips around frames; those that overlap are one.
+    """Return clips around frames; overlapping clips are merged.
 
     Parameters
     ----------
@@ -51,12 +51,12 @@ def around_frames(
     frames : iterable
         ``frame_id``, ``TRACE#SEQ`` or ``TRACE@12.3s`` each.
     before, after : float
-        What is added at both ends; s.
+        Time added at both ends; s.
 
     Raises
     ------
     StoreError
-        There is no such frame.
+        A frame is missing.
     """
     found = [store.file.frame(frame) for frame in frames]
     clips = (
@@ -70,7 +70,7 @@ def around_frames(
 
 
 def labelled(export: Export, texts: Mapping[str, str], **parameters: object) -> Export:
-    """An export with labels for the frames of its clips.
+    """Return an export with labels for the frames of its clips.
 
     Parameters
     ----------
@@ -94,26 +94,26 @@ def labelled(export: Export, texts: Mapping[str, str], **parameters: object) -> 
 def write_export(
     export: Export, to: str | Path, form: str = "mcap"
 ) -> list[WrittenClip | WrittenFile]:
-    """Write clips of a store, all of it or nothing.
+    """Write clips of a store, completely or not at all.
 
     Parameters
     ----------
     export : Export
     to : str or Path
-        Folder; made if it does not exist, and nothing in it is overwritten.
+        Folder, created if missing; its files are not overwritten.
     form : str
         Name of an exporter.
 
     Returns
     -------
     list of WrittenClip or WrittenFile
-        What is there now, without the manifest.
+        The written files, without the manifest.
 
     Raises
     ------
     ExportError, TraceError
-        As the exporter says, or it breaks; there is no such format, or it does not mind an option. Then nothing
-        is written.
+        The exporter fails, the format is unknown, or it does not support an option. Then no file is
+        written.
     """
     to, exporter = Path(to), exporter_named(form)
     _check(export, exporter)
@@ -135,7 +135,7 @@ def write_export(
 
 
 def _written(exporter: Exporter, export: Export, folder: Path) -> list[WrittenClip | WrittenFile]:
-    """Files that an exporter wrote; whatever breaks in it, maybe of another package, is told by its name."""
+    """Run an exporter; errors in it are reported with the name of the format."""
     try:
         written: list[Any] = list(exporter.write(export, folder))
         odd = [one for one in written if not isinstance(one, WrittenClip | WrittenFile)]

@@ -1,13 +1,15 @@
-"""Clips as scenarios: OpenSCENARIO XML 1.2, which simulators drive again, with the road map beside them.
+"""Clips as scenarios in OpenSCENARIO XML 1.2 for simulators, with the road map.
 
-For each clip there is ``CLIP.xosc``; its map, if the trace has one, is ``MAP.xodr`` in the same folder.
+Each clip has a file ``CLIP.xosc``; its map, if the trace has one, is ``MAP.xodr`` in the same
+folder.
 
-* Every entity follows its recorded track: a trajectory of vertices with times, which a simulator joins by
-  straight lines. Time 0 is the first frame of the clip. Who comes later is added then, who leaves is deleted.
-* What never moves is put in its place. Signs and lights are parts of the map; what lights show is told by the
-  ids that the map has for them.
-* The origin of a vehicle is below the middle of its rear axle, on the ground, as the standard wants it. Where
-  that axle is, no recording says: it is taken to be 0.3 of the length behind the middle.
+* Every entity follows its recorded track: a trajectory of vertices with times, which a simulator
+  joins by straight lines. Time 0 is the first frame of the clip. Entities are added and deleted
+  when they appear and disappear.
+* Static entities are placed once. Signs and lights are parts of the map; light states refer to ids
+  of the map.
+* The origin of a vehicle is below the middle of its rear axle, on the ground, as in the standard.
+  Recordings do not contain the axle: the export assumes 0.3 of the length behind the middle.
 
 Source: ASAM OpenSCENARIO XML 1.2.0, its model of classes and its schema.
 """
@@ -53,7 +55,7 @@ _CATEGORIES: Final = {
     "vegetation": "vegetation",
     "unknown": "none",
 }
-"""Kind → category; signs and lights are none, they are the map's."""
+"""Kind → category; without signs and lights, which belong to the map."""
 _PEOPLE: Final = frozenset({"person", "animal"})
 _SIZES: Final = {
     "truck": (8.0, 2.5, 3.2),
@@ -66,12 +68,12 @@ _SIZES: Final = {
     "person": (0.6, 0.6, 1.75),
 }
 _SIZE: Final = (4.5, 1.8, 1.5)
-"""Length, width and height where none are known; m."""
+"""Default length, width and height; m."""
 REAR_AXLE: Final = 0.3
-"""How far behind the middle of a vehicle its rear axle is, as a share of the length."""
+"""Distance of the rear axle behind the middle of a vehicle, as a share of the length."""
 _MASS: Final = {"person": 75.0, "animal": 20.0}
 TOLERANCE: Final = 0.001
-"""How exactly positions are read again; m."""
+"""Tolerance of positions in the verification; m."""
 
 _ENTITIES: Final = """
 SELECT n.node_id, any_value(n.kind)::VARCHAR AS kind, bool_or(n.is_ego) AS is_ego,
@@ -95,20 +97,20 @@ WHERE frame_id >= $first AND frame_id <= $last AND node_id = $node AND light_sta
 
 @dataclass(frozen=True, slots=True)
 class ScenarioEntity:
-    """An entity of a clip.
+    """Entity of a clip.
 
     Attributes
     ----------
     node : int
     name : str
-        In the scenario.
+        Name in the scenario.
     kind : str
     still : bool
-        It never moves.
+        True if it never moves.
     size : tuple of float
         Length, width, height; m.
     properties : dict
-        What the simulator called it.
+        Names from the simulator.
     """
 
     node: int
@@ -120,7 +122,7 @@ class ScenarioEntity:
 
     @property
     def centre(self) -> tuple[float, float, float]:
-        """The middle of the box in the axes of the entity; m."""
+        """Return the middle of the box in the axes of the entity; m."""
         ahead = REAR_AXLE * self.size[0] if self.kind in VEHICLES else 0.0
         return ahead, 0.0, self.size[2] / 2
 
@@ -132,9 +134,10 @@ class EntityTrack:
     Attributes
     ----------
     row : int64
-        Of each state, among the frames of the clip.
+        Frame of each state, as a row of the clip.
     pose : (n, 6) float64
-        x, y, z, heading, pitch, roll of the origin, headings without jumps; m, rad. NaN: not known.
+        x, y, z, heading, pitch, roll of the origin, headings without jumps; m, rad. NaN means
+        unknown.
     speed : float64
         m/s.
     """
@@ -144,13 +147,13 @@ class EntityTrack:
     speed: Numbers
 
     def stretches(self) -> Iterator[tuple[int, int]]:
-        """First and last index of each stretch without a gap."""
+        """Yield first and last index of each stretch without a gap."""
         ends = np.flatnonzero(np.diff(self.row) > 1).tolist()
         yield from zip([0, *(end + 1 for end in ends)], [*ends, len(self.row) - 1], strict=True)
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
-    """Write a scenario for each clip, and the maps that they name."""
+    """Write a scenario for each clip, and the referenced maps."""
     maps: dict[str, Path | None] = {}
     written: list[WrittenFile] = []
     for frames in export.frames():
@@ -169,12 +172,12 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
 
 
 def _write_map(export: Export, folder: Path, trace: str) -> Path | None:
-    """The road map of a trace beside its scenarios; the same text once."""
+    """Write the road map of a trace next to its scenarios; equal texts are shared."""
     told = export.store.file.road_map_text(trace)
     if told is None:
         return None
     name, text = told
-    if is_lane_text(text):  # lanes of a recording or map that is no OpenDRIVE
+    if is_lane_text(text):  # plain lanes are not OpenDRIVE
         return None
     stem = safe_name(name.removesuffix(".xodr").rpartition("/")[2], "map")
     data = text.encode("utf-8")
@@ -189,14 +192,14 @@ def _write_map(export: Export, folder: Path, trace: str) -> Path | None:
 
 
 class Scenario:
-    """One clip on its way into a file.
+    """Writer of one clip into a file.
 
     Parameters
     ----------
     export : Export
     frames : ClipFrames
     map_file : str
-        Name of the map in the folder; empty: none.
+        Name of the map in the folder, or empty.
     """
 
     def __init__(self, export: Export, frames: ClipFrames, map_file: str) -> None:
@@ -234,7 +237,7 @@ class Scenario:
                 )
 
     def losses(self) -> list[Loss]:
-        """Parts of the clip that the scenario does not have."""
+        """Return the parts of the clip that the scenario does not have."""
         told: list[Loss] = []
         if self._unsized:
             reason = f"the size of {_some(self._unsized)} is not known: a usual one is written"
@@ -247,7 +250,7 @@ class Scenario:
         return told
 
     def write(self, file: Path) -> None:
-        """Write it."""
+        """Write the scenario into a file."""
         with file.open("x", encoding="utf-8", newline="\n") as stream:
             xml = XmlWriter(stream)
             with xml.element("OpenSCENARIO"):
@@ -327,7 +330,7 @@ class Scenario:
         track: EntityTrack,
         ends: tuple[int, int],
     ) -> None:
-        """An entity comes, moves, and leaves."""
+        """Write the appearance, movement and disappearance of an entity."""
         low, high = ends
         times, poses = self._seconds[track.row[low : high + 1]], track.pose[low : high + 1]
         start = float(times[0])
@@ -356,7 +359,7 @@ class Scenario:
                 xml.leaf("DeleteEntityAction")
 
     def _write_lights(self, xml: XmlWriter, *, alone: bool) -> None:
-        """Changes of lights; without any entity that moves, an act has to have something else."""
+        """Write light changes; without moving entities, a placeholder fills the act."""
         for node, ref in self._lights:
             changes = [(row, state) for row, state in self._light(node) if row > 0]
             if not changes:
@@ -374,7 +377,7 @@ class Scenario:
     # What the store knows -------------------------------------------------------------------------
 
     def _track(self, actor: ScenarioEntity, *, first: bool = False) -> EntityTrack:
-        """The states of an entity in the clip, or in its first frame alone."""
+        """Return the states of an entity in the clip, or only in its first frame."""
         bounds = self._frames.bounds
         if first:
             bounds["last"] = bounds["first"]
@@ -388,7 +391,7 @@ class Scenario:
         return EntityTrack(row, _origins(pose, actor.centre), speed)
 
     def _light(self, node: int) -> Iterator[tuple[int, str]]:
-        """Rows of the frames at which a light shows something else than before, and what."""
+        """Yield rows of the frames where a light changes, and its new state."""
         before = ""
         for frame_id, state in self._store.rows(_LIGHT, {**self._frames.bounds, "node": node}):
             if state != before:
@@ -402,7 +405,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def _unwrapped(heading: Numbers) -> Numbers:
-    """Headings without jumps of a whole turn; those that are not known stay so."""
+    """Remove full-turn jumps from headings; unknown headings stay."""
     known = np.isfinite(heading)
     out = heading.copy()
     out[known] = np.unwrap(heading[known])
@@ -410,7 +413,7 @@ def _unwrapped(heading: Numbers) -> Numbers:
 
 
 def _origins(pose: Numbers, centre: tuple[float, float, float]) -> Numbers:
-    """Poses of origins, of poses of the middles of boxes."""
+    """Convert poses of box centres to poses of origins."""
     (ch, cp, cr), (sh, sp, sr) = (
         [of(np.nan_to_num(pose[:, axis])) for axis in (3, 4, 5)] for of in (np.cos, np.sin)
     )
@@ -426,7 +429,7 @@ def _origins(pose: Numbers, centre: tuple[float, float, float]) -> Numbers:
 
 
 class XmlWriter:
-    """Elements, written one after another."""
+    """Writer of XML elements in sequence."""
 
     def __init__(self, stream: Any) -> None:
         self._out = XMLGenerator(stream, "utf-8", short_empty_elements=True)
@@ -435,7 +438,7 @@ class XmlWriter:
 
     @contextmanager
     def element(self, tag: str, /, **attributes: str) -> Generator[None]:
-        """An element around what is written inside."""
+        """Write an element around the content of the ``with`` block."""
         self._begin(tag, attributes)
         self._out.ignorableWhitespace("\n")
         self._depth += 1
@@ -446,7 +449,7 @@ class XmlWriter:
         self._out.ignorableWhitespace("\n")
 
     def leaf(self, tag: str, /, **attributes: str) -> None:
-        """An element with nothing inside."""
+        """Write an empty element."""
         self._begin(tag, attributes)
         self._out.endElement(tag)
         self._out.ignorableWhitespace("\n")
@@ -462,7 +465,7 @@ class XmlWriter:
 
 
 def _readable(text: str) -> str:
-    """A text that XML can hold; a dollar would name a parameter of the scenario."""
+    """Replace characters that XML cannot hold, and ``$``, which marks scenario parameters."""
     return "".join(c if c.isprintable() and c != "$" else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
@@ -563,7 +566,7 @@ def _write_signal(xml: XmlWriter, ref: str, state: str) -> None:
 
 
 def _write_when(xml: XmlWriter, time: float, name: str) -> None:
-    """A condition that holds from a time on."""
+    """Write a condition that holds from a time on."""
     with (
         xml.element("ConditionGroup"),
         xml.element("Condition", name=name, delay="0", conditionEdge="none"),
@@ -591,7 +594,7 @@ def _event(xml: XmlWriter, name: str, time: float) -> Generator[None]:
 
 
 def _test(file: Path, vertices: int) -> None:
-    """Read what was written, an element at a time."""
+    """Read the written file again, one element at a time."""
     found = 0
     try:
         for _, element in ET.iterparse(file):  # noqa: S314  it is ours

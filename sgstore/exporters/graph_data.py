@@ -1,4 +1,4 @@
-"""Graphs that ``sgstore export --format pyg`` wrote, for networks that learn from them.
+"""Reader of graphs from ``sgstore export --format pyg``, for machine learning.
 
 ::
 
@@ -9,7 +9,7 @@
     for batch in DataLoader(graphs, batch_size=32, shuffle=True):
         ...
 
-:class:`GraphData` gives the same as arrays, and needs neither torch nor PyTorch Geometric.
+:class:`GraphData` returns the same as arrays, without torch and PyTorch Geometric.
 """
 
 from __future__ import annotations
@@ -44,24 +44,25 @@ _MOST: Final = 64 << 20
 
 
 class GraphData:
-    """Graphs as arrays, mapped into memory.
+    """Graphs as memory-mapped arrays.
 
     Parameters
     ----------
     folder : str or Path
-        What an export wrote.
+        Folder of an export.
 
     Attributes
     ----------
     about : dict
         ``abstraction``, ``node_types``, ``relations``, ``node_features``, ``labels``, ``clips``.
     columns : dict
-        Name → array; see :mod:`sgstore.exporters._pyg`. ``label_NAME``: float64, NaN where it is not known.
+        Name → array; see :mod:`sgstore.exporters._pyg`. ``label_NAME``: float64, NaN for unknown
+        values.
 
     Raises
     ------
     ExportError
-        There is no such folder, or it holds something else, or a part of it is missing.
+        The folder is missing, has other content, or lacks a part.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -95,7 +96,7 @@ class GraphData:
         return len(self.columns["frame_id"])
 
     def arrays(self, number: int) -> dict[str, NDArray[Any]]:
-        """One graph.
+        """Return one graph as arrays.
 
         Returns
         -------
@@ -106,7 +107,7 @@ class GraphData:
         Raises
         ------
         IndexError
-            There is none of that number.
+            The number is out of range.
         """
         if not 0 <= number < len(self):
             raise IndexError(f"graph {number} of {len(self)}")
@@ -124,19 +125,20 @@ class GraphData:
         return found
 
     def identities(self, number: int) -> list[tuple[str, str]]:
-        """Of each node of a graph the simulator's id, and its name of the type.
+        """Return the simulator's id and type name of each node of a graph.
 
         Returns
         -------
         list of (str, str)
-            In the order of ``node_id``; empty texts of parts of the road map, and where nothing is known.
+            In the order of ``node_id``; empty texts for parts of the road map and for unknown
+            names.
 
         Raises
         ------
         IndexError
-            There is no graph of that number.
+            The number is out of range.
         ExportError
-            The file of the entities cannot be read. (Exports before 0.2 have none.)
+            The file of the entities cannot be read. (Exports before 0.2 have no such file.)
         """
         nodes = self.arrays(number)
         trace = self.about["clips"][int(nodes["clip"])]["trace"]
@@ -145,7 +147,7 @@ class GraphData:
 
     @cached_property
     def _entities(self) -> dict[str, dict[int, tuple[str, str]]]:
-        """Trace → node → the simulator's id and type."""
+        """Map traces to nodes to the simulator's id and type."""
         found: dict[str, dict[int, tuple[str, str]]] = {}
         file = self.folder / ENTITIES
         try:
@@ -159,24 +161,24 @@ class GraphData:
         return found
 
     def sequences(self) -> Iterator[range]:
-        """The graphs of each clip, in order of time."""
+        """Yield the graphs of each clip, in order of time."""
         for clip in self.about["clips"]:
             yield range(*clip["graphs"])
 
     def by_trace(self) -> dict[str, list[int]]:
-        """The graphs of each trace: what is split into parts to learn from and to test with."""
+        """Return the graphs of each trace, for a split into training and test data."""
         found: dict[str, list[int]] = {}
         for clip in self.about["clips"]:
             found.setdefault(clip["trace"], []).extend(range(*clip["graphs"]))
         return found
 
     def check(self) -> None:
-        """Look whether the columns fit together.
+        """Check the consistency of the columns.
 
         Raises
         ------
         ExportError
-            They do not; it says which.
+            Columns are inconsistent; the message names one.
         """
         count = len(self)
         for thing in ("node", "edge"):
@@ -212,37 +214,38 @@ class GraphData:
 
 
 class GraphDataset:
-    """Graphs for ``torch_geometric.loader.DataLoader``.
+    """Data set of graphs for ``torch_geometric.loader.DataLoader``.
 
     Parameters
     ----------
     folder : str or Path
-        What an export wrote.
+        Folder of an export.
     hetero : bool
-        Whether each is a ``HeteroData``, by types of nodes and relations, or a ``Data``.
+        True for ``HeteroData``, by types of nodes and relations, instead of ``Data``.
     label : str, optional
-        The label that becomes ``y``; without one there is no ``y``.
+        The label for ``y``; by default there is no ``y``.
     rows : sequence of int, optional
-        Which graphs; by default all.
+        Indices of graphs; by default all.
     like : GraphData, optional
-        Whose numbers types and relations have: those of what was learned from. Without one, its own.
+        Data with the numbering of types and relations, such as the training data. By default their
+        own numbering.
     names : bool
-        Whether each graph has ``ident`` and ``type_name``, lists with a text for each node: what the
-        simulator calls it, and its type.
+        True if each graph has ``ident`` and ``type_name``: lists with the simulator's id and type
+        name per node.
 
     Raises
     ------
     ExportError
-        The folder cannot be read, there is no such label, or a type or relation that ``like`` lacks.
+        The folder cannot be read, the label is unknown, or ``like`` lacks a type or relation.
     MissingExtraError
         PyTorch Geometric is not installed.
 
     Notes
     -----
-    ``Data`` has ``x`` (n, types), one-hot; ``edge_index`` (2, e); ``edge_attr`` (e,), the number of the
-    relation: as RoadScene2Vec's networks want them; ``place`` (n, 4), NaN where it is not known; ``y`` (1,),
-    NaN where the label is not known; ``frame_id``, ``clip``. ``HeteroData`` has, for each type, ``x`` (n, 4),
-    places with 0 where they are not known, ``known`` (n, 4), and an ``edge_index`` for each (type, relation,
+    ``Data`` has ``x`` (n, types), one-hot; ``edge_index`` (2, e); ``edge_attr`` (e,), the number of
+    the relation, as for RoadScene2Vec's networks; ``place`` (n, 4), NaN if unknown; ``y`` (1,), NaN
+    for an unknown label; ``frame_id``, ``clip``. ``HeteroData`` has, for each type, ``x`` (n, 4),
+    places with 0 if unknown, ``known`` (n, 4), and an ``edge_index`` for each (type, relation,
     type).
     """
 
@@ -333,7 +336,7 @@ class GraphDataset:
         return made
 
     def triples(self) -> list[tuple[str, str, str]]:
-        """All (type, relation, type) that occur in the data, in order."""
+        """Return all triples (type, relation, type) in the data, in order."""
         return self._triples
 
     @cached_property
@@ -357,7 +360,7 @@ class GraphDataset:
 
 
 def _renumbered(own: list[str], wanted: list[str], folder: str | Path) -> NDArray[np.int64]:
-    """Numbers of names in a list → their numbers in another one."""
+    """Map numbers of names in one list to numbers in another list."""
     place = {name: i for i, name in enumerate(wanted)}
     missing = [name for name in own if name not in place]
     if missing:
