@@ -1,13 +1,13 @@
-"""More than one machine: the same questions over a collection of stores.
+"""Collections of stores: the same queries over several stores and machines.
 
-A collection is a folder, or a place in an object store. It has *bundles*, ordinary stores of some hundreds of
-traces that never change, and a *catalogue* that says what is in them. ``_place`` reads and writes such places,
-``_catalogue`` the snapshots of the catalogue, ``_pack`` makes bundles of stores and of landed segments, and
-looks after them.
+A collection is a folder, or a prefix in an object store. It has *bundles*, which are immutable
+stores of some hundreds of traces, and a *catalogue* of their contents. ``_place`` reads and writes
+such places, ``_catalogue`` the snapshots of the catalogue. ``_pack`` makes bundles of stores and of
+landed segments, and maintains them.
 
-A question is compiled once against the whole, then asked of each bundle that may answer it, by an engine
-(``_engines``: processes of this machine, Ray, Spark) that runs ``_worker``; ``_questions`` makes one answer of
-theirs.
+A query is compiled once against the whole collection. An engine (``_engines``: local processes,
+Ray, Spark) then runs ``_worker`` on each bundle that may have results. ``_questions`` merges the
+results.
 """
 
 import lazy_loader

@@ -1,8 +1,8 @@
-"""Bundles on this machine: fetched once, and looked at once whether they are what the catalogue says.
+"""Cache of bundles on this machine: fetched once, and verified once against the catalogue.
 
-A bundle is called by the SHA-256 of its file. Of a collection in a folder it is used where it is; what was
-found right is remembered by the file's number, size and time, so that it is not read as a whole for each
-question.
+The name of a bundle is the SHA-256 of its file. A bundle in a local folder is used in place. A
+verified bundle is remembered by the file's inode, size and time, so that it is not hashed for each
+query.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
     from sgstore.collection._place import Place
 
 CACHE: Final = "SGSTORE_CACHE"
-"""Variable of the environment: the folder for bundles that were fetched."""
+"""Environment variable: the folder for fetched bundles."""
 
 
 def cache_folder() -> Path:
-    """The folder for bundles that were fetched, and for what is remembered of others; it is made.
+    """Create and return the folder for fetched bundles and for verification marks.
 
     Raises
     ------
     StoreError
-        It cannot be made.
+        The folder cannot be created.
     """
     told = os.environ.get(CACHE)
     base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
@@ -46,19 +46,19 @@ def cache_folder() -> Path:
 
 
 def bundle_path(place: Place, sha: str, *, again: bool = False) -> Path:
-    """The file of a bundle on this machine, after it was seen to be what its name says.
+    """Return the local file of a bundle after verification.
 
     Parameters
     ----------
     place : Place
     sha : str
     again : bool
-        Whether it is looked at even if it was found right before.
+        True to verify the file again.
 
     Raises
     ------
     StoreError
-        It is not there, cannot be fetched, or is not as it was committed.
+        The file is missing, cannot be fetched, or differs from the committed one.
     """
     folder, name = cache_folder(), f"bundles/{sha}.sgstore"
     path = place.local(name)
@@ -99,7 +99,7 @@ def _stamp(path: Path) -> list[int]:
 
 
 def _seen(folder: Path, sha: str, path: Path) -> bool:
-    """Tell whether a file was found right, and looks the same since."""
+    """True if a file has been verified and has not changed since."""
     try:
         return json.loads((folder / "seen" / sha).read_text()) == _stamp(path)
     except FileNotFoundError:
@@ -112,6 +112,6 @@ def _seen(folder: Path, sha: str, path: Path) -> bool:
 
 def _remember(folder: Path, sha: str, path: Path) -> None:
     fresh = folder / "seen" / f".{sha}.{os.getpid()}"
-    with suppress(OSError):  # then it is looked at again
+    with suppress(OSError):  # then it is verified again
         fresh.write_text(json.dumps(_stamp(path)))
         fresh.replace(folder / "seen" / sha)

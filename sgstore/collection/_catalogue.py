@@ -1,8 +1,8 @@
-"""The catalogue of a collection: snapshots, each of which says all that is in it.
+"""Catalogue of a collection: complete snapshots of its contents.
 
-A snapshot has a number, a folder of Parquet files and one of JSON beside that, which is written last, and only
-if there is none of that number: so a snapshot is there as a whole or not at all, and of two commits at once
-one has to look again. Questions keep to the snapshot that they began with.
+A snapshot has a number, a folder of Parquet files, and a JSON file. The JSON file is written last,
+and only if its number is free: a snapshot is complete or absent, and of two simultaneous commits
+one must retry. A query uses one snapshot from begin to end.
 """
 
 from __future__ import annotations
@@ -42,24 +42,24 @@ FORMAT: Final = 1
 """Version of the layout."""
 
 BUNDLE_TRACES: Final = 1_000
-"""Most traces of a bundle, unless the collection says otherwise."""
+"""Default for the greatest number of traces per bundle."""
 
 BUNDLE_BYTES: Final = 512 << 20
-"""About how many bytes a bundle should have at most."""
+"""Approximate greatest size of a bundle; bytes."""
 
 _SNAPSHOTS: Final = "catalogue"
 
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """Settings of a collection, once for all.
+    """Fixed settings of a collection.
 
     Attributes
     ----------
     schema_version : str
-        Of its bundles.
+        Schema version of its bundles.
     bundle_traces, bundle_bytes : int
-        How large its bundles are to be at most.
+        Limits for the size of its bundles.
     """
 
     schema_version: str = SCHEMA_VERSION
@@ -73,7 +73,7 @@ def about(place: Place) -> About:
     Raises
     ------
     StoreError
-        There is no collection, or one of another version.
+        The collection is missing, or has another version.
     """
     try:
         told = json.loads(place.read(ABOUT))
@@ -97,13 +97,13 @@ def about(place: Place) -> About:
 
 
 def _damage(error: Exception) -> str:
-    """What is wrong with a file of JSON."""
+    """Return the defect of a JSON file as text."""
     why = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
     return f"damaged or cut off ({why}); put it back from a copy"
 
 
 def create(place: Place, wanted: About) -> About:
-    """Make a collection where there is none; what it says of itself."""
+    """Create a collection, if there is none, and return its settings."""
     told = {
         "format": FORMAT,
         "schema_version": wanted.schema_version,
@@ -116,12 +116,12 @@ def create(place: Place, wanted: About) -> About:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A state of a collection.
+    """State of a collection.
 
     Attributes
     ----------
     number : int
-        0: nothing was committed yet.
+        0 means no commits yet.
     facts : dict
         Rows of the tables of the catalogue, by table.
     """
@@ -131,30 +131,30 @@ class Snapshot:
 
     @cached_property
     def bundles(self) -> tuple[dict[str, Any], ...]:
-        """The rows of table ``bundle``, in the order in which they were committed."""
+        """Return the rows of table ``bundle``, in commit order."""
         names = [*CATALOGUE["bundle"]]
         return tuple(dict(zip(names, row, strict=True)) for row in self.facts["bundle"])
 
     @cached_property
     def traces(self) -> tuple[dict[str, Any], ...]:
-        """The rows of table ``trace``, by name in natural order."""
+        """Return the rows of table ``trace``, by name in natural order."""
         names = [*CATALOGUE["trace"]]
         found = (dict(zip(names, row, strict=True)) for row in self.facts["trace"])
         return tuple(sorted(found, key=lambda row: natural(row["name"])))
 
     def scope(self, *, world: bool, traces: Iterable[int] | None = None) -> dict[str, Any]:
-        """What settings left out of some traces, or of all; see :func:`sgstore.store.scope_of`."""
+        """Return the omissions by settings in some traces, or in all; see :func:`sgstore.store.scope_of`."""
         chosen = None if traces is None else frozenset(traces)
         told = (row["scope"] for row in self.traces if chosen is None or row["trace_id"] in chosen)
         return scope_of(({"scope": json.loads(one)} for one in told if one), world=world)
 
     @cached_property
     def homes(self) -> dict[int, str]:
-        """Trace → its bundle."""
+        """Map each trace to its bundle."""
         return {row["trace_id"]: row["bundle"] for row in self.traces}
 
     def of(self, table: str, bundle: str) -> list[tuple[Any, ...]]:
-        """The rows of a table that speak of a bundle."""
+        """Return the rows of a table for one bundle."""
         return self._by_bundle(table).get(bundle, [])
 
     def _by_bundle(self, table: str) -> dict[str, list[tuple[Any, ...]]]:
@@ -171,7 +171,7 @@ class Snapshot:
 
     @cached_property
     def words(self) -> dict[str, tuple[str, ...]]:
-        """Enumeration → values that bundles have beside those of every store, in one order."""
+        """Map each enumeration to its additional values in the bundles, in a fixed order."""
         found: dict[str, dict[str, None]] = {enum: {} for enum in NAMES}
         for _, what, word, _, _ in sorted(
             self.facts["word"], key=lambda row: (row[1], row[4], row[2])
@@ -182,7 +182,7 @@ class Snapshot:
 
     @cached_property
     def own(self) -> dict[str, dict[str, Type]]:
-        """``own`` and ``own_edges`` → attributes of a client's own, with their types over all bundles."""
+        """Map ``own`` and ``own_edges`` to custom attributes, with their types over all bundles."""
         found: dict[str, dict[str, set[Type]]] = {"own": {}, "own_edges": {}}
         for _, what, word, kind, _ in self.facts["word"]:
             if what in found:
@@ -194,16 +194,16 @@ class Snapshot:
 
     @cached_property
     def classed(self) -> tuple[str, ...]:
-        """Abstractions in which classes of frames are known in some bundle."""
+        """Return the abstractions with known classes of frames in some bundle."""
         return tuple(sorted({row[2] for row in self.facts["word"] if row[1] == "classed"}))
 
     @cached_property
     def catalog(self) -> Catalog:
-        """Contents of all bundles together, for the compiler."""
+        """Return the contents of all bundles together, for the compiler."""
         return self.catalog_of([bundle["bundle"] for bundle in self.bundles])
 
     def catalog_of(self, bundles: Sequence[str]) -> Catalog:
-        """Contents of some bundles together; names are those of all."""
+        """Return the contents of some bundles together, with the names of all bundles."""
         chosen = frozenset(bundles)
         found = zip(self._homes, self._facts, strict=True)
         sets = subset_catalogs()
@@ -219,7 +219,7 @@ class Snapshot:
         )
 
     def contents(self, bundles: Sequence[str], name: str = "") -> Catalog:
-        """The triples and kinds of some bundles, in a derived set or as they were ingested; no traces."""
+        """Return triples and kinds of some bundles, in a derived set or as ingested, without traces."""
         edges, map_edges, beyond = Counter[Any](), Counter[Any](), Counter[Any]()
         tables = {True: edges, False: map_edges, None: beyond}
         kinds: dict[str, set[str]] = {home: set() for home in ("moving", "fixed", "mapped")}
@@ -242,13 +242,13 @@ class Snapshot:
     def triples(
         self, name: str, matters: Callable[[Triple], bool], *, world: bool
     ) -> dict[str, frozenset[Triple]]:
-        """Bundle → its triples that matter, in a derived set or as they were ingested.
+        """Map each bundle to its relevant triples, in a derived set or as ingested.
 
-        ``world``: those beyond the graphs count, too.
+        ``world``: includes triples outside the graphs.
         """
         if (name, world) not in self._triples:
             held: dict[str, list[Triple]] = {}
-            known: dict[Triple, Triple] = {}  # one object for each, so that they are soon compared
+            known: dict[Triple, Triple] = {}  # one shared object per triple, for fast comparison
             for row in self.facts["triple"]:
                 if row[1] == name and (world or row[2] is not None):
                     triple = row[3:6]
@@ -264,7 +264,7 @@ class Snapshot:
 
     @cached_property
     def kinds(self) -> dict[str, tuple[frozenset[str], ...]]:
-        """Bundle → its kinds that move, that are fixed, and those of the map."""
+        """Map each bundle to its kinds that move, that are fixed, and those of the map."""
         homes = {home: place for place, home in enumerate(("moving", "fixed", "mapped"))}
         found = {one["bundle"]: (set[str](), set[str](), set[str]()) for one in self.bundles}
         for bundle, home, kind in self.facts["kind"]:
@@ -299,14 +299,14 @@ class Snapshot:
 
     @cached_property
     def sets(self) -> dict[str, list[tuple[Any, ...]]]:
-        """Derived sets by name: their rows of table ``set``."""
+        """Map each derived set to its rows of table ``set``."""
         found: dict[str, list[tuple[Any, ...]]] = {}
         for row in self.facts["set"]:
             found.setdefault(row[1], []).append(row)
         return found
 
     def _derived(self, name: str, bundles: frozenset[str], whole: Catalog) -> Catalog:
-        """The catalog of a derived set, of the traces that have it."""
+        """Return the catalogue of a derived set, for the traces that have it."""
         held = self.contents([*bundles], name)
         own = {row[2]: row for row in self.sets[name] if row[0] in bundles}
         traces = tuple(
@@ -334,7 +334,7 @@ class Snapshot:
         )
 
     def relations_of(self, name: str) -> frozenset[str] | None:
-        """The relations that a derived set has by its settings, over all bundles; ``None``: unknown."""
+        """Return the relations of a derived set by its settings, over all bundles; ``None`` means unknown."""
         rows = self.sets[name]
         numbers = {row[2] for row in rows}
         if any("abstraction" in json.loads(row[4]) for row in rows):
@@ -354,7 +354,7 @@ def _name(number: int) -> str:
 
 
 def numbers(place: Place) -> list[int]:
-    """The numbers of all snapshots."""
+    """Return the numbers of all snapshots."""
     found: list[int] = []
     for name, _, _ in place.names(_SNAPSHOTS):
         head, _, tail = name.removeprefix(f"{_SNAPSHOTS}/").partition(".")
@@ -364,12 +364,12 @@ def numbers(place: Place) -> list[int]:
 
 
 def latest(place: Place) -> Snapshot:
-    """The last snapshot of a collection.
+    """Return the last snapshot of a collection.
 
     Raises
     ------
     StoreError
-        There is no collection, or the catalogue is damaged.
+        The collection is missing, or its catalogue is damaged.
     """
     about(place)
     known = numbers(place)
@@ -377,12 +377,12 @@ def latest(place: Place) -> Snapshot:
 
 
 def read(place: Place, number: int) -> Snapshot:
-    """A snapshot by its number.
+    """Return a snapshot by its number.
 
     Raises
     ------
     StoreError
-        A file of it is gone, or is not as it was written.
+        A file of the snapshot is missing, or differs from the written one.
     """
     try:
         told = json.loads(place.read(f"{_name(number)}.json"))
@@ -413,9 +413,9 @@ def read(place: Place, number: int) -> Snapshot:
 
 
 def write(place: Place, number: int, facts: Facts) -> bool:
-    """Commit a snapshot; tell whether it was the first one of that number.
+    """Commit a snapshot; return False if its number is already taken.
 
-    The files of one that came too late are removed.
+    The files of a late snapshot are removed.
     """
     with working_folder("catalogue") as held:
         digests: dict[str, str] = {}
@@ -443,7 +443,7 @@ def write(place: Place, number: int, facts: Facts) -> bool:
 
 
 def joined(facts: Iterable[Facts]) -> Facts:
-    """The rows of several catalogues as one; of settings that are the same, one row."""
+    """Concatenate the rows of several catalogues; equal settings become one row."""
     found: Facts = {table: [] for table in CATALOGUE}
     for one in facts:
         for table, rows in one.items():
@@ -453,7 +453,7 @@ def joined(facts: Iterable[Facts]) -> Facts:
 
 
 def without(facts: Facts, bundles: Iterable[str]) -> Facts:
-    """The rows of a catalogue that do not speak of some bundles."""
+    """Return the rows of a catalogue without those of some bundles."""
     gone = frozenset(bundles)
     kept = {
         table: rows if table == "config" else [row for row in rows if row[0] not in gone]
@@ -465,7 +465,7 @@ def without(facts: Facts, bundles: Iterable[str]) -> Facts:
 
 
 def files(place: Place, known: Iterable[int]) -> set[str]:
-    """Names of the files that some snapshots are made of."""
+    """Return the names of the files of some snapshots."""
     found: set[str] = set()
     for number in known:
         told = json.loads(place.read(f"{_name(number)}.json"))

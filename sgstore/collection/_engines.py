@@ -1,7 +1,7 @@
-"""Engines: who does the tasks of a question. One seam, ``map``; nobody here knows what a task is about.
+"""Engines that run the tasks of a query through one interface, ``map``.
 
-``local:N`` does them in N processes of this machine, ``local`` or ``local:1`` in this one. ``ray`` and
-``ray://HOST:PORT`` hand them to Ray, ``spark``, ``spark:MASTER`` and ``spark://HOST:PORT`` to Spark.
+``local:N`` uses N processes of this machine, ``local`` or ``local:1`` the current process. ``ray``
+and ``ray://HOST:PORT`` use Ray, ``spark``, ``spark:MASTER`` and ``spark://HOST:PORT`` use Spark.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
 RETRIES: Final = 3
-"""How often a task is done again whose process or machine was lost."""
+"""Number of retries of a task whose process or machine is lost."""
 
 TOGETHER: Final = 256
-"""Tasks of a job of Spark, whose outcomes come to the driver together."""
+"""Tasks per Spark job, whose results reach the driver together."""
 
 Task = dict[str, Any]
 Outcome = dict[str, Any]
@@ -51,26 +51,26 @@ class Engine(Protocol):
     Attributes
     ----------
     shares_files : bool
-        Whether what a task writes to a folder of this machine can be read here.
+        True if this process can read local files that a task writes.
     """
 
     shares_files: bool
 
     def map(self, function: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[Outcome]:
-        """Yield the outcome of each task, as they come; ``{"bundle": …, "error": …}`` of one that failed.
+        """Yield the result of each task on arrival; ``{"bundle": …, "error": …}`` for a failed one.
 
-        What :func:`refusal` adds to it, :func:`fault_of_question` reads.
+        :func:`refusal` adds details for :func:`fault_of_question`.
         """
         ...
 
 
 def engine_named(name: str) -> Engine:
-    """An engine by its name: ``local``, ``local:4``, ``ray``, ``ray://HOST:PORT``, ``spark``, ``spark:MASTER``.
+    """Return an engine by its name, such as ``local:4``, ``ray://HOST:PORT`` or ``spark:MASTER``.
 
     Raises
     ------
     StoreError
-        There is none of that name.
+        The name is unknown.
     MissingExtraError
         Its package is not installed.
     """
@@ -91,17 +91,17 @@ def engine_named(name: str) -> Engine:
 
 
 _OF_QUESTIONS: Final = (QueryError, SqlError, AbstractionError, ConfigError)
-"""Errors that are due to a question and not to a bundle."""
+"""Errors caused by a query, not by a bundle."""
 
 
 def refusal(task: Task, error: SgstoreError) -> Outcome:
-    """The outcome of a task that was refused: to do it again would not help."""
+    """Return the result of a task with a permanent error, which needs no retry."""
     outcome = {"bundle": task["bundle"], "error": str(error)}
     return outcome | ({"wrong": plain_error(error)} if isinstance(error, _OF_QUESTIONS) else {})
 
 
 def fault_of_question(outcome: Outcome) -> SgstoreError | None:
-    """The error that is due to the question itself; ``None``: its bundle cannot answer, or did."""
+    """Return the error if the query caused it; ``None`` for errors of a bundle, or success."""
     return error_of(outcome["wrong"]) if "wrong" in outcome else None
 
 
@@ -117,7 +117,7 @@ class _Here:
 
 
 class _Processes:
-    """Processes of this machine; whoever is free takes the next task, and one that dies is replaced."""
+    """Local processes; an idle process takes the next task, and a dead process is replaced."""
 
     shares_files = True
 
@@ -162,7 +162,7 @@ class _Processes:
 
 
 class _Process:
-    """A process that does tasks, one after the other."""
+    """Process that runs tasks one after the other."""
 
     def __init__(self, name: str, events: SimpleQueue[tuple[_Process, str | None]]) -> None:
         separate: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
@@ -184,7 +184,7 @@ class _Process:
         self._events.put((self, None))
 
     def begin(self, task: tuple[int, Task]) -> None:
-        """Hand over a task. If the process has died, that is told where its stdout ends."""
+        """Send a task; if the process is dead, the end of its stdout reports it."""
         self.task = task
         with suppress(OSError):
             assert self._process.stdin is not None  # noqa: S101 - it was asked for
@@ -192,7 +192,7 @@ class _Process:
             self._process.stdin.flush()
 
     def end(self) -> int:
-        """End the process if it still runs; its exit code."""
+        """Kill the process if it still runs; return its exit code."""
         self._process.kill()
         code = self._process.wait()
         self._listener.join()
@@ -204,7 +204,7 @@ class _Process:
 
 
 class _Ray:
-    """Tasks of Ray: one that is lost with its worker or its node is done again, by Ray itself."""
+    """Tasks of Ray, which repeats lost tasks itself."""
 
     shares_files = False
 
@@ -215,7 +215,7 @@ class _Ray:
             raise MissingExtraError("the engine ray", "ray") from error
         if not self._ray.is_initialized():
             self._ray.init(address=address, log_to_driver=False, logging_level="ERROR")
-        # Once: what is made for each question, each worker has to be given anew.
+        # Once: a new remote function would be sent to each worker again.
         self._run: Any = self._ray.remote(max_retries=RETRIES)(_done)
 
     def map(self, function: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[Outcome]:
@@ -233,9 +233,9 @@ class _Ray:
 
 
 class _Spark:
-    """Tasks of Spark, a partition each. One that is lost is done again, by Spark itself.
+    """Tasks of Spark, one partition each; Spark repeats lost tasks itself.
 
-    Of a job that fails as a whole, nobody knows which task it was: its tasks are then done one by one.
+    If a complete job fails, the faulty task is unknown: its tasks then run one by one.
     """
 
     shares_files = False
@@ -269,14 +269,15 @@ class _Spark:
             return [{"bundle": task["bundle"], "error": _cause(error)}]
 
     def _done(self, name: str, tasks: Sequence[Task]) -> list[Outcome]:
-        # Not as a data frame (mapInArrow): planning it, and rows of Java between, cost four times as much.
+        # Not a data frame (mapInArrow): its planning, and Java rows in between, take four times as
+        # long.
         lines = self._spark.sparkContext.parallelize([*map(json.dumps, tasks)], len(tasks))
         done = lines.mapPartitions(partial(_lines_done, name)).collect()
         return [*map(json.loads, done)]
 
 
 def _session(sql: Any, master: str) -> Any:
-    """A session of Spark: on a master, or on all cores of this machine; lost tasks are done again."""
+    """Return a Spark session on a master, or on all local cores, with retries of lost tasks."""
     build = sql.SparkSession.builder.appName("sgstore").master(master or f"local[*,{RETRIES + 1}]")
     build = build.config("spark.task.maxFailures", RETRIES + 1).config("spark.ui.enabled", "false")
     build = build.config("spark.ui.showConsoleProgress", "false")
@@ -286,17 +287,17 @@ def _session(sql: Any, master: str) -> Any:
 
 
 def _lines_done(name: str, lines: Iterable[str]) -> Iterator[str]:
-    """Do tasks that are told as JSON; the outcome of each."""
+    """Run tasks from JSON lines; yield the result of each."""
     for line in lines:
         yield json.dumps(_done(name, json.loads(line)))
 
 
 _RAISED: Final = re.compile(r'^[ \t]+File ".*\n(?:[ \t].*\n)*(\S.*)', re.MULTILINE)
-"""Frames of Python within the text of an error, and what was raised there."""
+"""Python frames within the text of an error, and the error raised there."""
 
 
 def _cause(error: BaseException) -> str:
-    """One line that says why: what a task raised far away, else the first line."""
+    """Return the cause of an error in one line: the remote error, else the first line."""
     text = re.sub(r"\x1b\[[\d;]*m", "", str(error)).strip()  # Ray writes in colours
     lines = _RAISED.findall(text)[-1:] or text.splitlines() or [type(error).__name__]
     return lines[0].strip()[:300]
@@ -318,7 +319,7 @@ def _done(name: str, task: Task) -> Outcome:
 
 
 def main(name: str, stdin: TextIO, answers: TextIO) -> None:
-    """Do the tasks that come as lines of JSON, until there are no more."""
+    """Run tasks from JSON lines until the end of the input."""
     for line in stdin:
         answers.write(f"{json.dumps(_done(name, json.loads(line)))}\n")
         answers.flush()
@@ -326,5 +327,5 @@ def main(name: str, stdin: TextIO, answers: TextIO) -> None:
 
 if __name__ == "__main__":
     out = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    sys.stdout = sys.stderr  # what anything prints is no answer
+    sys.stdout = sys.stderr  # printed text must not mix with the results
     main(sys.argv[1], sys.stdin, out)

@@ -1,6 +1,6 @@
-"""Frames of a collection, told by all bundles together, as a store tells its own.
+"""Frames of a collection, with the interface of a store's frames.
 
-Coverage, selections and locks are made of them.
+Coverage, selections and locks use them.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _ALL: Final = f"FROM {PARTS} ORDER BY ALL"
 
 
 class Bundles(Protocol):
-    """What frames are asked of; see :class:`sgstore.collection.Collection`."""
+    """Methods of a collection that frames need; see :class:`sgstore.collection.Collection`."""
 
     snapshot: Snapshot
 
@@ -60,13 +60,13 @@ class Bundles(Protocol):
 
 
 class CollectionFrames:
-    """The frames of a collection, as :class:`StoreFile` and its :class:`Abstracted` tell those of a store.
+    """Frames of a collection, with the interface of :class:`StoreFile` and its :class:`Abstracted`.
 
     Parameters
     ----------
     whole : Collection
     catalog : function
-        Gives what all bundles hold together, for the compiler of queries.
+        Function that returns the contents of all bundles, for the compiler of queries.
     """
 
     def __init__(self, whole: Bundles, catalog: Callable[[], Catalog]) -> None:
@@ -76,27 +76,28 @@ class CollectionFrames:
 
     @property
     def abstracted(self) -> Self:
-        """The same: its frames as abstractions have them."""
+        """Return itself: the interface for abstractions."""
         return self
 
     def snapshot(self) -> AbstractContextManager[object]:
-        """Do nothing: a collection does not change while it is asked."""
+        """Do nothing: the snapshot of a collection does not change."""
         return nullcontext()
 
     def arrays(self, sql: str, parameters: Parameters = ()) -> dict[str, NDArray[np.generic]]:
-        """All columns of a statement of ours whose rows are each of one trace, by the values in them.
+        """Return all columns of a statement whose rows belong to one trace each, ordered by value.
 
         Parameters
         ----------
         sql : str
         parameters : sequence or mapping
-            Of ``frames``, their ids, each bundle is given its own, and who has none is not asked.
+            ``frames`` has ids of frames: each bundle gets its own ids, and bundles without any are
+            skipped.
         """
         with self._told(sql, parameters) as parts:
             return merged_arrays({PARTS: parts}, self._words, _ALL, ())
 
     def rows(self, sql: str, parameters: Parameters = ()) -> Rows:
-        """All rows of such a statement; see :meth:`arrays`."""
+        """Return all rows of such a statement; see :meth:`arrays`."""
         with self._told(sql, parameters) as parts:
             values = [*_rows(parts, self._words)]
             return Rows(parts[0].columns, parts[0].types, values)
@@ -112,7 +113,7 @@ class CollectionFrames:
             yield parts
 
     def by_bundle(self, frame_id: Ints) -> list[tuple[str, tuple[Ints, Ints]]]:
-        """Bundles of some frames, and of each: which of them, and their ids."""
+        """Return the bundles of some frames, each with the indices and ids of its frames."""
         traces, number = np.unique(trace_of(frame_id), return_inverse=True)
         homes = [self._homes[trace] for trace in traces.tolist()]
         of = {bundle: place for place, bundle in enumerate(dict.fromkeys(homes))}
@@ -121,24 +122,24 @@ class CollectionFrames:
         return [(name, (some, frame_id[some])) for name, some in rows]
 
     def coded(self, name: str) -> CodedClasses:
-        """The class of each frame in an abstraction as a number; in bundles that lack it it is made anew."""
+        """Return the class of each frame as a number; computed in bundles without stored classes."""
         with self._parts({"kind": "coded", "abstraction": name}) as parts:
             return merged_classes(parts)
 
     def times(self) -> tuple[Ints, Ints]:
-        """Ids of all frames, ascending, and their simulation times; ns."""
+        """Return the ids of all frames, ascending, and their simulation times; ns."""
         frame_id, time_ns = self.arrays(_TIMES).values()
         return np.asarray(frame_id, np.int64), np.asarray(time_ns, np.int64)
 
     def imported_names(self) -> dict[str, int]:
-        """Names of graphs in imported files, and the ids of the frames that these became."""
+        """Map names of graphs in imported files to the ids of their frames."""
         found = sorted(self.rows(_IMPORTS).values, key=lambda row: row[1])
         return dict(found)
 
     def features(self, name: str, frame_id: Ints) -> Iterator[tuple[Ints, Triples]]:
-        """Features of the graphs of frames in an abstraction, those of a bundle at a time.
+        """Yield features of the graphs of frames in an abstraction, bundle by bundle.
 
-        Parameters and what it yields are those of :meth:`sgstore.store._classes.Abstracted.features`.
+        Parameters and results as in :meth:`sgstore.store._classes.Abstracted.features`.
         """
         homes = dict(self.by_bundle(frame_id))
         each = {bundle: {"frames": of.tolist()} for bundle, (_, of) in homes.items()}
@@ -154,7 +155,7 @@ class CollectionFrames:
             yield homes[result["bundle"]][0], Triples(names, *columns)
 
     def margins(self, question: dict[str, Any]) -> Iterator[tuple[Ints, Floats]]:
-        """Margins by which traces meet a check, as :meth:`sgstore.temporal.CheckRun.margins` tells them."""
+        """Yield the margins of a check, as :meth:`sgstore.temporal.CheckRun.margins`."""
         with self._parts({"kind": "margins"} | question) as parts:
             found = merged_arrays({PARTS: parts}, self._words, _ALL, ())
         yield (
@@ -166,10 +167,10 @@ class CollectionFrames:
     def _parts(
         self, question: dict[str, Any], each: Mapping[str, dict[str, Any]] = MappingProxyType({})
     ) -> Generator[list[PartFile]]:
-        """The answers to a question of all bundles, or of those of which each is asked something."""
+        """Return the results of all bundles, or of the bundles with an entry in ``each``."""
         with working_folder("parts") as folder:
             found: list[PartFile] = []
-            for bundles in ([*each] or self._bundles, [worker.EMPTY]):  # all may be missing
+            for bundles in ([*each] or self._bundles, [worker.EMPTY]):  # all bundles may be missing
                 if not found:
                     asked = {one: each.get(one, _any_of(each)) for one in bundles}
                     answers = self._whole.ask(question, bundles, asked)

@@ -1,8 +1,8 @@
-"""Recordings into a collection: each lands as sealed segments, and a commit makes bundles of what has landed.
+"""Ingest into a collection: recordings land as sealed segments, and a commit makes bundles of them.
 
-To land needs no lock and no order: a segment is called by what is in it, so that whoever lands it again writes
-the same. Which recordings are read by whom is told by their digests: of N shards each takes its share, on any
-machine, in any order, and one that was stopped is begun again.
+Landing needs no lock and no order: the name of a segment is its content hash, so that a repeated
+landing writes the same. The digests of the recordings distribute them: each of N shards takes its
+share, on any machine, in any order, and an interrupted shard can be repeated.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from sgstore.store import Facts
 
 FILES: Final = ("sealed.json", "tables")
-"""Files of a segment that has landed."""
+"""Files of a landed segment."""
 
 
 def land(  # noqa: PLR0913  as many options as there are ways to read
@@ -60,33 +60,33 @@ def land(  # noqa: PLR0913  as many options as there are ways to read
     until: float | None = None,
     rate: float | None = None,
 ) -> list[TraceOutcome]:
-    """Read recordings, and land their segments in a collection, which is made if there is none.
+    """Read recordings, and land their segments in a collection, which is created if missing.
 
-    What has landed already, read in the same way, is not read again.
+    Recordings that have landed with the same settings are not read again.
 
     Parameters
     ----------
     url : str or Path
-        Of the collection.
+        Place of the collection.
     traces : sequence of str or Path
         Files; :func:`sgstore.ingest.recordings` finds them in folders and by patterns.
     shard : (int, int)
-        Which share of the recordings is read here, of how many: 1 … N, N.
+        Share of the recordings to read, and number of shares: 1 … N, N.
     road_map, config, egos, jobs, since, until, rate
-        As :func:`sgstore.ingest.ingest` takes them.
+        As in :func:`sgstore.ingest.ingest`.
 
     Returns
     -------
     list of TraceOutcome
-        For each recording of the share, in the order given, one for each ego: ``landed``, ``present`` or
+        For each recording of the share, in input order, one per ego: ``landed``, ``present`` or
         ``failed``.
 
     Raises
     ------
     StoreError
-        The collection cannot be written, or there is no such share.
+        The collection is not writable, or the shard is out of range.
     MapError
-        The file given for the road map cannot be read.
+        The road map file cannot be read.
     """
     number, of = shard
     if not 1 <= number <= of:
@@ -100,7 +100,7 @@ def land(  # noqa: PLR0913  as many options as there are ways to read
     catalogue.create(place, catalogue.About())
     with working_folder("landing") as folder:
         job = Job(
-            store=folder / "none.sgstore",  # nothing is there: whatever is asked for is read
+            store=folder / "none.sgstore",  # empty: every recording is read
             road_map=None if road_map is None else Path(road_map),
             config=settings,
             part=TracePart(since, until, settings.rate),
@@ -119,13 +119,13 @@ class _Landing:
 
     def landed(self, paths: list[Path], share: int, of: int, jobs: int) -> list[TraceOutcome]:
         """Read a share of some recordings, and land their segments."""
-        Maps(self.job.road_map, self.job.config.signs)  # one that cannot be read stops all at once
+        Maps(self.job.road_map, self.job.config.signs)  # an unreadable map stops the run early
         found: dict[int, list[TraceOutcome]] = {}
         wanted: dict[int, tuple[Path, str]] = {}
         for place, path in enumerate(paths):
             try:
                 digest = _mark(path)
-            except SgstoreError as error:  # then one share says so, always the same
+            except SgstoreError as error:  # reported by always the same share
                 if _share(hashlib.sha256(path.name.encode()).hexdigest(), of) == share:
                     found[place] = [TraceOutcome(path, error=error)]
                 continue
@@ -148,7 +148,7 @@ class _Landing:
         self, paths: list[Path], jobs: int, stack: ExitStack
     ) -> Iterator[list[tuple[TraceOutcome, Path | None]]]:
         def see(*_told: int) -> None:
-            """Take no note of how far it is."""
+            """Ignore the progress."""
 
         if min(jobs, len(paths)) > 1:
             yield from stack.enter_context(Workers(self.job, jobs, see)).read(paths, self.folder)
@@ -158,7 +158,7 @@ class _Landing:
             yield reader.read(path, self.folder / str(number))
 
     def _key(self, digest: str) -> str:
-        """Key of a recording that is read in this way, among those that have landed."""
+        """Return the key of a landed recording: its digest and the settings."""
         job = self.job
         road_map = ""
         if job.road_map is not None and job.road_map.is_file():
@@ -169,7 +169,7 @@ class _Landing:
         return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
 
     def _told(self, key: str, path: Path) -> list[TraceOutcome] | None:
-        """Outcomes of a recording that has landed before; ``None`` if it has not."""
+        """Return the results of a recording that has landed before, or ``None``."""
         name = f"landed/{key[:2]}/{key}.json"
         if not any(one == name for one, _, _ in self.place.names(f"landed/{key[:2]}")):
             return None
@@ -197,7 +197,7 @@ class _Landing:
         return [outcome for outcome, _ in views]
 
     def _put(self, sealed: Path) -> str:
-        """Put a segment into the collection, and its map if that is not there; what the segment is called."""
+        """Put a segment, and its map if missing, into the collection; return the segment's name."""
         with working_folder("segment") as folder:
             parts = [folder / name for name in ("segment", "map")]
             for part in parts:
@@ -210,15 +210,16 @@ class _Landing:
                 self.maps.add(of_map)
             digests = [digest_of_file(parts[0] / name) for name in FILES]
             segment = hashlib.sha256(" ".join(digests).encode()).hexdigest()
-            for name in reversed(FILES):  # what says that it is complete comes last
+            for name in reversed(FILES):  # the completeness file is last
                 self.place.upload(parts[0] / name, f"segments/{segment[:2]}/{segment}/{name}")
             return segment
 
 
 def _mark(path: Path) -> str:
-    """What a recording is known by before it is read: its digest.
+    """Return the digest of a recording, which identifies it before it is read.
 
-    Of one that lies elsewhere, where it lies and how it looks: to hash it, all shards would have to fetch it.
+    A remote recording is identified by its URL, size and time: hashing would make every shard fetch
+    it.
     """
     url = url_named(path)
     if url is None:
@@ -238,7 +239,7 @@ def _share(digest: str, of: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Landed:
-    """A segment that waits to be committed."""
+    """Landed segment before its commit."""
 
     segment: str
     trace_id: int
@@ -250,7 +251,7 @@ class _Landed:
     map_name: str
     size: int
     read: tuple[Any, ...]
-    """How it was read, and what of it: settings, map, frames, start."""
+    """Settings, map, frames and start: how it was read."""
 
     @property
     def whose(self) -> str:
@@ -258,12 +259,12 @@ class _Landed:
 
 
 def commit(url: str | Path) -> Commit:
-    """Make bundles of all segments that have landed and are not committed, and a snapshot that has them.
+    """Make bundles of all landed, uncommitted segments, and commit a snapshot with them.
 
     Raises
     ------
     StoreError
-        There is no collection, or it cannot be read or written.
+        The collection is missing, or cannot be read or written.
     """
     place = place_at(url)
     about = catalogue.about(place)
@@ -291,7 +292,7 @@ def commit(url: str | Path) -> Commit:
 
 
 def _waiting(place: Place, before: Snapshot, folder: Path) -> list[_Landed]:
-    """The segments that have landed and are in no bundle, in the order of their recordings' digests."""
+    """Return the landed segments outside bundles, ordered by the digests of their recordings."""
     known = {row["segment"] for row in before.traces}
     sizes: dict[str, int] = {}
     complete: set[str] = set()
@@ -334,7 +335,7 @@ def _fetched(place: Place, segment: str, folder: Path, files: Iterable[str] = FI
 
 
 def _accepted(waiting: list[_Landed], before: Snapshot, done: Commit) -> list[_Landed]:
-    """The segments that can come in; the others are told with the reason."""
+    """Return the acceptable segments; record the others with a reason."""
     there = {row["trace_id"]: row for row in before.traces}
     by_id: dict[int, list[_Landed]] = {}
     for one in waiting:
@@ -366,12 +367,12 @@ def _accepted(waiting: list[_Landed], before: Snapshot, done: Commit) -> list[_L
 
 
 def _read_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    """How a trace of the collection was read, and what of its recording, as :class:`_Landed` has it."""
+    """Return how a trace of the collection was read, as in :class:`_Landed`."""
     return row["config"], row["map_digest"] or "", row["frames"], row["start_ns"]
 
 
 def _names(waiting: Sequence[_Landed], before: Snapshot, done: Commit) -> dict[int, str]:
-    """Name of each trace: in the order of digests, so it does not matter who landed first."""
+    """Return the name of each trace, in the order of digests, independent of the landing order."""
     taken = {row["name"] for row in before.traces}
     names: dict[int, str] = {}
     for one in waiting:
@@ -388,7 +389,7 @@ def _bundled(
     names: Mapping[int, str],
     maps: Mapping[str, str],
 ) -> Facts:
-    """Make a bundle of segments, by way of a store that they are published to."""
+    """Make a bundle of segments, through a temporary store."""
     path = folder / "published.sgstore"
     file = StoreFile.create(path)
     for one in waiting:

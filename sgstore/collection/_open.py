@@ -1,4 +1,4 @@
-"""The one way to open what is there: a store, or with an engine a collection of stores."""
+"""The function that opens a store, or with an engine a collection of stores."""
 
 from __future__ import annotations
 
@@ -58,18 +58,18 @@ def open(  # noqa: PLR0913  those of a store, and those of a collection
     Parameters
     ----------
     path : str or Path
-        Of a collection its place: a folder, or ``s3://bucket/prefix``.
+        Path of a store; place of a collection: a folder, or ``s3://bucket/prefix``.
     create, memory, tables, max_spill, root
-        As :class:`sgstore.Store` takes them; of a collection ``tables`` only.
+        As in :class:`sgstore.Store`; for a collection only ``tables``.
     engine : str
-        Who asks the stores of a collection: ``local``, ``local:8``, ``ray``, ``ray://HOST:PORT``, ``spark``.
+        Engine for a collection: ``local``, ``local:8``, ``ray``, ``ray://HOST:PORT``, ``spark``.
     partial : bool
-        Whether an answer of a collection may lack stores that cannot be asked.
+        True if results of a collection may lack stores that cannot answer.
 
     Raises
     ------
     StoreError
-        There is no store, or no collection, or it is one of another version.
+        The store or collection is missing, or has another version.
     """
     if not engine:
         return Store(

@@ -1,7 +1,7 @@
-"""Bundles of a collection: made of stores, put together again as one, looked after.
+"""Bundles of a collection: creation from stores, unpacking to one store, maintenance.
 
-Traces that are committed keep their names, and so do road maps; new ones are named in the order of the digests
-of their recordings, so that names depend on what is committed, and not on who was first.
+Committed traces and road maps keep their names. New traces are named in the order of the digests of
+their recordings, so that names depend only on the committed contents.
 """
 
 from __future__ import annotations
@@ -39,30 +39,30 @@ if TYPE_CHECKING:
     from sgstore.store import Facts
 
 ATTEMPTS: Final = 100
-"""How often a commit looks again because another one came first."""
+"""Number of retries of a commit after concurrent commits."""
 
 GRACE_S: Final = 86_400.0
-"""How long what nothing speaks of stays where it is: somebody may be about to commit it; s."""
+"""Time that unreferenced files stay, because a commit may be in progress; s."""
 
 _TRACE: Final = {name: place for place, name in enumerate(CATALOGUE["trace"])}
 
 
 @dataclass(slots=True)
 class Commit:
-    """Changes that a commit has made.
+    """Changes of a commit.
 
     Attributes
     ----------
     number : int
-        Of the snapshot; that of the last one if there was nothing to commit.
+        Number of the snapshot; the last one if the commit was empty.
     added, present : list of str
-        Names of traces that came in, and of those that the collection had.
+        Names of added traces, and of those that the collection already had.
     renamed : dict of str to str
-        Names of traces in the store → in the collection, where they differ.
+        Names of traces in the store → in the collection, if they differ.
     bundles : list of str
-        The bundles that were made.
+        The created bundles.
     refused : list of str
-        Landed segments that cannot come in, each with the reason.
+        Rejected segments, each with the reason.
     """
 
     number: int = 0
@@ -80,27 +80,28 @@ def pack(
     bundle_traces: int | None = None,
     on_bundle: Callable[[int, int], None] | None = None,
 ) -> Commit:
-    """Bring the traces of a store into a collection, which is made if there is none.
+    """Add the traces of a store to a collection, which is created if missing.
 
-    Those that the collection has are left as they are. The store stays as it is.
+    Existing traces and the store do not change.
 
     Parameters
     ----------
     store : str or Path
     url : str or Path
-        Of the collection: a folder, or a place in an object store.
+        Place of the collection: a folder, or a prefix in an object store.
     bundle_traces : int, optional
-        Most traces of a bundle; what a new collection says of itself.
+        Greatest number of traces per bundle; by default the setting of the collection.
     on_bundle : function, optional
-        Called after each bundle with how many are done, and how many there will be.
+        Called after each bundle with the number of finished bundles and the total.
 
     Raises
     ------
     StoreError
-        The store or the collection cannot be read or written; or two recordings have one trace id by chance.
+        The store or the collection cannot be read or written; or two recordings have the same trace
+        id by chance.
     """
     place = place_at(url)
-    known = StoreFile(store).path  # what is no store is refused before anything is made
+    known = StoreFile(store).path  # an invalid store is rejected before any change
     wanted = catalogue.About() if bundle_traces is None else _sized(bundle_traces)
     about = catalogue.create(place, wanted)
     limit = about.bundle_traces if bundle_traces is None else bundle_traces
@@ -120,7 +121,7 @@ def _sized(traces: int) -> About:
 
 @dataclass(slots=True)
 class _Source:
-    """A store whose traces go into a collection."""
+    """Store whose traces are added to a collection."""
 
     path: Path
     about: About
@@ -128,7 +129,7 @@ class _Source:
     on_bundle: Callable[[int, int], None] | None = None
 
     def committed(self, place: Place) -> Commit | None:
-        """Commit what is new to the last snapshot; ``None``: another commit came first."""
+        """Commit the new traces to the last snapshot; ``None`` means that another commit was first."""
         before = catalogue.latest(place)
         done = Commit(before.number)
         names = self._named(before, done, place)
@@ -150,7 +151,7 @@ class _Source:
         return done if catalogue.write(place, done.number, whole) else None
 
     def _named(self, before: Snapshot, done: Commit, place: Place) -> dict[int, str]:
-        """The traces that are new, and what each is to be called.
+        """Return the new traces with their names.
 
         Raises
         ------
@@ -184,15 +185,16 @@ class _Source:
         return names
 
     def _groups(self, names: Mapping[int, str]) -> list[dict[int, str]]:
-        """The traces of each bundle."""
+        """Return the traces of each bundle."""
         each = max(self.path.stat().st_size // max(len(names_of_traces(self.path)), 1), 1)
         return groups(names, max(min(self.limit, self.about.bundle_bytes // each), 1))
 
 
 def groups(names: Mapping[int, str], most: int) -> list[dict[int, str]]:
-    """Traces in groups of so many at most: neighbours by name, so that few bundles have the first ones.
+    """Divide traces into groups of limited size, neighbours by name.
 
-    The groups are as equal as can be: 1,001 traces are none of 1,000 and one of 1.
+    The groups have almost equal sizes: 1,001 traces are not split into 1,000 and 1. Few bundles
+    have the first traces by name.
     """
     ordered = sorted(names, key=lambda one: natural(names[one]))
     count = -(-len(ordered) // most)
@@ -208,19 +210,19 @@ def put_bundle(
     maps: Mapping[str, str],
     segments: Mapping[int, str] | None = None,
 ) -> Facts:
-    """Make a bundle of traces of a store, and put it into a collection; what the catalogue says of it.
+    """Make a bundle of traces of a store and add it to a collection; return its catalogue rows.
 
     Parameters
     ----------
     place : Place
     source : Path
-        The store.
+        Path of the store.
     path : Path
-        Where the bundle is made; it is not there afterwards.
+        Temporary path of the bundle; removed afterwards.
     names, maps : mapping
-        As :func:`sgstore.store.write_bundle` takes them.
+        As in :func:`sgstore.store.write_bundle`.
     segments : mapping of int to str, optional
-        Trace → the landed segment that it was made of.
+        Trace → its landed segment.
     """
     write_bundle(source, path, names, maps)
     sha = digest_of_file(path)
@@ -236,7 +238,7 @@ def put_bundle(
 
 
 def map_names(before: Snapshot, found: Mapping[str, str]) -> dict[str, str]:
-    """The name of each road map, by its digest: one that the collection has keeps its name."""
+    """Return the name of each road map by digest; known maps keep their names."""
     names = {row["map_digest"]: row["map"] for row in before.traces if row["map_digest"]}
     taken = set(names.values())
     for digest, name in sorted(found.items()):
@@ -250,13 +252,13 @@ def map_names(before: Snapshot, found: Mapping[str, str]) -> dict[str, str]:
 
 
 def unpack(url: str | Path, store: str | Path) -> list[str]:
-    """Put all traces of a collection into one new store; their names.
+    """Copy all traces of a collection into one new store; return their names.
 
     Raises
     ------
     StoreError
-        There is something at the place of the store, a bundle is not as it was committed, or a file cannot be
-        read or written.
+        The store path exists, a bundle differs from the committed one, or a file cannot be read or
+        written.
     """
     from pathlib import Path
 
@@ -283,12 +285,12 @@ def unpack(url: str | Path, store: str | Path) -> list[str]:
 
 
 def refuse_others(place: Place, snapshot: Snapshot) -> None:
-    """Refuse a collection with bundles of another version of the schema.
+    """Reject a collection with bundles of another schema version.
 
     Raises
     ------
     StoreError
-        It lists them.
+        The error lists these bundles.
     """
     wanted = catalogue.About().schema_version
     odd = [one for one in snapshot.bundles if one["schema_version"] != wanted]
@@ -313,11 +315,11 @@ class CollectionFaults:
     Attributes
     ----------
     number : int
-        Of the snapshot that was looked at.
+        Number of the verified snapshot.
     bundles, traces : int
-        How many of each were looked at.
+        Numbers of verified bundles and traces.
     faults : list of (str, str, str)
-        Bundle or trace, what was looked at, and what is wrong.
+        Bundle or trace, the verified part, and the fault.
     """
 
     number: int
@@ -327,12 +329,12 @@ class CollectionFaults:
 
 
 def verify(url: str | Path) -> CollectionFaults:
-    """Look whether all bundles of a collection are as they were committed, and hold what the catalogue says.
+    """Verify that all bundles of a collection are unchanged and agree with the catalogue.
 
     Raises
     ------
     StoreError
-        There is no collection, or its catalogue cannot be read.
+        The collection is missing, or its catalogue cannot be read.
     """
     place = place_at(url)
     snapshot = catalogue.latest(place)
@@ -357,7 +359,7 @@ def verify(url: str | Path) -> CollectionFaults:
 
 
 def _differing(snapshot: Snapshot, sha: str, facts: Facts) -> list[tuple[str, str, str]]:
-    """Tables of the catalogue that say something else than a bundle."""
+    """Return the tables of the catalogue that disagree with a bundle."""
     faults: list[tuple[str, str, str]] = []
     for table in CATALOGUE:
         if table == "config":
@@ -372,15 +374,15 @@ def _differing(snapshot: Snapshot, sha: str, facts: Facts) -> list[tuple[str, st
 
 @dataclass(slots=True)
 class Garbage:
-    """Files that nothing speaks of.
+    """Unreferenced files.
 
     Attributes
     ----------
     names : list of str
     size : int
-        Bytes of all of them.
+        Total bytes.
     young : int
-        Further ones that are left because somebody may be about to commit them.
+        Number of other unreferenced files, kept because a commit may be in progress.
     """
 
     names: list[str] = field(default_factory=list[str])
@@ -391,23 +393,22 @@ class Garbage:
 def gc(
     url: str | Path, *, keep: int = 1, older_s: float = GRACE_S, dry_run: bool = False
 ) -> Garbage:
-    """Remove old snapshots, and files that no snapshot speaks of.
+    """Remove old snapshots, and files that no snapshot references.
 
     Parameters
     ----------
     url : str or Path
     keep : int
-        Snapshots that stay, the last ones; 1 or more.
+        Number of last snapshots to keep; at least 1.
     older_s : float
-        Only files that were written so long ago are removed: a commit on its way has some that no snapshot
-        knows; s.
+        Least age of removed files, because a running commit has unreferenced files; s.
     dry_run : bool
-        Whether it is only said what would be removed.
+        True to list the files without removing them.
 
     Raises
     ------
     StoreError
-        There is no collection, or a file cannot be removed.
+        The collection is missing, or a file cannot be removed.
     """
     if keep < 1:
         raise StoreError(f"keep is {keep}, expected 1 or more: the last snapshot is the collection")
@@ -444,12 +445,12 @@ def gc(
 
 
 def _segment_of(name: str) -> str:
-    """The segment that a file below ``segments/`` belongs to."""
+    """Return the segment of a file below ``segments/``."""
     return name.split("/")[1] if name.count("/") > 1 else ""
 
 
 def _last(name: str) -> bool:
-    """Tell whether a file is one that must go after others: a snapshot is gone before its tables are."""
+    """True for a file that is removed after others: a snapshot goes before its tables."""
     return not name.endswith(".json")
 
 

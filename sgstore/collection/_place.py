@@ -1,7 +1,7 @@
 """Places of collections: a folder, or a prefix in an object store.
 
-Nothing that is there is ever changed, but for being removed: a file appears complete or not at all, and of two
-who write the same name at once one is told that it was late.
+Files are written and removed, but never changed. A file appears complete or not at all. If two
+processes write the same name at once, one of them learns that it was late.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ if TYPE_CHECKING:
     from collections.abc import Generator, Iterator
 
 ABOUT: Final = "COLLECTION.json"
-"""The file by which a folder is known as a collection."""
+"""The file that marks a folder as a collection."""
 
 PIECE: Final = 1 << 20
-"""Bytes that are read at a time."""
+"""Block size for reading; bytes."""
 
 
 class MissingObjectError(StoreError):
-    """There is no file of that name at a place."""
+    """The place has no file with this name."""
 
 
 class Place(Protocol):
-    """A folder of files with names such as ``bundles/….sgstore``.
+    """Folder of files with names such as ``bundles/….sgstore``.
 
     Attributes
     ----------
     url : str
-        As people name it.
+        Its name for users.
     """
 
     url: str
@@ -52,32 +52,32 @@ class Place(Protocol):
         ...
 
     def write_new(self, name: str, data: bytes) -> bool:
-        """Write a file unless there is one of that name; tell whether it was written."""
+        """Write a new file; return False if the name exists."""
         ...
 
     def upload(self, path: Path, name: str) -> None:
-        """Write a file with the content of a local one."""
+        """Write a file with the content of a local file."""
         ...
 
     def fetch(self, name: str, to: Path) -> None:
-        """Copy a file to a local place."""
+        """Copy a file to a local path."""
         ...
 
     def names(self, folder: str) -> Iterator[tuple[str, int, float]]:
-        """Names of the files in a folder and below it; bytes, and when each was written (s since 1970)."""
+        """Yield name, bytes and time (s since 1970) of the files in a folder and below it."""
         ...
 
     def remove(self, name: str) -> None:
-        """Remove a file, if it is there."""
+        """Remove a file, if it exists."""
         ...
 
     def local(self, name: str) -> Path | None:
-        """The file on this machine; ``None`` if it must be fetched."""
+        """Return the path of a local file; ``None`` means that it must be fetched."""
         ...
 
 
 def place_at(url: str | Path) -> Place:
-    """The place of a collection.
+    """Return the place of a collection.
 
     Parameters
     ----------
@@ -87,19 +87,19 @@ def place_at(url: str | Path) -> Place:
     Raises
     ------
     MissingExtraError
-        It is in an object store, and the extra ``cluster`` is not installed.
+        The place is an object store, and the extra ``cluster`` is not installed.
     """
     remote = url_named(url)
     return _Folder(Path(str(url).removeprefix("file://"))) if remote is None else _Remote(remote)
 
 
 def digest_of_file(path: Path) -> str:
-    """SHA-256 of a file.
+    """Return the SHA-256 of a file.
 
     Raises
     ------
     StoreError
-        It cannot be read.
+        The file cannot be read.
     """
     digest = hashlib.sha256()
     try:
@@ -150,7 +150,7 @@ class _Folder:
 
     @contextmanager
     def _beside(self, name: str) -> Generator[tuple[Path, Path]]:
-        """A place for a file on its way, which is gone in the end, and its own place."""
+        """Yield a temporary path, which is removed at the end, and the final path."""
         path = self.root / name
         path.parent.mkdir(parents=True, exist_ok=True)
         fresh = path.with_name(f".{path.name}.{secrets.token_hex(6)}")
@@ -174,7 +174,7 @@ class _Folder:
         path = self.root / name
         with self._told(name):
             path.unlink(missing_ok=True)
-        with suppress(OSError):  # others are in it
+        with suppress(OSError):  # the folder may contain other files
             if path.parent != self.root:
                 path.parent.rmdir()
 
@@ -183,7 +183,7 @@ class _Folder:
 
 
 class _Remote:
-    """A place in an object store, by obstore: it asks again where that is worth it, a while later."""
+    """Place in an object store, with obstore, which retries requests."""
 
     def __init__(self, url: str) -> None:
         self.url = url.rstrip("/")

@@ -1,8 +1,8 @@
-"""Questions to a collection: asked of the bundles that may answer, and one answer made of theirs.
+"""Queries over a collection: run on the relevant bundles, with merged results.
 
-A question is compiled once, against what all bundles hold together: that says what is wrong with it, and which
-bundles need not be opened. The rows of each bundle come into a folder of this process as Parquet files, and a
-statement makes one answer of them, which is the answer of one store with all the traces.
+A query is compiled once, against the contents of all bundles. This finds its errors and the
+irrelevant bundles. The rows of each bundle are written to Parquet files in a temporary folder, and
+a statement merges them. The result is equal to that of one store with all traces.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ if TYPE_CHECKING:
     from sgstore.world import Floats, Ints
 
 _SHOWN: Final = 8
-"""Bundles that a message names; the others are counted."""
+"""Number of bundles that a message names; further bundles are counted."""
 
 
 _ALL: Final = f"FROM {PARTS}"
@@ -90,7 +90,7 @@ class PartialAnswerError(StoreError):
     Attributes
     ----------
     bundles : dict of str to str
-        Those that did not, and why.
+        These bundles, each with the reason.
     """
 
     def __init__(self, message: str, bundles: Mapping[str, str]) -> None:
@@ -99,35 +99,36 @@ class PartialAnswerError(StoreError):
 
 
 class Collection:
-    """A collection of stores, by its place: the questions of a store, asked of all its bundles.
+    """Collection of stores, with the query interface of a store.
 
     Parameters
     ----------
     url : str or Path
         A folder, or ``s3://bucket/prefix``.
     engine : str
-        Who asks the bundles: ``local`` (this process), ``local:4`` (4 processes), ``ray``, ``ray://HOST:PORT``,
-        ``spark``, ``spark:MASTER`` such as ``spark:local[2,4]``, ``spark://HOST:PORT``.
+        Engine for the bundles: ``local`` (this process), ``local:4`` (4 processes), ``ray``,
+        ``ray://HOST:PORT``, ``spark``, ``spark:MASTER`` such as ``spark:local[2,4]``,
+        ``spark://HOST:PORT``.
     tables : mapping of str to path or data frame, optional
-        Tables of one's own that are joined to the frames, as :class:`sgstore.Store` takes them.
+        User tables that are joined to the frames, as in :class:`sgstore.Store`.
     partial : bool
-        Whether an answer may lack bundles that cannot be asked; ``missing`` says which. They are not asked
-        again, so that several questions are answered by the same bundles: one that has answered, and then
-        cannot be asked, is an error once, and missing from then on.
+        True if results may lack bundles that cannot answer; ``missing`` lists them. They are not
+        tried again, so that several queries use the same bundles. A bundle that has answered before
+        and then fails raises an error once, and is missing from then on.
 
     Raises
     ------
     StoreError
-        There is no collection, its catalogue cannot be read, or bundles are of another version.
+        The collection is missing, its catalogue cannot be read, or bundles have another version.
 
     Attributes
     ----------
     snapshot : Snapshot
-        What it holds; questions keep to it.
+        Its contents for all queries.
     missing : dict of str to str
-        Bundles that did not answer a question so far, and why; only with ``partial``.
+        Bundles that failed so far, each with the reason; only with ``partial``.
     opened : list of str
-        Bundles that the last question was asked of.
+        Bundles that the last query used.
     """
 
     def __init__(
@@ -157,26 +158,26 @@ class Collection:
         self.close()
 
     def close(self) -> None:
-        """Do nothing: no file stays open between questions."""
+        """Do nothing: files are closed after each query."""
 
     def joined(self, tables: Mapping[str, object]) -> Collection:
-        """The same collection with other tables of one's own: see the parameter ``tables``."""
+        """Return the same collection with other user tables: see the parameter ``tables``."""
         engine, partial = self._engine_name, self._partial
         return Collection(self.place.url, engine=engine, tables=tables, partial=partial)
 
     @cached_property
     def engine(self) -> Engine:
-        """Engine that asks the bundles; begun with the first question."""
+        """Return the engine for the bundles, started with the first query."""
         return engine_named(self._engine_name)
 
     @cached_property
     def catalog(self) -> Catalog:
-        """Contents of all bundles together, with the tables of one's own."""
+        """Return the contents of all bundles together, with the user tables."""
         found = self.snapshot.catalog
         return found if self._tables is None else replace(found, tables=self._table_facts())
 
     def _table_facts(self) -> dict[str, TableFacts]:
-        """Facts for the compiler of tables of one's own: how their rows fit the frames of all bundles."""
+        """Return facts about user tables for the compiler: the match of their rows with the frames."""
         told: dict[str, dict[str, Any]] = {}
         for result in self.ask({"kind": "tables"}, self.bundles() or [worker.EMPTY]):
             for name, one in result["tables"].items():
@@ -189,16 +190,16 @@ class Collection:
 
     @cached_property
     def file(self) -> CollectionFrames:
-        """Its frames, as the file of a store has them."""
+        """Return its frames, with the interface of a store's file."""
         return CollectionFrames(self, lambda: self.catalog)
 
     def bundles(self) -> list[str]:
-        """All bundles, the largest first."""
+        """Return all bundles, the largest first."""
         ordered = sorted(self.snapshot.bundles, key=lambda one: (-one["bytes"], one["bundle"]))
         return [one["bundle"] for one in ordered]
 
     def traces(self) -> tuple[dict[str, Any], ...]:
-        """Facts of the catalogue about each trace, by name in natural order (``run2`` before ``run10``)."""
+        """Return the catalogue rows of traces, by name in natural order (``run2`` before ``run10``)."""
         return self.snapshot.traces
 
     info = traces
@@ -211,8 +212,8 @@ class Collection:
         Raises
         ------
         QueryError
-            The text is no query, names what the collection does not know, or asks for what cannot be told of
-            all bundles; it says where.
+            The text is not a query, uses unknown names, or needs values that some bundles lack; the
+            error shows the place.
         """
         if not isinstance(query, str):
             from sgstore.lang import Pattern
@@ -234,29 +235,29 @@ class Collection:
         status: bool = False,
         **parameters: object,
     ) -> PartedChecks:
-        """Verdicts of ``CHECK`` statements for every trace; see :meth:`sgstore.Store.check`.
+        """Return the verdicts of ``CHECK`` statements for every trace; see :meth:`sgstore.Store.check`.
 
         Raises
         ------
         QueryError
-            The text has no checks, or names what the collection does not know; it says where.
+            The text has no checks, or uses unknown names; the error shows the place.
         """
         about = {"sgsm_compat": sgsm_compat, "status": status}
         return PartedChecks(self, text, parameters, about)
 
     def sql(self, text: str, *, each: bool = False) -> PartedRows:
-        """The rows of a statement that is run in every bundle, with a column ``bundle`` before them.
+        """Run a statement in every bundle; return its rows after a column ``bundle``.
 
         Parameters
         ----------
         text : str
         each : bool
-            That it is meant so: a statement cannot be split, and what it counts it counts in each bundle.
+            Must be True, as a confirmation: a statement is not split, and counts are per bundle.
 
         Raises
         ------
         SqlError
-            ``each`` is not said, or the database refuses the statement.
+            ``each`` is not set, or the database rejects the statement.
         """
         if not each:
             raise SqlError(
@@ -290,11 +291,11 @@ class Collection:
         return most_like(found, limit)
 
     def pattern(self, frame: str, *, ignore: Sequence[str] = ()) -> str:
-        """The text of a pattern that describes a frame around its ego; see :meth:`sgstore.Store.pattern`."""
+        """Return a pattern that describes a frame around its ego; see :meth:`sgstore.Store.pattern`."""
         return self._at_home(frame, Store.pattern, {"frame": frame, "ignore": [*ignore]})
 
     def _at_home(self, frame: str, step: Callable[..., Any], values: dict[str, Any]) -> Any:
-        """What a function makes of the bundle that has a frame; its errors are those of one store."""
+        """Run a function on the bundle of a frame; errors are those of a single store."""
         home = self._home_of(frame)
         try:
             for _, value in self.each(step, {home: values}):
@@ -304,12 +305,12 @@ class Collection:
         raise StoreError(self.missing[home])
 
     def _home_of(self, frame: str) -> str:
-        """The bundle of the trace of a frame, as :meth:`sgstore.Store.graph` takes its name.
+        """Return the bundle of a frame's trace; names as in :meth:`sgstore.Store.graph`.
 
         Raises
         ------
         StoreError
-            There is no such trace.
+            The trace is unknown.
         """
         name = re.split("[#@](?=[^#@]*$)", frame)[0]
         known = {row["name"]: row["trace_id"] for row in self.snapshot.traces}
@@ -324,15 +325,15 @@ class Collection:
     def each(
         self, step: Callable[..., Any], asked: Mapping[str, Mapping[str, Any]]
     ) -> Iterator[tuple[str, Any]]:
-        """Yield what a function makes of some bundles, and which bundle it is, as they come.
+        """Run a function on some bundles; yield bundle and result on arrival.
 
         Parameters
         ----------
         step : function
-            Of a module, called with the :class:`sgstore.Store` of a bundle and with values; what it returns is
-            as plain as JSON.
+            Module-level function, called with the :class:`sgstore.Store` of a bundle and with
+            values; its result must be plain JSON values.
         asked : mapping of str to mapping
-            Bundle → plain values, by the names of parameters.
+            Bundle → plain values by parameter name.
         """
         name = f"{step.__module__}:{step.__qualname__}"
         values = {bundle: {"values": dict(given)} for bundle, given in asked.items()}
@@ -345,16 +346,16 @@ class Collection:
         bundles: Sequence[str],
         each: Mapping[str, dict[str, Any]] = MappingProxyType({}),
     ) -> Iterator[dict[str, Any]]:
-        """Yield what each of some bundles answers, as they come; ``each``: what only one of them is asked.
+        """Yield the result of each bundle on arrival; ``each`` has the parameters of single bundles.
 
-        Those that are missing are not asked again.
+        Missing bundles are not tried again.
 
         Raises
         ------
         PartialAnswerError
-            Some did not answer, and an answer must be whole; or they have answered other questions before.
+            Some bundles failed, and ``partial`` is off; or they have answered other queries before.
         QueryError, SqlError, AbstractionError, ConfigError
-            The question is at fault, as a bundle has found.
+            The query is invalid, as found by a bundle.
         """
         self.opened = [one for one in bundles if one not in self.missing]
         failed: dict[str, str] = {}
@@ -378,9 +379,9 @@ class Collection:
             self._judge(failed, len(tasks))
 
     def _judge(self, failed: Mapping[str, str], asked: int) -> None:
-        """Refuse an answer without some bundles, or note them if an answer may lack bundles.
+        """Reject a result without some bundles, or record them if ``partial`` is on.
 
-        What was asked before may hold what those said that have answered then: so they are not left out now.
+        Earlier results may include bundles that answered then; such bundles cannot be left out now.
         """
         lost = failed.keys() & self._answered
         if self._partial:
@@ -421,13 +422,13 @@ class Collection:
         return {"text": "", "parameters": {}, "limit": None} | asked | about
 
     def _sent(self, path: Path) -> str:
-        """A table as a task names it: its file, or its bytes where files are not shared."""
+        """Return a table for a task: its path, or its bytes if files are not shared."""
         if self.engine.shares_files:
             return str(path)
         return "base64:" + base64.b64encode(path.read_bytes()).decode()
 
     def classes(self, questions: Iterable[ClassQuestion], folder: str | Path) -> dict[str, Path]:
-        """The table of classes that all bundles have, for those that are asked; nothing if none is asked."""
+        """Write the table of classes of all bundles for these abstractions; empty without any."""
         rows: list[tuple[str, str, str, int]] = []
         asked = False
         for one in questions:
@@ -453,7 +454,7 @@ class Collection:
         return {CLASSES_GIVEN: path}
 
     def _counted(self, abstraction: str) -> list[tuple[str, str, str, int]]:
-        """Count the frames of each class of an abstraction in all bundles, as the catalogue says."""
+        """Return the number of frames of each class of an abstraction in all bundles, from the catalogue."""
         counts: dict[str, int] = {}
         for _, of, name, frames, _ in self.snapshot.facts["class_count"]:
             if of == abstraction:
@@ -461,7 +462,7 @@ class Collection:
         return [("", abstraction, name, frames) for name, frames in counts.items()]
 
     def may_answer(self, compiled: Compiled) -> list[str]:
-        """The bundles in which a query may have a match, the largest first."""
+        """Return the bundles in which a query may have a match, the largest first."""
         chosen, left = traces_of(compiled.query, compiled.catalog)
         every = {t.trace_id for t in compiled.catalog.traces}
         asked = (every if chosen is None else chosen) - left
@@ -473,7 +474,7 @@ class Collection:
     def _held(
         self, catalog: Catalog, pruning: Pruning
     ) -> Callable[[str], tuple[frozenset[Triple], Sequence[frozenset[str]]]]:
-        """Tell of a bundle the triples that matter, and its kinds, under an abstraction."""
+        """Return a function from a bundle to its relevant triples, and its kinds, under an abstraction."""
         snapshot, name, world = self.snapshot, catalog.name, catalog.world
         if name and name not in snapshot.sets:
 
@@ -496,7 +497,7 @@ def _similar(values: dict[str, Any]) -> SimilarFrames:
 
 
 def _facts_of_table(name: str, told: Mapping[str, Any]) -> TableFacts:
-    """Facts for the compiler of a table of one's own, given how its rows fit the frames of all bundles."""
+    """Return the facts about a user table, from the match of its rows with the frames."""
     refused = None
     if not told["joins"]:
         refused = "no rows that belong to frames"
@@ -507,18 +508,18 @@ def _facts_of_table(name: str, told: Mapping[str, Any]) -> TableFacts:
 
 
 class PartedMatches(Tabular):
-    """Matches of a query in a collection, as :class:`sgstore.matches.Matches` has them for a store.
+    """Matches of a query in a collection, with the interface of :class:`sgstore.matches.Matches`.
 
-    Each way of asking searches anew.
+    Each method runs the query again.
 
     Attributes
     ----------
     columns : tuple of str
         Names of the columns of the rows.
     graphs : bool
-        Whether each row ends in a graph, as ``RETURN SUBGRAPHS`` asks.
+        True if each row ends in a graph (``RETURN SUBGRAPHS``).
     of_match : bool
-        Whether one value is returned, and that is of each match as a whole.
+        True if the only returned value belongs to each match as a whole.
     """
 
     of_match = TemporalMatches.of_match
@@ -528,7 +529,7 @@ class PartedMatches(Tabular):
         self._whole, self._text, self._parameters = whole, text, dict(parameters)
         self._limit: int | None = None
         self._ready: Compiled = compile_query(text, whole.catalog, parameters)
-        parted(self._ready)  # what cannot be merged is refused before a bundle is opened
+        parted(self._ready)  # unmergeable queries are rejected before a bundle is opened
         self.graphs = self._ready.layout is not None
         self.columns = self._ready.columns
         self._reasons: dict[str, str] = {}
@@ -537,12 +538,12 @@ class PartedMatches(Tabular):
         return f"<PartedMatches of {' '.join(self._text.split())[:80]!r}>"
 
     def limit(self, most: int) -> Self:
-        """The same matches, but no more rows than so many, as if the query ended in ``LIMIT``.
+        """Return the same matches with at most ``most`` rows, as with ``LIMIT``.
 
         Raises
         ------
         ValueError
-            The number is below zero.
+            The number is negative.
         """
         if most < 0:
             raise ValueError(f"limit is {most}, expected 0 or more")
@@ -553,33 +554,33 @@ class PartedMatches(Tabular):
 
     @property
     def of_all(self) -> bool:
-        """Tell whether it speaks of the classes of the frames of all bundles."""
+        """True if the query uses the classes of frames of all bundles."""
         return bool(class_questions(self._ready.bound))
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Traces that cannot answer the query, and why: as the catalogue and bundles asked so far tell."""
+        """Map traces that cannot answer to the reason, as known from the catalogue and earlier runs."""
         found = {**self._ready.reasons, **self._reasons}
         return {name: found[name] for name in sorted(found, key=natural)}
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Traces that cannot answer the query, because something that it needs is not known of them."""
+        """Return the traces that cannot answer, because a required value is unknown."""
         return tuple(self.reasons)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on likely mistakes: none are looked for in a collection."""
+        """Return no notes: a collection does not search for likely mistakes."""
         return ()
 
     @property
     def scope(self) -> dict[str, Any]:
-        """What settings left out of the traces that are asked; see :func:`sgstore.store.scope_of`."""
+        """Return the omissions by settings in the queried traces; see :func:`sgstore.store.scope_of`."""
         chosen = (trace.trace_id for trace in self._ready.chosen)
         return self.snapshot.scope(world=self._ready.bound.world, traces=chosen)
 
     def _rows(self, *, whole: bool) -> Iterator[Any]:
-        del whole  # a bundle is asked as a whole
+        del whole  # a bundle always runs the complete query
         return iter(self)
 
     def __iter__(self) -> Iterator[Any]:
@@ -588,17 +589,17 @@ class PartedMatches(Tabular):
         yield from map(row._make, rows if layout is None else map(layout.row, rows))
 
     def rows(self) -> list[Any]:
-        """All rows at once."""
+        """Return all rows at once."""
         return list(self)
 
     def numpy(self) -> dict[str, Any]:
-        """All columns as arrays, masked where something is NULL."""
+        """Return all columns as arrays, masked for NULL."""
         with self._tables("rows", (0, 0)) as tables:
             text, values = parted(self._ready).statement(self._ready.catalog)
             return merged_arrays(tables, self.snapshot.words, text, values)
 
     def count(self) -> int:
-        """The number of distinct frames."""
+        """Return the number of distinct frames."""
         if self._ready.limited_to_frames is not None:
             return len({row[0] for row in self._frames()})
         with working_folder("classes") as folder:
@@ -612,7 +613,7 @@ class PartedMatches(Tabular):
             return total
 
     def frames(self) -> Iterator[FrameRef]:
-        """The distinct frames, by name of the trace and number; of limited rows, in the order of the rows."""
+        """Yield the distinct frames, ordered by trace name and number, or in the order of limited rows."""
         for frame_id, trace, seq, time_ns, t, log_time_ns in self._frames():
             yield FrameRef(frame_id, frame_id >> SEQ_BITS, trace, seq, time_ns, log_time_ns, t)
 
@@ -621,7 +622,7 @@ class PartedMatches(Tabular):
         yield from rows if self._ready.limited_to_frames is None else dict.fromkeys(rows)
 
     def subgraphs(self) -> Iterator[nx.MultiDiGraph[int]]:
-        """Each match as a graph of the nodes and edges that it binds; see :meth:`sgstore.Matches.subgraphs`."""
+        """Yield each match as a graph of its nodes and edges; see :meth:`sgstore.Matches.subgraphs`."""
         from sgstore.graph import graph_of_records
 
         layout = Layout.of(self._ready.bound)
@@ -639,7 +640,7 @@ class PartedMatches(Tabular):
             yield Interval(*row[:width], values=dict(zip(names, row[width:], strict=True)))
 
     def clips(self, before: float = 0.0, after: float = 0.0) -> Iterator[Clip]:
-        """Clips around the frames that match, in log time; see :meth:`sgstore.Matches.clips`."""
+        """Yield clips around the matching frames, in log time; see :meth:`sgstore.Matches.clips`."""
         start, end = round(before * 1e9), round(after * 1e9)
         if self._ready.limited_to_frames is not None:
             around = (Clip(row[1], row[-1] - start, row[-1] + end) for row in self._frames())
@@ -651,12 +652,12 @@ class PartedMatches(Tabular):
 
     @property
     def _slack(self) -> dict[str, int]:
-        """The tolerance of times of each trace, by name; ns."""
+        """Return the time tolerance of each trace, by name; ns."""
         traces = self._ready.catalog.traces
         return {trace.name: tolerance_ns(trace.period_ns) for trace in traces}
 
     def explain(self) -> str:
-        """Explain the query, stage by stage, and how its answers are merged."""
+        """Explain the query, stage by stage, and the merge of the results."""
         asked = parted(self._ready)
         bundles = self._whole.may_answer(self._ready)
         text, _ = asked.statement(self._ready.catalog)
@@ -665,7 +666,7 @@ class PartedMatches(Tabular):
         return f"{self._ready.stages()}\n\n{told}"
 
     def for_people(self) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-        """Columns and rows as a person wants to read them."""
+        """Return columns and rows in a readable form."""
         return for_people(self.columns, self, graphs=self.graphs)
 
     def _described(self) -> tuple[tuple[str, ...], None]:
@@ -687,7 +688,7 @@ class PartedMatches(Tabular):
         }
 
     def _answered(self, form: str, offsets: tuple[int, int] = (0, 0)) -> Iterator[tuple[Any, ...]]:
-        """The rows of a form in which the matches are asked for."""
+        """Yield the merged rows of a form of the matches."""
         asked = parted(self._ready, form, *offsets)
         with self._tables(form, offsets) as tables:
             text, values = asked.statement(self._ready.catalog)
@@ -697,7 +698,7 @@ class PartedMatches(Tabular):
                     yield from batch.values
 
     def written_apart(self, to: Path) -> PartFile:
-        """Write the rows, with columns that tell nodes of several traces apart, as a part of a union."""
+        """Write the rows as a part of a union, with columns that distinguish nodes of several traces."""
         asked = parted(self._ready, "apart")
         with self._tables("apart", (0, 0)) as tables:
             statement = asked.statement(self._ready.catalog)
@@ -706,7 +707,7 @@ class PartedMatches(Tabular):
 
     @contextmanager
     def _tables(self, form: str, offsets: tuple[int, int]) -> Generator[dict[str, list[PartFile]]]:
-        """The answers of the bundles, by the table as which the merging statement knows them."""
+        """Run the query; yield the results of the bundles by table of the merging statement."""
         with working_folder("parts") as folder:
             question = self._question(form, folder, offsets)
             tables: dict[str, list[PartFile]] = {}
@@ -723,18 +724,18 @@ class PartedMatches(Tabular):
 
 
 class PartedUnion(UnionMatches):
-    """Matches of several queries as one in a collection: of a ``UNION``, or of ``UNION ALL``."""
+    """Matches of ``UNION`` or ``UNION ALL`` in a collection."""
 
     _parts: Sequence[Any]  # PartedMatches
 
     @property
     def of_all(self) -> bool:
-        """Tell whether it speaks of the classes of the frames of all bundles."""
+        """True if the query uses the classes of frames of all bundles."""
         return any(part.of_all for part in self._parts)
 
     @property
     def scope(self) -> dict[str, Any]:
-        """What settings left out of the traces that any part is asked of."""
+        """Return the omissions by settings in the traces of all parts."""
         parts = [part._ready for part in self._parts]  # noqa: SLF001
         chosen = {trace.trace_id for one in parts for trace in one.chosen}
         snapshot = self._parts[0].snapshot
@@ -750,7 +751,7 @@ class PartedUnion(UnionMatches):
                 yield from map(row._make, batch.values)
 
     def numpy(self) -> dict[str, Any]:
-        """All columns as arrays, masked where something is NULL."""
+        """Return all columns as arrays, masked for NULL."""
         if self.graphs:
             raise QueryError("a table has values, and SUBGRAPHS are graphs")
         with self._tables() as asked:
@@ -758,7 +759,7 @@ class PartedUnion(UnionMatches):
 
     @contextmanager
     def _tables(self) -> Generator[tuple[Any, Any, str, list[Any]]]:
-        """The rows of the parts as tables, the words in them, and the statement that joins them."""
+        """Yield the rows of the parts as tables, their words, and the joining statement."""
         tables, snapshot = dict[str, list[PartFile]](), self._parts[0].snapshot
         with working_folder("union") as folder:
             for number, part in enumerate(self._parts):
@@ -773,7 +774,7 @@ class PartedUnion(UnionMatches):
 
 
 class _NoFile:
-    """What stands where matches of a store have its file: a collection does not change while it is asked."""
+    """Substitute for the file of a store: a collection does not change during a query."""
 
     @contextmanager
     def snapshot(self) -> Generator[None]:
@@ -781,7 +782,7 @@ class _NoFile:
 
 
 class PartedChecks:
-    """The checks of a text, ready to be asked of a collection. Iterating asks: verdicts, check by check."""
+    """Checks of a text over a collection; iteration runs them and yields verdicts, check by check."""
 
     def __init__(
         self,
@@ -796,39 +797,39 @@ class PartedChecks:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the checks, in order."""
+        """Return the names of the checks, in order."""
         return tuple(one.check.name for one in self._checks)
 
     @property
     def quantitative(self) -> bool:
-        """Tell whether it is asked of some check by how much it is met."""
+        """True if some check has a robustness."""
         return any(one.check.robustness for one in self._checks)
 
     @property
     def lasting(self) -> bool:
-        """Tell whether frames have margins; see :attr:`sgstore.temporal.CheckRun.lasting`."""
+        """True if frames have margins; see :attr:`sgstore.temporal.CheckRun.lasting`."""
         return all(kept_throughout(one.check) is not None for one in self._checks)
 
     def margins(self) -> Iterator[tuple[Ints, Floats]]:
-        """Margins by which traces meet the one check; see :meth:`sgstore.temporal.CheckRun.margins`."""
+        """Yield the margins of the only check; see :meth:`sgstore.temporal.CheckRun.margins`."""
         question = {"text": self._text, "parameters": self._parameters}
         return self._whole.file.margins(question)
 
     @property
     def returned(self) -> dict[str, tuple[str, ...]]:
-        """Names of the values that each check returns of its violations."""
+        """Return the names of the values that each check returns for its violations."""
         from sgstore.temporal import returned_by
 
         return returned_by(one.check for one in self._checks)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on likely mistakes: none are looked for in a collection."""
+        """Return no notes: a collection does not search for likely mistakes."""
         return ()
 
     @property
     def scope(self) -> dict[str, Any]:
-        """What settings left out of the traces; see :func:`sgstore.store.scope_of`."""
+        """Return the omissions by settings in the traces; see :func:`sgstore.store.scope_of`."""
         world = any(one.check.world for one in self._checks)
         return self._whole.snapshot.scope(world=world)
 
@@ -869,7 +870,7 @@ def _verdicts(path: Path) -> Iterator[Verdict]:
 
 
 class PartedRows(Tabular):
-    """The rows of a statement in every bundle; iterating runs it."""
+    """Rows of a statement in every bundle; iteration runs it."""
 
     def __init__(self, whole: Collection, text: str) -> None:
         self._whole, self._text = whole, text
@@ -897,7 +898,7 @@ class PartedRows(Tabular):
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the columns; a bundle is asked for them."""
+        """Return the names of the columns, found by running the statement."""
         if not self._columns:
             next(iter(self), None)
         return self._columns

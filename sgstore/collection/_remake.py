@@ -1,4 +1,4 @@
-"""Bundles made anew from their recordings, one after another: ``collection rebuild``."""
+"""Rebuild of bundles from their recordings, one after another: ``collection rebuild``."""
 
 from __future__ import annotations
 
@@ -30,33 +30,33 @@ def rebuild(
     everything: bool = False,
     on_bundle: Callable[[int, int], None] | None = None,
 ) -> dict[str, str]:
-    """Make the bundles of another version anew from their recordings, each with a snapshot of its own.
+    """Rebuild the bundles of another version from their recordings, each with its own snapshot.
 
-    A run that was stopped goes on with the bundles that are left. Names of traces and maps stay.
+    A repeated run continues with the remaining bundles. Names of traces and maps stay.
 
     Parameters
     ----------
     url : str or Path
-        Of the collection.
+        Place of the collection.
     look_in : sequence of str or Path
-        Folders in which to look for recordings that are not where they were.
+        Folders to search for moved recordings.
     jobs : int
-        Recordings that are read at the same time.
+        Number of recordings to read at the same time.
     everything : bool
-        Whether bundles of this version are made anew, too.
+        True to rebuild also bundles of this version.
     on_bundle : function, optional
-        Called after each bundle with how many are done, and how many there are.
+        Called after each bundle with the number of finished bundles and the total.
 
     Returns
     -------
     dict of str to str
-        Bundle as it was called → as it is called now.
+        Old name of a bundle → new name.
 
     Raises
     ------
     StoreError
-        There is no collection, a recording is gone or has changed, or something cannot be read or written. What
-        was made before stays made.
+        The collection is missing, a recording is missing or has changed, or a file cannot be read
+        or written. Finished bundles stay.
     """
     place = place_at(url)
     wanted = catalogue.About().schema_version
@@ -73,7 +73,7 @@ def rebuild(
 
 
 def _remade(place: Place, bundle: str, look_in: Sequence[str | Path], jobs: int) -> Facts:
-    """Make a bundle anew, and put it beside the old one; what the catalogue is to say of it."""
+    """Rebuild a bundle next to the old one; return its catalogue rows."""
     with working_folder("rebuild") as folder:
         path = folder / "bundle.sgstore"
         shutil.copyfile(bundle_path(place, bundle), path)
@@ -89,7 +89,7 @@ def _remade(place: Place, bundle: str, look_in: Sequence[str | Path], jobs: int)
 
 
 def _replaced(place: Place, bundle: str, fresh: Facts) -> bool:
-    """Commit a bundle in the place of another one; ``False``: that is not there any more."""
+    """Replace a bundle in a commit; ``False`` means that it has disappeared."""
     for _ in range(ATTEMPTS):
         before = catalogue.latest(place)
         if bundle not in {one["bundle"] for one in before.bundles}:

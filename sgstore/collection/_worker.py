@@ -1,7 +1,7 @@
-"""A part of a question: one bundle is asked, and its answer waits in files.
+"""Worker: runs a part of a query on one bundle and writes its results to files.
 
-A task and its result are plain values, so that any engine can carry them. A task depends on nothing but what
-it says and the bundle, so it can be done again, here or elsewhere, and gives the same.
+A task and its result are plain values, so that any engine can transport them. A task depends only
+on its values and the bundle; it can be repeated anywhere with the same result.
 """
 
 from __future__ import annotations
@@ -45,26 +45,26 @@ if TYPE_CHECKING:
     from sgstore.matches import Matches
 
 KEPT: Final = 128
-"""Bundles that a process remembers, and keeps open."""
+"""Number of bundles that a process keeps open."""
 
 EMPTY: Final = ""
-"""The name of the bundle that has nothing: it is asked where no other one is, to know the columns."""
+"""Name of the empty bundle, which provides the columns if no other bundle is relevant."""
 
 
 @dataclass(frozen=True, slots=True)
 class Whole:
-    """Facts of the whole that a part must know, beside what it holds.
+    """Facts about the whole collection that a part of a query needs.
 
     Attributes
     ----------
     words : dict
-        Enumeration → values in it beside those of every store.
+        Enumeration → additional values.
     own, own_edges : dict
-        Attributes of a client's own → their types.
+        Custom attributes → their types.
     classed : list of str
-        Abstractions in which the classes of frames are known.
+        Abstractions with known classes of frames.
     sets : dict
-        Derived set → the relations that it has; ``None``: that is not known.
+        Derived set → its relations; ``None`` means unknown.
     """
 
     words: dict[str, list[str]]
@@ -74,7 +74,7 @@ class Whole:
     sets: dict[str, list[str] | None]
 
     def catalog(self, local: Catalog) -> Catalog:
-        """The catalog of a part: its contents, and the names of the whole."""
+        """Return the catalogue of a part: its contents, with the names of the whole."""
         sets = dict(local.sets)
         for name, relations in self.sets.items():
             if name in sets:
@@ -92,7 +92,7 @@ class Whole:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Make it of plain values."""
+        """Build it from plain values."""
         return cls(**values)
 
 
@@ -104,10 +104,10 @@ def _with_relations(
 
 
 class PartMatches(TemporalMatches):
-    """Matches of a query in one bundle, as the merging of all asks for them."""
+    """Matches of a query in one bundle, in the forms that the merge needs."""
 
     def written(self, form: str, offsets: tuple[int, int], folder: Path) -> list[PartFile]:
-        """Write the rows of each question that a part is asked."""
+        """Write the rows of each partial query."""
         with self._compiled() as compiled:
             if form == "count":
                 return [self._written(compiled, Compiled.count(compiled), folder)]
@@ -122,26 +122,26 @@ class PartMatches(TemporalMatches):
 
 
 def answer(task: dict[str, Any]) -> dict[str, Any]:
-    """The answer of one bundle.
+    """Run a task on one bundle.
 
     Parameters
     ----------
     task : dict
-        ``kind``: one of those in ``_KINDS``; ``url`` and ``bundle``; ``whole``: see :class:`Whole`;
-        ``text``, ``parameters``, ``limit``; ``tables``: name → Parquet file, or its bytes as base64; ``to``:
-        the folder for parts, which the caller reads, empty: rows come with the result; and what the kind
-        needs.
+        ``kind``: a key of ``_KINDS``; ``url`` and ``bundle``; ``whole``: see :class:`Whole`;
+        ``text``, ``parameters``, ``limit``; ``tables``: name → Parquet file, or its bytes as
+        base64; ``to``: the folder for result files, or empty to return the rows with the result;
+        and values for the kind.
 
     Returns
     -------
     dict
-        ``parts``: rows in Parquet files; ``lines``: a file of JSON lines; ``reasons``: traces that cannot
-        answer, and why; ``value``: plain values.
+        ``parts``: rows in Parquet files; ``lines``: a file of JSON lines; ``reasons``: traces that
+        cannot answer, with the reason; ``value``: plain values.
 
     Raises
     ------
     SgstoreError
-        The bundle cannot be read, or the question not be answered by it.
+        The bundle cannot be read, or cannot answer the query.
     """
     with working_folder("part") as held:
         to = Path(task["to"]) if task["to"] else held
@@ -154,7 +154,7 @@ def answer(task: dict[str, Any]) -> dict[str, Any]:
 
 
 def _known(file: StoreFile, told: str) -> Catalog:
-    """The catalog of a bundle, which never changes; what was found out about its traces is remembered."""
+    """Return the cached catalogue of a bundle, which never changes."""
     local = file.catalog()
     held = _catalogs.get((file.path, told))
     if held is None or held[0] is not local:
@@ -170,7 +170,7 @@ _catalogs: Final[dict[tuple[Path, str], tuple[Catalog, Catalog]]] = {}
 
 @contextmanager
 def _opened(task: dict[str, Any], held: Path) -> Generator[StoreFile]:
-    """The bundle, open, with the tables beside it; alone, if a statement of a user's is to see it."""
+    """Yield the open bundle with the user tables, or in a separate process for user statements."""
     if task["bundle"] == EMPTY:
         path = held / "empty.sgstore"
         StoreFile.create(path).close()
@@ -189,12 +189,12 @@ def _opened(task: dict[str, Any], held: Path) -> Generator[StoreFile]:
 
 @lru_cache(maxsize=KEPT)
 def _kept(path: Path) -> StoreFile:
-    """A bundle that was asked lately: its file stays open, and what it holds is remembered."""
+    """Return an open bundle from the cache."""
     return StoreFile.together(path)
 
 
 def _tables_of(task: dict[str, Any], held: Path) -> dict[str, Path]:
-    """The tables beside a bundle, by name, as files."""
+    """Return the user tables of a task, by name, as files."""
     given: dict[str, Path] = {}
     for name, table in task.get("tables", {}).items():
         if table.startswith("base64:"):
@@ -236,7 +236,7 @@ def _check(
 
 
 def _plain(value: Any) -> Any:
-    """What JSON is to write of numpy."""
+    """Convert numpy values for JSON."""
     return value.tolist()
 
 
@@ -248,7 +248,7 @@ _of_interval, _of_robustness = _getter(Interval), _getter(Robustness)
 
 
 def _values_of(verdict: Verdict) -> list[Any]:
-    """The values of a verdict in their order: with the name of each there were thrice as much to write."""
+    """Return the values of a verdict without names, which would triple the size."""
     margin, witnesses = verdict.robustness, verdict.witnesses
     return [
         *(verdict.check, verdict.trace, verdict.verdict),
@@ -261,7 +261,7 @@ def _values_of(verdict: Verdict) -> list[Any]:
 
 
 def as_verdict(values: list[Any]) -> Verdict:
-    """The verdict whose values these are."""
+    """Rebuild a verdict from its values."""
     from sgstore.arrays import np
 
     check, trace, word, violations, witnesses, status, reason, margin, absent = values
@@ -284,7 +284,7 @@ def as_verdict(values: list[Any]) -> Verdict:
 def _classes(
     task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
-    """The classes of the frames of some traces, or of a table of single frames."""
+    """Write the classes of the frames of some traces, or of a table of single frames."""
     path = to / f"{secrets.token_hex(8)}.parquet"
     part = write_classes(file, task["abstraction"], task["traces"], task["table"], path)
     return {"parts": [part.as_dict()], "reasons": {}}
@@ -293,7 +293,7 @@ def _classes(
 def _sql(
     task: dict[str, Any], file: StoreFile, catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
-    """The rows of a user's statement on one bundle, as lines."""
+    """Write the rows of a user's statement on one bundle as JSON lines."""
     path = to / f"{secrets.token_hex(8)}.ndjson"
 
     def find(text: str, **values: object) -> Matches:
@@ -314,7 +314,7 @@ def _sql(
 def _coded(
     task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
-    """The class of each frame in an abstraction."""
+    """Write the class of each frame in an abstraction."""
     part = write_coded(file, task["abstraction"], to / f"{secrets.token_hex(8)}.parquet")
     return {"parts": [part.as_dict()], "reasons": {}}
 
@@ -322,7 +322,7 @@ def _coded(
 def _features(
     task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
-    """Features of the graphs of some frames in an abstraction; frames by their place in the question."""
+    """Write features of the graphs of frames in an abstraction; frames are numbered as in the task."""
     from sgstore.arrays import np
 
     def rows() -> Iterator[tuple[int, str, int]]:
@@ -342,7 +342,7 @@ def _features(
 def _margins(
     task: dict[str, Any], file: StoreFile, catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
-    """The margin by which each frame meets a check, or its trace as a whole."""
+    """Write the margin of each frame, or of its trace, for a check."""
     from sgstore.arrays import np
 
     run = CheckRun(file, catalog, task["text"], task["parameters"])
@@ -356,7 +356,7 @@ def _margins(
 def _rows(
     task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
-    """The rows of a statement of ours."""
+    """Write the rows of an internal statement."""
     statement = task["sql"], task["values"]
     columns = [row[0] for row in file.rows(f"DESCRIBE {task['sql']}", task["values"]).values]
     part = write_part(file, statement, columns, (), to / f"{secrets.token_hex(8)}.parquet")
@@ -366,7 +366,7 @@ def _rows(
 def _step(
     task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], _to: Path
 ) -> dict[str, Any]:
-    """What a function of another room makes of a bundle."""
+    """Return the result of a module-level function for a bundle."""
     module, _, name = task["step"].partition(":")
     step = attrgetter(name)(import_module(module))
     return {"value": step(Store.of(file), **task["values"])}
@@ -375,7 +375,7 @@ def _step(
 def _tables(
     _task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], _to: Path
 ) -> dict[str, Any]:
-    """Fit of the rows of tables of users' own to the frames of one bundle."""
+    """Return the match of user tables with the frames of one bundle."""
     joined, told = file.joined(), dict[str, Any]()
     for name, facts in file.catalog().tables.items():
         rows = joined.get(name)
@@ -390,12 +390,12 @@ def _tables(
 
 
 def example_in(store: Store, **asked: Any) -> dict[str, Any]:
-    """A frame of a bundle as an example for others."""
+    """Return a frame of a bundle as an example for others."""
     return asdict(example_of(store.file, **asked))
 
 
 def like_in(store: Store, example: dict[str, Any], **how: Any) -> list[dict[str, Any]]:
-    """The frames of a bundle that are most like an example."""
+    """Return the frames of a bundle that are most similar to an example."""
     return [asdict(one) for one in frames_like(store.file, Example(**example), **how)]
 
 
@@ -414,7 +414,7 @@ _KINDS: Final[dict[str, Any]] = {
 
 
 def _carry(found: dict[str, Any]) -> None:
-    """Put the content of files into a result that is read on another machine."""
+    """Embed the content of files into a result for another machine."""
     for part in found.get("parts", ()):
         if not part["path"]:
             continue
@@ -424,7 +424,7 @@ def _carry(found: dict[str, Any]) -> None:
 
 
 def brought(result: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """A result with its files in a folder here, if they came with it.
+    """Write the embedded files of a result to a local folder.
 
     Raises
     ------

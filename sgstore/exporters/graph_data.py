@@ -315,7 +315,7 @@ class GraphDataset:
     def _hetero_data(
         self, graph: dict[str, NDArray[Any]], kind: NDArray[Any], relation: NDArray[Any]
     ) -> Any:
-        """With all types and all triples that occur; the others are empty, so that graphs can be batched."""
+        """Return data with all types and triples, empty ones too, so that graphs can be batched."""
         made = self._data.HeteroData()
         tensor = self._torch.from_numpy
         own = np.zeros(len(kind), np.int64)
