@@ -475,7 +475,7 @@ _WORDS: Final = {"->": "IMPLIES", "|": "OR", "&": "AND", "U": "UNTIL", "R": "REL
 
 
 class _Ltl:
-    """Translator of an LTL formula in the syntax of ``ltlf2dfa``. SGSM's ``$[N][…]`` means N frames in a row."""
+    """Translator of LTL formulas in the syntax of ``ltlf2dfa``. ``$[N][…]`` means N frames in a row."""
 
     def __init__(self, text: str, defined: Mapping[str, str]) -> None:
         self._formula = text

@@ -97,7 +97,7 @@ def aggregate(e: s.Call, names: SymbolTable) -> b.Aggregate:
     Raises
     ------
     QueryError
-        Its arguments do not fit.
+        Invalid arguments.
     """
     name, session = normalize_name(e.name), names.session
     function = AGGREGATES[name]

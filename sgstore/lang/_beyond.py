@@ -78,7 +78,7 @@ def _is_told(edge: b.Edge, block: b.BlockValue) -> bool:
         return False
     if edge.relations - bounded_in(edge.beyond):
         return False
-    # Entities that near to the ego are in the graph.
+    # Entities within this distance of the ego are in the graph.
     of_ego = any(not one.other for one in kinds)
     return not (of_ego and all(_reach(edge, reach) <= reach.radius for reach in known))
 

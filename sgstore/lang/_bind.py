@@ -619,7 +619,7 @@ def _special(returns: s.Returns, session: Session) -> s.Item | None:
 
 
 def _columns(items: Iterable[s.Item], names: SymbolTable) -> tuple[b.ReturnColumn, ...]:
-    """Bind the values to return. An aggregating value may use the grouping values beside it."""
+    """Bind the values to return. An aggregating value may use the grouping values of the same ``RETURN``."""
     items = [item for item in items if item.form == "value"]
     found = [_column(item, names) for item in items]
     keys = _group_keys(found)
@@ -633,7 +633,7 @@ def _columns(items: Iterable[s.Item], names: SymbolTable) -> tuple[b.ReturnColum
 
 
 def _group_keys(columns: Iterable[b.ReturnColumn]) -> dict[b.Bound, str]:
-    """Return the values by which matches are grouped, with their names."""
+    """Return the grouping values, each with its column name."""
     plain = (one for one in columns if not b.is_counted(one.value))
     return {one.value: one.name for one in plain if not isinstance(one.value, b.Value)}
 

@@ -321,7 +321,7 @@ MOST_WAYS: Final = 100
 
 
 def _place(name: str, value: b.Bound | None, session: Session) -> b.FrameAttribute:
-    """Return a new placeholder for a named value, or for a path if the value is None."""
+    """Return a new placeholder for a named value. ``value=None`` means a path."""
     session.numbers += 1
     if value is None or b.is_path(value):
         return b.passed_on(f"{b.PASSED}{name} p{session.numbers}", Type.list)

@@ -243,7 +243,7 @@ IN_GRAPH: Final = Attribute(
     DisplayUnit.inside,
     _ENTITIES,
 )
-"""Used only in generated queries. In written queries, the scope has this role."""
+"""Used only in generated queries. Queries of users have the scope instead."""
 
 COMPUTED: Final = Attribute(
     "computed", Type.boolean, {}, "whether its relations were computed here, and not imported"

@@ -29,7 +29,7 @@ class StepLink:
 
 @dataclass(frozen=True, slots=True)
 class StepWay:
-    """One of the sequences that an expression of steps stands for.
+    """Sequence of steps that an expression of steps allows.
 
     Attributes
     ----------

@@ -136,7 +136,7 @@ def _note(name: str, text: str, ask: Ask) -> str:
         alike = other.startswith("trace.") == name.startswith("trace.") and other != name
         if alike and other != "type" and _there(other, text, ask):
             return f"{said}; it is a value of {other}"
-    # Case is the least of mistakes.
+    # A difference in case is the smallest mistake.
     near = 'levenshtein(lower("v"."value"), lower($1)), levenshtein("v"."value", $1), "v"."value"'
     nearest = Select(['"v"."value"'], [nested(_all_values(name), "v")], order=[near], limit=1)
     rows = ask(nearest.text(), [text])

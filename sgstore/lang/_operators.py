@@ -613,8 +613,8 @@ OPERATORS: Final[Mapping[str, Operator]] = {
     "IS NOT NULL": _null_test("IS NOT NULL", null=False),
     "IN": Operator(_member, _is_member, _is_member_columns, infix=True),
 }
-"""All operators by the word that an :class:`~sgstore.lang.ir.Operation` has. The operands of ``IN`` are a value
-and, in memory, its choices as one."""
+"""All operators by the word that an :class:`~sgstore.lang.ir.Operation` has. ``IN`` has two operands: a
+value, and in memory all its choices as one operand."""
 
 ROUNDINGS: Final[Mapping[str, Callable[[float], float | None]]] = {
     "float32": float32,

@@ -44,7 +44,7 @@ class Terminal:
         Text in capitals; empty if the terminal is a pattern.
     pattern : re.Pattern or None
     priority : int
-        Decides between terminals that match the same text.
+        Priority among terminals that match the same text.
     """
 
     name: str

@@ -104,13 +104,13 @@ class Pattern:
         Parameters
         ----------
         src, relation, dst : str
-            ``relation`` is one, or several as ``near|very_near``; empty: any.
+            ``relation`` is one relation, or several as ``near|very_near``; empty means any.
         both : bool
             True if the edge may have either direction.
         times : str
             Number of edges in a row: ``2`` or ``1..3``.
         name : str
-            Of its variable, if it has one.
+            Name of the variable; empty without one.
 
         Raises
         ------

@@ -846,7 +846,7 @@ def _block_rows(
     sql: SqlBuilder, leaf: BlockValue, given: SharedRelation | None, keys: frozenset[str]
 ) -> str:
     if leaf.word == "EXISTS":
-        # A column that is not a key: DuckDB 2.0.0 gives wrong results if keys are tested for NULL.
+        # A column that is not a key: DuckDB 2.0.0 has a bug if keys are tested for NULL.
         rows = frames(sql, leaf.scope, given, keys)
         return Select(["*", 'TRUE AS "value"'], [nested(rows, ":block")]).text()
     parts = list(leaves(leaf.value)) if leaf.value is not None else []

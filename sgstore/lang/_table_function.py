@@ -159,7 +159,7 @@ class _Arguments:
         return tuple(items)
 
     def _value(self) -> Any:
-        """Read a constant, or return None if there is none."""
+        """Read a constant. ``None`` means that the next argument is not a constant."""
         found = _VALUE.match(self.sql, self._next())
         if found is None:
             return None

@@ -74,9 +74,9 @@ class Edge:
     Attributes
     ----------
     key : str
-        Its name in the query, or a number.
+        Name in the query, or a number.
     src, dst : str
-        Keys of its nodes.
+        Keys of the two nodes.
     relations : frozenset of str
     both : bool
         True if the edge may also run from ``dst`` to ``src``.
@@ -149,7 +149,7 @@ class Aggregate:
 
 @dataclass(frozen=True, slots=True)
 class GroupKey:
-    """Value by which an aggregating query groups its matches. ``name`` is the column that holds it."""
+    """Grouping value of an aggregating query. ``name`` is the name of its column."""
 
     name: str
     type: Type
@@ -612,7 +612,7 @@ class Query:
     policy : str
         Matches of a sequence to return: ``all``, ``first``, ``longest``.
     gaps : str
-        Whether a gap in the recording ends a run (``break``) or not (``bridge``).
+        ``break``: a gap in the recording ends a run; ``bridge``: it does not.
     stages : tuple of MatchStage and WithStage
         Parts of a query with ``OPTIONAL MATCH``, ``WITH`` or a named path. The first is a pattern.
     world : bool
@@ -886,8 +886,8 @@ class BoundCheck:
         Meaning of the end of a trace for unmet obligations: ``bounded`` (pending if the bound has not passed,
         otherwise failed), ``strong`` (failed), ``weak`` (met), ``pending`` (pending).
     gaps : str
-        Whether a gap in the recording ends a run (``break``) or not (``bridge``); with ``unknown`` the events
-        in the gap are unknown.
+        ``break``: a gap in the recording ends a run; ``bridge``: it does not; ``unknown``: the events in the
+        gap are unknown.
     robustness : bool
         True if the robustness of the formula is computed: the margin by which it is true or false.
     returns : tuple of ReturnColumn

@@ -247,7 +247,7 @@ Given = Constant | Duration | Parameter | Variable
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """Label as written. The name ``%`` stands for any label."""
+    """Label in a pattern. The name ``%`` means any label."""
 
     name: str
     span: TextSpan
