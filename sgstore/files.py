@@ -150,6 +150,11 @@ def _remove_dead(folder: Path, undo: Callable[[Path], None] | None) -> None:
         os.close(lock)
 
 
+def sweep_temporary() -> None:
+    """Remove the folders for temporary files whose processes are gone."""
+    sweep(_root(), PREFIX)
+
+
 _mine: dict[tuple[int, Path], Path] = {}
 """The folder of this process, by the process and the folder for temporary files."""
 

@@ -466,7 +466,11 @@ class Killing:
         if verb.gives and (place / verb.gives).is_dir():
             hidden = {p.name for p in (place / verb.gives).iterdir() if p.name.startswith(".")}
             beside += hidden - {*more}
-        beside += [p.name for p in self._server.temporary.iterdir() if not tried_by_python(p)]
+        beside += [
+            p.name
+            for p in self._server.temporary.iterdir()
+            if p.name not in more and not tried_by_python(p)
+        ]
         assert beside == [], f"{what}: {sorted(beside)} is left"
 
     def _round(self, name: str, kills: int) -> None:

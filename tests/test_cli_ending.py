@@ -582,6 +582,40 @@ def test_what_a_killed_run_left_is_removed_by_the_next_start(
     assert not list(begun.temporary.iterdir())
 
 
+@pytest.mark.parametrize("verb", ["export", "shrink"])
+def test_a_refused_export_removes_the_folders_of_a_killed_one(
+    verb: str, town_store: Path, tmp_path: Path
+) -> None:
+    to, temporary = tmp_path / "to", tmp_path / "tmp"
+    temporary.mkdir()
+    more = ["--format", "parquet"] if verb == "export" else []
+    line = [verb, str(town_store), "MATCH (e:Ego) WHERE e.speed > 9", "--to", str(to), *more]
+    code = (
+        "import os, signal, sys; from sgstore import cli, files; sys.argv[0] = 'sgstore'\n"
+        "if sys.argv[1] == 'kill':\n"
+        "    files.HeldFolder.remove = lambda self: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "del sys.argv[1]; cli.main()"
+    )
+
+    def run(how: str) -> int:
+        env = os.environ | {"TMPDIR": str(temporary)}
+        return subprocess.run(
+            [sys.executable, "-c", code, how, *line], check=False, capture_output=True, env=env
+        ).returncode
+
+    assert run("kill") == -signal.SIGKILL
+    files = {one.name for one in to.iterdir()}
+    assert "manifest.json" in files
+    assert any(name.startswith(".export-") for name in files)
+    assert list(temporary.glob("sgstore-held-*"))
+
+    assert run("again") == 1
+    assert {one.name for one in to.iterdir()} == {
+        name for name in files if not name.startswith(".export-")
+    }
+    assert not list(temporary.iterdir())
+
+
 def test_the_exit_code_is_kept_wherever_the_interruption_came_from() -> None:
     code = (
         "import signal, sys; from sgstore.cli import ending\n"

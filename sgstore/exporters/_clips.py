@@ -19,7 +19,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import ExportError
-from sgstore.files import HeldFolder
+from sgstore.files import HeldFolder, sweep, sweep_temporary
 from sgstore.mcap import digest_of
 
 if TYPE_CHECKING:
@@ -187,7 +187,13 @@ def check_folder(to: Path) -> None:
     ------
     ExportError
         It is a file, or contains an export.
+
+    Notes
+    -----
+    Folders that a killed run left are removed first: a refused run makes no folder, so it would keep them.
     """
+    sweep(to, _PREFIX, _undo)
+    sweep_temporary()
     if os.path.lexists(to) and not to.is_dir():
         raise ExportError(f"{to}: a file; an export needs a folder")
     _refuse_taken(to, [MANIFEST])
