@@ -1,4 +1,4 @@
-"""The query language: text and a catalog in, SQL out; no database inside.
+"""Compiler of the query language: converts query text and a catalog to SQL, without a database.
 
 The stages are parse (``_parse``), bind (``_bind``), rewrite (``_rewrite``) and emit (``_results``), each a pure
 function whose result can be printed.

@@ -110,7 +110,7 @@ def timespan(e: s.Duration, _: SymbolTable) -> b.Value:
 
 
 def course(e: s.Call, names: SymbolTable) -> b.Bound:
-    """Bind a call of one of :data:`COURSES`: ``prev``, ``delta``, a window, ``run_length``, …, or ``t``.
+    """Bind a function over time: ``prev``, ``delta``, a window, ``run_length``, …, or ``t``.
 
     Raises
     ------

@@ -184,7 +184,7 @@ class Attribute:
 
     @property
     def kinds(self) -> frozenset[str]:
-        """All kinds that may have the attribute. Attributes of all entities include added entity kinds."""
+        """All kinds that may have the attribute. If all entities have it, this includes added kinds."""
         every = self.own_kinds >= _ENTITIES
         return self.own_kinds | entity_kinds() if every else self.own_kinds
 

@@ -615,7 +615,7 @@ class Compiled:
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Reasons by name of the selected traces that lack a relation of the query."""
+        """Reason for each selected trace that lacks a relation of the query, by trace name."""
         if self.query.unknown_is_false:
             return {}
         wanted = self.query.relations

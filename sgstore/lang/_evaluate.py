@@ -192,7 +192,7 @@ class FrameView:
         return None if math.isnan(value) else value
 
     def _by_lanes(self, name: str, one: int, other: int) -> float | None:
-        """Return a number that is looked up by lanes, or None if unknown."""
+        """Return a number derived from lanes, such as a lane distance, or None if unknown."""
         reach = self.graph.reach
         if reach is None:
             return None
@@ -221,7 +221,7 @@ class FrameView:
         return self._pairs[key][name]
 
     def _on(self, node: int, *, parts: bool = False) -> Sequence[tuple[int, float, float]]:
-        """Return the stretches of lanes on which an entity is, or with ``parts`` a part of the map."""
+        """Return the lane stretches occupied by an entity, or with ``parts`` by a part of the map."""
         reach, kind = self.graph.reach, self.nodes[node]["kind"]
         if node >= 0 or reach is None:
             return self._stretches.get(node, ())

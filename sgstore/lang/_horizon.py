@@ -1,4 +1,4 @@
-"""Horizon of a check: the range around the ego that a trace must cover for a certain verdict.
+"""Horizon of a check: the range around the ego that a trace must cover for a reliable verdict.
 
 Unknown entities are in no binding. In ``FORALL (v:Vehicle) ALWAYS dist(ego, v) > 5`` only vehicles within 5 m
 matter, so a trace that covers 50 m around the ego is sufficient. ``FORALL (v:Vehicle) ALWAYS v.speed < 50``
@@ -159,7 +159,7 @@ class _Missed:
 
     @property
     def either(self) -> _Missed:
-        """Copy for the case that the affected verdict is unknown."""
+        """Copy in which the missing node can make both verdicts wrong."""
         return replace(self, true=True, false=True)
 
 
@@ -356,7 +356,7 @@ _BRAKING: Final = {"a_long_req": -1.0, "drac": 1.0, "btn": 11.5}
 
 
 def bounds(value: Bound, speed: float) -> Interval:
-    """Return the smallest and largest possible value of a number, for a speed limit of the trace.
+    """Return the smallest and largest possible value of a number, for a maximum speed in the trace.
 
     Parameters
     ----------

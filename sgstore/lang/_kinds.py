@@ -55,7 +55,7 @@ class Profile:
         return sum(map(bool, (self.moving, self.fixed, self.mapped)))
 
     def has(self, home: Home) -> bool:
-        """True if the nodes may have values stored in the given home."""
+        """True if the nodes may have values in the given table."""
         kinds = {
             Home.state: self.moving,
             Home.entity: self.moving | self.fixed,
@@ -66,7 +66,7 @@ class Profile:
 
 
 def homes_of(attribute: Attribute, profile: Profile) -> set[Home]:
-    """Return the homes to join for an attribute of nodes with a given profile.
+    """Return the tables to join for an attribute of nodes with a given profile.
 
     The state of a moving entity is joined anyway. So a constant that states repeat is read from the state.
     """

@@ -516,7 +516,7 @@ def _in_names(
     bound: tuple[Catalog, BoundValues],
     owners: Mapping[str, str],
 ) -> str:
-    """Return SQL for rows sorted by query order, then by columns. Trace names sort by number.
+    """Return SQL for rows in query order, then sorted by columns, with ``run2`` before ``run10``.
 
     ``owners``: the columns with the owners of the nodes in a column.
     """
@@ -535,7 +535,7 @@ def _in_names(
 
 
 class _Grouping:
-    """Parts of an aggregating query over a collection.
+    """Split of an aggregating query into queries for the parts of a collection.
 
     The first query for a part has a column for each grouping value, and one or two summable columns for each
     aggregate. An aggregate over *distinct* values needs its own query, which returns the set of values for

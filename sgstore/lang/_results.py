@@ -705,7 +705,7 @@ def _column(leaf: Leaf) -> str:
 
 
 def _kept(value: Bound) -> tuple[Bound, ...]:
-    """Return the columns that must stay the same so that a value stays the same."""
+    """Return the columns that determine a value."""
     return (
         tuple(leaves(value)) if isinstance(value, Operation) and value.word == "name" else (value,)
     )
@@ -724,7 +724,7 @@ def _name_of(node: str, query: Query, catalog: Catalog) -> Bound:
 
 
 def _spelled(query: Query, catalog: Catalog) -> Query:
-    """Return a query whose results compose names as late as possible."""
+    """Return a query that composes node names as late as possible."""
 
     def spelled(value: Bound) -> Bound:
         match value:

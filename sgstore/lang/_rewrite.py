@@ -615,7 +615,7 @@ _MORE: Final = {">", ">=", "="}
 
 
 def bounds(conditions: list[Bound]) -> list[Bound]:
-    """Return simple conditions that follow from others: ``gap < t`` implies that circles are near."""
+    """Return cheaper conditions that follow from others, such as a lower bound for ``gap < t``."""
     found: list[Bound] = []
     for condition in conditions:
         match condition:

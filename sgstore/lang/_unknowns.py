@@ -129,7 +129,7 @@ def spelled_out(operands: tuple[b.Bound, ...]) -> b.Bound:
 def certain(  # noqa: PLR0911 - a case each
     condition: b.Bound, *, decided: bool = False
 ) -> b.Bound:
-    """Return the condition that a pushed condition is true for all possible unknown values.
+    """Return the condition that a condition is true for all possible unknown values.
 
     A comparison without a value is false. If it compares pair numbers, its negation is false too.
 
@@ -161,7 +161,7 @@ def certain(  # noqa: PLR0911 - a case each
 
 
 def possible(condition: b.Bound) -> b.Bound:
-    """Return the condition that a pushed condition is true for some possible unknown values."""
+    """Return the condition that a condition is true for some possible unknown values."""
     match condition:
         case b.Operation("AND" | "OR", operands):
             return replace(condition, operands=tuple(map(possible, operands)))
@@ -176,7 +176,7 @@ def possible(condition: b.Bound) -> b.Bound:
 
 
 def undecided(condition: b.Bound) -> b.Bound | None:
-    """Return the condition that a pushed condition is possible but unknown. ``None`` means always known.
+    """Return the condition that a condition may be true, but is unknown. ``None`` means always known.
 
     It also holds if the condition is true and one of its parts is unknown.
     """

@@ -358,7 +358,10 @@ class SortKey:
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """Limit of ``number`` results for each value of ``per``. ``None`` means a limit for all results."""
+    """Limit of ``number`` results for each value of ``per``.
+
+    If ``per`` is ``None``, the limit is for all results.
+    """
 
     number: int
     per: Bound | str | None
