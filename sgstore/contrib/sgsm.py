@@ -131,7 +131,6 @@ def _check(found: str) -> None:
 
 
 def _place(text: str, error: SyntaxError) -> TextSpan:
-    """Return the position of a Python syntax error in the text."""
     before = text.split("\n")[: (error.lineno or 1) - 1]
     start = sum(len(line) + 1 for line in before) + max((error.offset or 1) - 1, 0)
     return TextSpan(min(start, len(text)), min(start, len(text)) + 1)

@@ -633,7 +633,6 @@ def _columns(items: Iterable[s.Item], names: SymbolTable) -> tuple[b.ReturnColum
 
 
 def _group_keys(columns: Iterable[b.ReturnColumn]) -> dict[b.Bound, str]:
-    """Return the grouping values, each with its column name."""
     plain = (one for one in columns if not b.is_counted(one.value))
     return {one.value: one.name for one in plain if not isinstance(one.value, b.Value)}
 

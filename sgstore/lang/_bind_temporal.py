@@ -680,14 +680,12 @@ def _with_own_names(
 
 
 def _entry(step: s.ScenarioStep) -> NamedPattern | None:
-    """Return the library pattern that a step names, or None."""
     name = normalize_name(step.name)
     like = (p for p in patterns().values() if normalize_name(p.name) == name)
     return patterns().get(step.name) or next(like, None)  # CutIn and cut_in are different patterns
 
 
 def _parameters_shipped(step: s.ScenarioStep) -> dict[str, str]:
-    """Return the parameters of a library pattern with their default texts."""
     entry = _entry(step)
     return {} if entry is None else {p.name: p.default for p in entry.parameters.values()}
 

@@ -360,7 +360,6 @@ def seconds_text(ns: str) -> str:
 
 
 def _class_text(abstraction: str, frame: str) -> str:
-    """Return the SQL of the class of a frame in an abstraction."""
     on = [f'"c"."frame_id" = {frame}."frame_id"', f'"c"."abstraction" = {literal(abstraction)}']
     classes = Select(['any_value("c"."class")'], ['"classes" AS "c"'], on)
     return f"({classes.text()})"

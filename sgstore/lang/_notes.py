@@ -96,7 +96,6 @@ def _texts(attribute: b.Bound, values: Iterable[b.Bound], scope: b.Scope) -> Ite
 
 
 def _type_of(kinds: b.Kinds) -> str:
-    """Return the attribute that ``type`` means for nodes of the given kinds."""
     if "lane" not in kinds.every:
         return "type_name"
     return "type" if kinds.every & entity_kinds() else "lane_type"

@@ -338,7 +338,6 @@ def _ufunc(name: str) -> Callable[..., Any]:
 
 
 def _of_texts(name: str) -> Callable[..., Any]:
-    """Return a text function of ``numpy.char`` by name."""
     return lambda *values: getattr(np.char, name)(*map(_texts, values))
 
 

@@ -700,7 +700,6 @@ class _IntervalStatement:
 
 
 def _column(leaf: Leaf) -> str:
-    """Return the column of a value in the matches."""
     return f"{_ROWS}.{quoted(column_of(leaf))}"
 
 
@@ -747,7 +746,6 @@ def _frame_columns() -> list[tuple[str, str]]:
 
 
 def _from_frames(select: Select, relation: str) -> None:
-    """Join a relation to the rows of its frames and traces."""
     select.join(nested(relation, ":rows"), [])
     select.join(f'"frame" AS {_FRAME}', [f'{_FRAME}."frame_id" = {_ROWS}."frame_id"'])
     select.join(f'"trace" AS {_TRACE}', [f'{_TRACE}."trace_id" = {_FRAME}."trace_id"'])

@@ -432,7 +432,6 @@ def _of_table(leaf: NodeAttribute) -> bool:
 
 
 def _ends(scope: Scope) -> set[str]:
-    """Return the nodes bound by the edges of a scope."""
     return {key for edge in scope.edges for key in (edge.src, edge.dst)}
 
 

@@ -269,6 +269,5 @@ def _value(of: b.Bound, *, injective: bool) -> Evaluate:
 
 
 def _absent(row: Binding, nodes: Iterable[str], edges: Iterable[str]) -> bool:
-    """True if at least one of the nodes and edges is absent."""
     bound = {**row.nodes, **row.edges}
     return any(bound.get(key) is None for key in (*nodes, *edges))

@@ -126,7 +126,6 @@ def _parameters_of(part: s.MatchClause, defined: Iterable[s.Define]) -> set[str]
 
 
 def _called(part: object) -> Iterator[str]:
-    """Yield the folded names that a part of a text calls."""
     return (
         normalize_name(one.name) for one in _walk(part) if isinstance(one, s.Call | s.ScenarioStep)
     )

@@ -308,7 +308,6 @@ def _exists(
 
 
 def _edges_of(condition: b.Bound) -> frozenset[str]:
-    """Return the keys of the edges used in a condition."""
     parts = (part for part in b.walk(condition))
     return frozenset(p.edge for p in parts if isinstance(p, b.EdgeRelation | b.EdgeAttribute))
 

@@ -244,7 +244,6 @@ def _of_frame(value: b.FrameAttribute) -> str:
 
 
 def _scopes(scope: b.Scope) -> Iterator[b.Scope]:
-    """Yield a scope and the scopes of all its blocks."""
     yield scope
     for block in _blocks(scope.where):
         yield from _scopes(block.scope)
@@ -633,7 +632,6 @@ def _name(view: FrameView, node: int) -> str:
 
 
 def _population(view: FrameView) -> str:
-    """Return the number of nodes of each kind, as text of the query language."""
     counts = Counter(attributes["kind"] for attributes in view.nodes.values())
     found = [(kind_label(kind), counts[kind]) for kind in KINDS if counts[kind]]
     return " AND ".join(f"COUNT {{(:{label})}} = {many}" for label, many in found)
