@@ -275,7 +275,7 @@ class Collection:
         limit: int = 10,
         each_trace: bool = False,
     ) -> list[SimilarFrames]:
-        """Frames like one that is given, as ``TRACE#SEQ`` or ``TRACE@12.3s``; see :meth:`sgstore.Store.like`.
+        """Return the frames most similar to a frame; see :meth:`sgstore.Store.like`.
 
         Raises
         ------
@@ -632,7 +632,7 @@ class PartedMatches(Tabular):
             yield graph_of_records(nodes, edges, **about)
 
     def intervals(self, *, bound: bool = False) -> Iterator[Interval]:
-        """Maximal runs of consecutive frames in which the same holds; see :meth:`sgstore.Matches.intervals`."""
+        """Yield maximal runs of frames with the same match; see :meth:`sgstore.Matches.intervals`."""
         form, width, result = "bound" if bound else "intervals", 8, self._ready.query.result
         names = parted(self._ready, form).columns[width:]
         most = result.limit if result.form == "intervals" else None

@@ -1,8 +1,8 @@
-"""Selection: which frames, clips or traces of a store to keep, and how good the choice is.
+"""Selection of frames, clips or traces of a store, with measures of its quality.
 
-``units`` says what is chosen or not and what it holds · ``choose`` chooses · ``cover`` and ``bounds`` find
-few sets that hold everything, and how few there must be · ``curve`` shows what is kept by how many, beside
-random order · ``splits`` makes parts that share no recording · ``locking`` makes a lock of it.
+``_units`` defines units and their elements. ``_choose`` has the strategies, splits and locks.
+``_cover`` and ``_sets`` find small sets of units that hold all elements, and lower bounds. Curves
+compare a selection with random order.
 """
 
 import lazy_loader

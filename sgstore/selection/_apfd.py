@@ -1,8 +1,8 @@
-"""Average percentage of faults detected (APFD): a number for how soon an order of cases finds failures.
+"""Average percentage of faults detected (APFD): measures how soon an order of cases finds failures.
 
-Rothermel, Untch, Chu and Harrold, "Prioritizing Test Cases for Regression Testing" (TSE 2001), where each
-failing case is a fault of its own: with failures at the places p of n cases, 1 - mean(p) / n + 1 / (2 n). In
-random order that is one half in the mean.
+Rothermel, Untch, Chu and Harrold, "Prioritizing Test Cases for Regression Testing" (TSE 2001), with
+each failing case as its own fault: with failures at the places p of n cases, 1 - mean(p) / n + 1 /
+(2 n). The mean of a random order is one half.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from sgstore.world import Bools, Floats
 
 SHARES: Final = (0.05, 0.1, 0.2)
-"""Parts of an order of which it is told how many failures are in them."""
+"""Shares of an order for which the found failures are reported."""
 
 _DRAWS: Final = 2_000
 
@@ -33,7 +33,7 @@ class FaultDetection:
     apfd : float
         Average percentage of faults detected, 0 … 1; one half is chance.
     low, high : float
-        Its interval of 95 %, by bootstrap over the failures.
+        Its 95 % interval, by bootstrap over the failures.
     found : dict of float to float
         Share of the failures in the first 5, 10 and 20 % of the cases.
     """
@@ -47,7 +47,7 @@ class FaultDetection:
 
     @property
     def said(self) -> str:
-        """All of it in a sentence."""
+        """Return all values in a sentence."""
         found = ", ".join(f"{self.found[s]:.0%} in the first {s:.0%}" for s in SHARES)
         return (
             f"APFD {self.apfd:.3f} ({self.low:.3f} to {self.high:.3f}; chance is 0.5): of {self.failures:,}"
@@ -61,7 +61,7 @@ def fault_detection(failed: Bools, seed: int = 0) -> FaultDetection:
     Parameters
     ----------
     failed : (N,) bool
-        Which cases fail, in their order.
+        Mask of failing cases, in their order.
     seed : int
         Random seed of the interval.
 
@@ -89,20 +89,20 @@ def fault_detection(failed: Bools, seed: int = 0) -> FaultDetection:
 
 
 def failure_curve(failed: Bools, points: int = 200) -> list[tuple[int, int, float, float]]:
-    """Failures in the first cases of an order.
+    """Return the failures in the first cases of an order.
 
     Parameters
     ----------
     failed : (N,) bool
         Outcomes of the cases, in their order.
     points : int
-        Most rows.
+        Greatest number of rows.
 
     Returns
     -------
     list of tuple
-        Cases, failures among them, their share of all failures, and as many cases' failures in random order, in
-        the mean.
+        Number of cases, failures among them, their share of all failures, and the mean number of
+        failures among as many cases in random order.
     """
     cases = np.unique(np.ceil(np.linspace(0, len(failed), points + 1)[1:]).astype(np.int64))
     found = np.cumsum(failed)[cases - 1]
@@ -114,5 +114,5 @@ def failure_curve(failed: Bools, points: int = 200) -> list[tuple[int, int, floa
 
 
 def _drawn(left: Floats, rng: np.random.Generator) -> float:
-    """The mean of as many failures, drawn with replacement."""
+    """Return the mean of an equal number of failures, drawn with replacement."""
     return float(left[rng.integers(0, len(left), len(left))].mean())

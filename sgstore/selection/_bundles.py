@@ -1,7 +1,8 @@
-"""Units of a collection, of which each bundle tells only those that a smallest selection can need.
+"""Units of a collection: each bundle reports only those that a minimal selection can need.
 
-Of units that hold the same classes the cheapest is enough. So a bundle tells one unit for each set of classes,
-with its frames, and how many units and frames it has; what is chosen, and its bounds, are those of all units.
+Of units with the same classes the cheapest is enough. Therefore a bundle reports one unit for each
+set of classes, with its frames, and its numbers of units and frames. The selection and its bounds
+are equal to those of all units.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class UnitsWished:
-    """Wish for units; the attributes are those of :class:`sgstore.selection.SelectionSpec`, as plain values."""
+    """Parameters of units; plain values of :class:`sgstore.selection.SelectionSpec`."""
 
     unit: str
     clip_s: float
@@ -39,20 +40,20 @@ class UnitsWished:
 def cheapest_units(
     chosen: ChosenFrames, whole: Collection, wish: UnitsWished
 ) -> tuple[Units, Holdings]:
-    """The cheapest unit of each set of classes in each bundle, and what they hold.
+    """Return the cheapest unit of each set of classes in each bundle, with their elements.
 
     Parameters
     ----------
     chosen : ChosenFrames
     whole : Collection
-        That they are of.
+        Collection of the frames.
     wish : UnitsWished
-        Clips of it share no frames.
+        Its clips share no frames.
 
     Raises
     ------
     AbstractionError, ConfigError
-        As of one store.
+        As for a single store.
     """
     asked: dict[str, Any] = dict.fromkeys(whole.bundles())
     if chosen.frame_id is not None:
@@ -88,7 +89,7 @@ def cheapest_units(
 
 
 def cheapest_in(store: Store, frames: list[int] | None, wish: dict[str, Any]) -> dict[str, Any]:
-    """The cheapest unit of each set of classes in a bundle, as plain values."""
+    """Return the cheapest unit of each set of classes in a bundle, as plain values."""
     how = UnitsWished(**wish)
     chosen = ChosenFrames("", store, None if frames is None else np.array(frames, np.int64))
     units = units_of(chosen, SelectionUnit(how.unit), how.clip_s, how.stride_s)
@@ -107,7 +108,7 @@ def cheapest_in(store: Store, frames: list[int] | None, wish: dict[str, Any]) ->
 
 
 def _classed(chosen: ChosenFrames, abstraction: str) -> Classed:
-    """The frames with their classes; what a bundle lacks is made anew, and not kept: it never changes."""
+    """Return the frames with their classes; missing classes are computed but not stored."""
     with working_folder("classes") as folder:
         part = write_coded(chosen.one_store.file, abstraction, folder / "classes.parquet")
         of = merged_classes([part])

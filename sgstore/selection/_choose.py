@@ -1,6 +1,6 @@
-"""Selection strategies, budgets, parts such as train and test, and locks of a selection.
+"""Selection strategies, budgets, splits such as train and test, and locks of a selection.
 
-A budget that is spent unit by unit; what units share is paid once.
+A budget is spent unit by unit; shared frames are paid once.
 """
 
 from __future__ import annotations
@@ -51,20 +51,20 @@ if TYPE_CHECKING:
 
 
 ROUNDING = 1 + 1e-12
-"""Sums of costs may be a hair above a budget that they meet."""
+"""Tolerance for rounded sums of costs that meet a budget."""
 
 
 @dataclass
 class BudgetTracker:
-    """Remainder of a budget, and the frames that were bought.
+    """Remainder of a budget, and the bought frames.
 
     Attributes
     ----------
     units : Units
     cost : (U,) float64
-        What each unit costs alone.
+        Cost of each unit alone.
     weights : (N,) float64 or None
-        What each frame costs, where units share frames.
+        Cost of each frame, if units share frames.
     bought : (N,) bool
     spent : float
     left : float
@@ -79,14 +79,14 @@ class BudgetTracker:
 
     @classmethod
     def of(cls, units: Units, measure: Measure, most: float = np.inf) -> BudgetTracker:
-        """Make a tracker of a budget of which nothing is spent."""
+        """Make a tracker of an unspent budget."""
         shared = units.overlap and measure != "units"
         weights = units.weights(measure) if shared else None
         nothing = np.zeros(len(units.frame_id), np.bool_)
         return cls(units, units.costs(measure), weights, nothing, 0.0, most * ROUNDING)
 
     def prices(self, some: Ints) -> Floats:
-        """Present price of each of some units; 0: all of it was bought with others."""
+        """Return the present price of units; 0 if all their frames are bought."""
         if self.weights is None:
             return self.cost[some]
         begin, end = self.units.begin[some].tolist(), self.units.end[some].tolist()
@@ -94,13 +94,13 @@ class BudgetTracker:
         return np.array([self.weights[own][~self.bought[own]].sum() for own in rows])
 
     def buy(self, one: int, price: float) -> None:
-        """Take a unit."""
+        """Buy a unit."""
         self.bought[self.units.begin[one] : self.units.end[one]] = True
         self.spent += price
         self.left -= price
 
     def fitting(self, order: Ints, most: float = np.inf) -> Ints:
-        """Buy units in order, up to so much; what does not fit any more, or brings no frame, is passed over."""
+        """Buy units in order, up to a limit; skip units that do not fit or add no frames."""
         found: list[int] = []
         end = max(self.left - most * ROUNDING, 0.0)
         cost = self.cost[order]
@@ -118,12 +118,12 @@ class BudgetTracker:
         return np.array(found, np.int64)
 
 
-# Which units are selected: all, few that keep everything, some of each class or stratum, the rarest first
-# ------------------------------------------------------------------------------------------------
+# Strategies: all units, a minimal set for all elements, some of each class or stratum, or the
+# rarest first.
 
 
 class Strategy(StrEnum):
-    """Strategy by which units are chosen."""
+    """Strategy of a selection."""
 
     every = "every"
     minimal = "minimal"
@@ -145,29 +145,30 @@ class SelectionSpec:
         Length of clips; s.
     abstraction : str
     combos : int
-        0: classes are to be kept; k: combinations of k features.
+        0: the elements are classes; k: combinations of k features.
     of_ego : bool
-        Whether only features of the ego count, and of lanes by how they lie to it.
+        True if only features of the ego, and of lanes relative to it, count.
     sequences : int
-        k: sequences of k manoeuvres are to be kept, and no classes; 0: none.
+        k: the elements are sequences of k manoeuvres instead of classes; 0: no sequences.
     manoeuvres : tuple of str
-        As :func:`sgstore.coverage.manoeuvres_named` takes them; by default those of the library.
+        As in :func:`sgstore.coverage.manoeuvres_named`; by default those of the library.
     within_s : float
-        Longest time from the first manoeuvre of a sequence to the last; s.
+        Greatest time from the first manoeuvre of a sequence to the last; s.
     each : int
-        In how many units each class is to be; of each stratum how many are taken, 0: as the budget allows.
+        Number of units per class; or number of units per stratum, 0 to use the budget.
     by : str
-        Expression whose value is the stratum of a frame. Of the weakest: a number whose least value counts, a
-        condition, whose robustness is one, or a ``CHECK`` with ``ROBUSTNESS``.
+        Expression for the stratum of a frame. For the strategy weakest: a number whose least value
+        counts, a condition, whose robustness counts, or a ``CHECK`` with ``ROBUSTNESS``.
     alpha : float
-        A stratum gets a share of the budget as the power of its size: 1 as it is, 0 the same for all.
+        Exponent of the stratum size for its share of the budget: 1 is proportional, 0 is equal
+        shares.
     budget : Budget or None
     objective : Measure
-        What is to be as little as possible.
+        Cost measure to minimise.
     seed : int
     stride_s : float or None
-        From the beginning of one clip to that of the next; s. If that is less than their length, clips overlap.
-        ``None``: the length.
+        Time from the start of one clip to the start of the next; s. Clips overlap if it is below
+        their length. ``None`` means the length.
     """
 
     strategy: Strategy = Strategy.every
@@ -188,7 +189,7 @@ class SelectionSpec:
     within_s: float = WITHIN_S
 
     def __post_init__(self) -> None:
-        """Refuse what has no meaning.
+        """Reject inconsistent values.
 
         Raises
         ------
@@ -220,7 +221,7 @@ class SelectionSpec:
 
     @property
     def one_of_alike(self) -> bool:
-        """Tell whether of units that hold the same classes one is enough to choose from, the cheapest."""
+        """True if one unit, the cheapest, is enough of units with the same classes."""
         shared = self.unit is SelectionUnit.clip and (self.stride_s or math.inf) < self.clip_s
         least = self.strategy is Strategy.minimal or (
             self.strategy is Strategy.per_class and self.each == 1
@@ -229,12 +230,12 @@ class SelectionSpec:
 
     @property
     def wished(self) -> UnitsWished:
-        """The units, as a bundle is asked for them."""
+        """Return the parameters of units for a bundle."""
         least = self.abstraction, self.objective, self.seed
         return UnitsWished(self.unit.value, self.clip_s, self.stride_s, *least)
 
     def as_dict(self, query: str) -> dict[str, Any]:
-        """All of it as plain values, as a lock says it."""
+        """Return all values as plain values for a lock."""
         cover = self.strategy in {Strategy.minimal, Strategy.per_class, Strategy.rarest}
         told = {
             "sequences": self.sequences,
@@ -261,24 +262,25 @@ class SelectionSpec:
 
 @dataclass(frozen=True)
 class Selection:
-    """Units that were selected.
+    """Selected units.
 
     Attributes
     ----------
     spec : SelectionSpec
     units : Units
     picked : int64
-        Numbers of units, in the order in which they were chosen.
+        Indices of units, in the order of selection.
     holdings : Holdings or None
-        What units hold, if that was asked.
+        Elements of units, if they were needed.
     result : dict
-        What is known of the choice: ``cost``, ``bound``, …; plain values, the same for the same recordings.
+        Facts about the selection: ``cost``, ``bound``, …; plain values, the same for the same
+        recordings.
     said : list of str
-        The same in sentences.
+        The same facts as sentences.
     strata : dict
-        Of each stratum, by its value: units, and units that were chosen.
+        Stratum → number of units, and number of selected units.
     values : (U,) float64 or None
-        Of each unit the least value by which it was chosen; NaN: not known.
+        Least value of each unit for the selection; NaN if unknown.
     """
 
     spec: SelectionSpec
@@ -297,11 +299,11 @@ def select(chosen: ChosenFrames, spec: SelectionSpec) -> Selection:
     Raises
     ------
     AbstractionError
-        There is no such abstraction.
+        The abstraction is unknown.
     ConfigError
-        What is wished for has no meaning, or is too large to be gone through.
+        The specification is inconsistent, or the problem is too large.
     QueryError, ExportError
-        The expression of the strata is none.
+        The expression of the strata is invalid.
     """
     if spec.one_of_alike and not isinstance(chosen.store, Store):
         units, held = cheapest_units(chosen, chosen.store, spec.wished)
@@ -342,14 +344,14 @@ def _selected(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
 
 
 def _held(spec: SelectionSpec, units: Units) -> Holdings:
-    """What the units of a selection hold: classes, combinations of features, or sequences of manoeuvres."""
+    """Return the elements of units: classes, combinations of features, or sequences of manoeuvres."""
     if spec.sequences:
         return sequence_holdings(units, spec.sequences, spec.manoeuvres, spec.within_s)
     return holdings(units, spec.abstraction, spec.combos, of_ego=spec.of_ego)
 
 
 def _every(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
-    """All units, or units at random until the budget is used up."""
+    """Select all units, or random units until the budget is used up."""
     picked = np.arange(len(units))
     if spec.budget is not None:
         tracker = BudgetTracker.of(units, spec.budget.measure, spec.budget.most)
@@ -424,7 +426,7 @@ def _said_of(held: Holdings, units: Units, spec: SelectionSpec) -> dict[str, Any
 
 
 def _met(held: Holdings, units: Units, picked: Ints) -> int:
-    """Number of elements that some units hold."""
+    """Return the number of elements that some units hold."""
     taken = np.zeros(len(units), np.bool_)
     taken[picked] = True
     return int(held.weight[np.unique(held.pairs[1][taken[held.pairs[0]]])].sum())
@@ -439,7 +441,7 @@ def _above(cost: float, bound: float) -> str:
 
 
 def _rarest(spec: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> Selection:
-    """For each class that no unit has yet, the rarest first, the unit that brings most besides."""
+    """Cover the rarest class first, each time with the unit that adds most other uncovered classes."""
     measure = spec.budget.measure if spec.budget else spec.objective
     tracker = BudgetTracker.of(units, measure, spec.budget.most if spec.budget else np.inf)
     family = held.family(units, tracker.cost, 1, rank)
@@ -498,7 +500,7 @@ def _stratified(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
 def _allotted(
     order: Ints, stratum: Ints, tracker: BudgetTracker, shares: Floats, rank: Ints
 ) -> Ints:
-    """Each stratum up to its share; then, of what is left of the budget, units at random."""
+    """Select units of each stratum up to its share, then random units for the rest of the budget."""
     within_share: list[Ints] = []
     used = np.zeros(len(shares))
     for number, share in enumerate(shares.tolist()):
@@ -506,7 +508,8 @@ def _allotted(
         within_share.append(tracker.fitting(order[stratum[order] == number], share))
         used[number] = tracker.spent - before
     picked = np.concatenate([np.zeros(0, np.int64), *within_share])
-    # Shares are rarely a whole number of units: the rest goes to those strata that are furthest below theirs.
+    # A share is rarely a whole number of units: the rest goes to the strata furthest below their
+    # share.
     others = np.setdiff1d(order, picked)
     lack = (shares - used)[stratum[others]] / tracker.cost[others]
     others = others[np.lexsort((rank[others], -lack))]
@@ -515,7 +518,7 @@ def _allotted(
 
 
 def _weakest(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
-    """Units in the order of their least value, unknown ones last, as far as the budget goes."""
+    """Select units in the order of their least value, unknown ones last, within the budget."""
     value = least_of_check(units, spec.by) if is_check(spec.by) else least_values(units, spec.by)
     order = np.lexsort((rank, np.where(np.isnan(value), np.inf, value)))
     if spec.budget is not None:
@@ -535,7 +538,7 @@ def _weakest(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
 
 
 def _strata(spec: SelectionSpec, units: Units) -> tuple[Ints, list[str]]:
-    """The stratum of each unit, the value that most of its frames have; and all values."""
+    """Return the stratum of each unit (the most frequent value of its frames), and all values."""
     from sgstore.exporters import Labels
 
     asked = np.flatnonzero(units.asked)
@@ -557,7 +560,7 @@ def _strata(spec: SelectionSpec, units: Units) -> tuple[Ints, list[str]]:
 
 
 def _value(value: Any) -> str:
-    """A value as a stratum is called."""
+    """Return the name of a value's stratum."""
     if value is None:
         return "unknown"
     if isinstance(value, bool):
@@ -566,13 +569,14 @@ def _value(value: Any) -> str:
 
 
 def listed(selection: Selection) -> ReportTable:
-    """The units that were chosen, in the order in which they were.
+    """Return a table of the selected units, in the order of selection.
 
     Returns
     -------
     ReportTable
-        ``unit`` (``TRACE#FIRST-LAST``, as a lock calls it), ``frames``, and, if it was asked what units hold,
-        ``holds`` and ``new``: of these, how many no unit before it has. Of the weakest: ``least``.
+        ``unit`` (``TRACE#FIRST-LAST``, as in a lock), ``frames``, and, if elements are known,
+        ``holds`` and ``new``: the number of elements, and of those without an earlier unit. For the
+        strategy weakest: ``least``.
     """
     units, held = selection.units, selection.holdings
     names = names_of_units(units, selection.picked)
@@ -592,7 +596,7 @@ def listed(selection: Selection) -> ReportTable:
 
 
 def names_of_units(units: Units, picked: Ints) -> list[str]:
-    """Units as a lock calls them: ``TRACE#FIRST-LAST``, or ``TRACE#SEQ`` of a single frame."""
+    """Return the names of units as in locks: ``TRACE#FIRST-LAST``, or ``TRACE#SEQ`` for a single frame."""
     first, last = units.first[picked], units.last[picked]
     names = names_of(units.chosen.store, first)
     for place in np.flatnonzero(first != last).tolist():
@@ -600,16 +604,17 @@ def names_of_units(units: Units, picked: Ints) -> list[str]:
     return names
 
 
-# Parts of a selection that share no recording, such as train and test; and what one knows of another ----
+# Splits of a selection without common recordings, such as train and test, and their overlap in
+# content.
 
 
 def parse_split(text: str) -> dict[str, float]:
-    """``train=0.8,test=0.2`` as shares by name.
+    """Parse ``train=0.8,test=0.2`` into shares by name.
 
     Raises
     ------
     ConfigError
-        It is not that, or the shares are not 1 together.
+        The text is invalid, or the shares do not add up to 1.
     """
     found: dict[str, float] = {}
     for part in text.split(","):
@@ -631,14 +636,14 @@ def parse_split(text: str) -> dict[str, float]:
 
 
 def split(selection: Selection, shares: dict[str, float]) -> dict[int, str]:
-    """The part that each selected unit belongs to; all that comes from one recording belongs to one.
+    """Return the split of each selected unit; all units of one recording have the same split.
 
-    The recordings with the most selected frames come first, each goes to the part that lacks most.
+    Recordings with most selected frames come first; each goes to the split that lacks most.
 
     Returns
     -------
     dict
-        Number of unit → name of its part.
+        Index of unit → name of its split.
     """
     units = selection.units
     recording = recordings_of(units.chosen.store)
@@ -664,14 +669,14 @@ def _drawn(digest: str, seed: int) -> bytes:
 def split_table(
     selection: Selection, parts: dict[int, str], shares: dict[str, float]
 ) -> ReportTable:
-    """Table of parts: their content, and the share of it that each other part has too.
+    """Return a table of the splits: their content, and the share of it that other splits also have.
 
     Returns
     -------
     ReportTable
-        ``split``, ``units``, ``frames``, ``share`` (of the frames), ``wanted``, ``recordings``, ``classes``;
-        and for each other part ``classes_in_…`` and ``frames_in_…``: the share of the classes, and of the
-        frames, whose class occurs there, too. ``None``: of nothing.
+        ``split``, ``units``, ``frames``, ``share`` (of the frames), ``wanted``, ``recordings``,
+        ``classes``; and for each other split ``classes_in_…`` and ``frames_in_…``: the share of the
+        classes, and of the frames with classes, that also occur there. ``None`` for an empty split.
     """
     units = selection.units
     of = classed(units.chosen, selection.spec.abstraction)
@@ -720,26 +725,26 @@ def locked_selection(
     payloads: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Lock:
-    """The lock of a selection.
+    """Return the lock of a selection.
 
     Parameters
     ----------
     selection : Selection
     query : str
-        The query whose frames were selected from; empty: all.
+        Query of the frames that were selected from; empty means all frames.
     parts : mapping of int to str, optional
-        The part that each unit belongs to: :func:`split`.
+        Split of each unit: :func:`split`.
     parameters : mapping, optional
         Values of ``$name`` in the query.
     payloads : bool
-        Whether the messages of the recordings count, too; then they must be there.
+        True to include the messages of the recordings, which must then exist.
     progress : callable, optional
-        Called with the number of cases done and of all.
+        Called with the number of finished cases and the total.
 
     Raises
     ------
     TraceError
-        A recording is gone, was replaced, or is damaged.
+        A recording is missing, was replaced, or is damaged.
     """
     units = selection.units
     wanted = units.cases(selection.picked, parts)
@@ -751,34 +756,34 @@ def locked_selection(
 # Elements kept after each unit of a selection, beside units in random order -----------------------
 
 POINTS: Final = 60
-"""Rows of a curve."""
+"""Number of rows of a curve."""
 
 ORDERS: Final = 1_000
-"""Random orders that are gone through, fewer where units hold much."""
+"""Number of random orders; fewer for units with many elements."""
 
 _WORK: Final = 30_000_000
-"""Memberships that random orders may look at, all together."""
+"""Greatest number of memberships in all random orders together."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Elements that so many units keep.
+    """Elements kept by the first units of a selection.
 
     Attributes
     ----------
     table : ReportTable
-        ``units``, ``kept`` by those that were selected first, ``share`` of all, and ``at_random``: how much so
-        many units drawn at random keep in the mean, exactly.
+        ``units``, ``kept`` by the first selected ones, ``share`` of all, and ``at_random``: exact
+        mean for as many random units.
     needed : int
-        Units that were selected until nothing more is kept.
+        Number of selected units until all elements are kept.
     at_random : float
-        How many units in random order it takes, in the mean, to keep as much as the selection does in the end:
-        over ``orders`` orders.
+        Mean number of units in random order that keep as much as the complete selection, over
+        ``orders`` orders.
     spread : float
-        Their standard deviation from one order to the next.
+        Standard deviation of this number between orders.
     orders : int
     at_random_s : float
-        What as many cost together, where clips overlap: s, in the mean.
+        Mean total time of as many random units, for overlapping clips; s.
     """
 
     table: ReportTable
@@ -790,14 +795,14 @@ class Curve:
 
 
 def curve(selection: Selection, points: int = POINTS) -> Curve:
-    """The curve of a selection that keeps classes or combinations.
+    """Return the curve of a selection by classes or combinations.
 
     Raises
     ------
     ConfigError
-        It was not chosen by what it keeps.
+        The strategy does not use elements.
     """
-    if selection.units.others:  # random orders are of all units
+    if selection.units.others:  # random orders need all units
         selection = _of_all_units(selection)
     held, units = selection.holdings, selection.units
     if not len(units):
@@ -839,7 +844,7 @@ def curve(selection: Selection, points: int = POINTS) -> Curve:
 
 
 def _of_all_units(selection: Selection) -> Selection:
-    """The same selection among all units, of which bundles left some out."""
+    """Return the same selection among all units, including those that bundles left out."""
     spec, some = selection.spec, selection.units
     units = units_of(some.chosen, spec.unit, spec.clip_s, spec.stride_s)
     picked = np.searchsorted(units.first, some.first[selection.picked])
@@ -853,14 +858,14 @@ def _points(most: int, points: int) -> Ints:
 
 
 def random_need(units: Units, held: Holdings, wanted: int, seed: int) -> tuple[Floats, float]:
-    """Number of units in random order that it takes to hold so many elements.
+    """Return the numbers of units in random order that hold as many elements.
 
     Returns
     -------
     needed : (K,) float64
-        Of K orders.
+        One number for each of K orders.
     seconds : float
-        How long these are together in the mean, if units overlap; else 0.
+        Mean total time, if units overlap; else 0.
     """
     if not wanted:
         return np.zeros(1), 0.0

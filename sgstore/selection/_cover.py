@@ -1,13 +1,13 @@
 """Set cover: reduction, greedy choice, bounds, and overlapping units.
 
-Reduction leaves out what need not be decided: sets that must be taken, elements and sets that are superfluous;
-and it finds parts that have nothing to do with one another.
+Reduction removes clear decisions: required sets, and redundant elements and sets. It also splits
+the problem into independent parts.
 
-An element is superfluous if another one is in no other sets than it is: whoever holds that one holds it, too. A
-set is superfluous if another one holds all that it holds and costs no more. Each such step may make room for
-another, so all are taken again until nothing changes. Of clips that begin anywhere on an axis of time hardly
-anything is left then: what comes once is in consecutive clips, and such a cover is decided by these steps
-alone (its matrix has consecutive ones).
+An element is redundant if all sets of another element contain it. A set is redundant if another set
+contains all its elements and does not cost more. A step can enable others; therefore the steps
+repeat until nothing changes. For clips at any places on a time axis almost nothing remains: an
+occurrence is in consecutive clips, and these steps solve such covers completely (the matrix has
+consecutive ones).
 
 Source. Garfinkel and Nemhauser, "Integer Programming" (1972), ch. 8.
 """
@@ -31,25 +31,27 @@ if TYPE_CHECKING:
 
 
 ROUNDING: Final = 1e-7
-"""Share of a cost that is due to rounding."""
+"""Rounding error as a share of a cost."""
 
 _COMPARISONS: Final = 100_000_000
-"""Steps of comparing, all together: what is found superfluous by then is dropped, the rest stays."""
+"""Greatest number of comparison steps; redundant items found within it are removed."""
 
 _BATCH: Final = 2_000_000
 """Pairs that are compared at once."""
 
 _TABLE: Final = 1 << 26
-"""Truth values that are kept to look up what is made of what."""
+"""Greatest size of a look-up table of memberships."""
 
 
 def reduced(family: SetFamily) -> tuple[Ints, list[tuple[SetFamily, Ints]]]:
-    """Sets that every answer may be taken to hold; and what is left, in parts, with their sets."""
+    """Return the required sets, and the remaining parts with their set indices."""
     need, alive = family.need.copy(), np.ones(len(family), np.bool_)
     forced = np.zeros(len(family), np.bool_)
     wanted = need > 0
     work, size = _COMPARISONS, -1
-    if need.max(initial=0) <= 1:  # at first: bundles of a collection have left out as much
+    if (
+        need.max(initial=0) <= 1
+    ):  # first, because bundles of a collection have already left out as much
         alive &= cheapest_alike(family)
     while size != (size := int(alive.sum()) + int(wanted.sum())):
         _force(family, need, alive, forced)
@@ -64,14 +66,14 @@ def reduced(family: SetFamily) -> tuple[Ints, list[tuple[SetFamily, Ints]]]:
 
 
 def cheapest_alike(family: SetFamily) -> Bools:
-    """(S,): of sets that hold the same only the cheapest: enough where each element is needed once."""
+    """Return a mask (S,) of the cheapest set among equal ones; enough if each element is needed once."""
     alive = np.ones(len(family), np.bool_)
     _drop_same_sets(family, alive, np.ones(len(family.need), np.bool_))
     return alive & (np.diff(family.starts) > 0)
 
 
 def _force(family: SetFamily, need: Ints, alive: Bools, forced: Bools) -> None:
-    """Take all sets of elements that are in no more sets than they need."""
+    """Take all sets of elements that have no more sets than needed."""
     while True:
         rows = alive[family.set_of]
         often = np.bincount(family.members[rows], minlength=len(need))
@@ -86,7 +88,7 @@ def _force(family: SetFamily, need: Ints, alive: Bools, forced: Bools) -> None:
 
 
 def _drop_same_elements(family: SetFamily, need: Ints, alive: Bools, wanted: Bools) -> None:
-    """Of elements that are in the same sets only the one that needs most counts."""
+    """Keep one of the elements with equal sets: the one with the greatest need."""
     rows = alive[family.set_of] & wanted[family.members]
     key = _keys(family.members[rows], family.set_of[rows], len(need), len(family))
     elements = np.flatnonzero(wanted)
@@ -95,7 +97,7 @@ def _drop_same_elements(family: SetFamily, need: Ints, alive: Bools, wanted: Boo
 
 
 def _drop_same_sets(family: SetFamily, alive: Bools, wanted: Bools) -> None:
-    """Of sets that hold the same only the cheapest counts."""
+    """Keep the cheapest of the sets with equal elements."""
     rows = alive[family.set_of] & wanted[family.members]
     key = _keys(family.set_of[rows], family.members[rows], len(family), len(wanted))
     sets = np.flatnonzero(alive)
@@ -104,11 +106,11 @@ def _drop_same_sets(family: SetFamily, alive: Bools, wanted: Bools) -> None:
 
 
 def _keys(of: Ints, what: Ints, size: int, things: int) -> tuple[Ints, Ints]:
-    """Two numbers for each set of things, 106 bits together: equal where the sets are."""
+    """Return a hash of 106 bits for each set, as two numbers: equal for equal sets."""
     words = np.random.Generator(np.random.PCG64(20_24)).integers(1 << 31, size=(2, 2, things))
     found: list[Ints] = []
     for low, high in words:
-        # Sums of numbers below 2³¹ are exact in floating point, if there are below 2²² of them.
+        # Sums of numbers below 2³¹ are exact in floating point for fewer than 2²² of them.
         first = np.bincount(of, low[what], size).astype(np.int64)
         second = np.bincount(of, high[what], size).astype(np.int64)
         found.append(first * (1 << 31) ^ second)
@@ -124,7 +126,7 @@ def _repeated(*keys: Ints) -> Bools:
 def _drop_larger_elements(
     family: SetFamily, need: Ints, alive: Bools, wanted: Bools, most: int
 ) -> int:
-    """Drop elements that are in all sets that another one is in. Returns how many steps that took."""
+    """Drop elements whose sets include all sets of another element; return the number of steps."""
     rows = alive[family.set_of] & wanted[family.members]
 
     def superfluous(small: Ints, large: Ints) -> Ints:
@@ -138,7 +140,7 @@ def _drop_larger_elements(
 
 
 def _drop_smaller_sets(family: SetFamily, alive: Bools, wanted: Bools, most: int) -> int:
-    """Drop sets that another one holds for no more. Returns how many steps that took."""
+    """Drop sets that a set of equal or lower cost contains; return the number of steps."""
     rows = alive[family.set_of] & wanted[family.members]
 
     def superfluous(small: Ints, large: Ints) -> Ints:
@@ -159,27 +161,27 @@ def _contained(
     superfluous: Callable[[Ints, Ints], Ints],
     most: int,
 ) -> tuple[Bools, int]:
-    """Find things that are superfluous because others contain them, or they contain others.
+    """Find items that are redundant because of containment.
 
     Parameters
     ----------
     one, other : (M,) int64
-        Things, and what each is made of; no two of the same.
+        Items, and their components; without duplicates.
     ones, others : int
-        How many of each there may be.
+        Numbers of possible items and components.
     superfluous : callable
-        Things that are contained in others, and these → those of them that are superfluous.
+        Function from pairs of a contained and a containing item to the redundant items.
     most : int
-        Steps of comparing.
+        Greatest number of comparison steps.
 
     Returns
     -------
     gone : (ones,) bool
     work : int
-        Steps that it took.
+        Number of steps.
     """
     gone, done = np.zeros(ones, np.bool_), np.zeros(ones, np.bool_)
-    # What is rare tells things apart: it is looked at first.
+    # Rare components distinguish items best: they are compared first.
     common = np.bincount(other, minlength=others)
     rare = np.empty(others, np.int64)
     rare[np.argsort(common, kind="stable")] = np.arange(others)
@@ -203,9 +205,9 @@ def _contained(
 def _compared(
     one: Ints, other: Ints, sizes: tuple[int, int], done: Bools, batch: int
 ) -> tuple[Ints, tuple[Ints, Ints]]:
-    """Some things that are not done, the smallest first; each with all that may contain it.
+    """Return some pending items, the smallest first, each with possible containing items.
 
-    What contains a thing has all that it is made of: also the first of that, which hardly any others have.
+    A containing item has all components of the item, also its first, which is the rarest.
     """
     many = np.bincount(one, minlength=sizes[0])
     common = np.bincount(other, minlength=sizes[1])
@@ -226,13 +228,13 @@ def _compared(
 def _holding(
     key: Ints, sizes: tuple[int, int], pairs: tuple[Ints, Ints], most: int
 ) -> tuple[Ints, Ints, int]:
-    """Those pairs whose second thing has all that the first one is made of; and how many steps that took.
+    """Return the pairs whose second item has all components of the first, and the number of steps.
 
-    Pairs share the first of it already. What was not found out within so many steps is not among them.
+    All pairs share the first component. Pairs that are undecided within the limit are excluded.
     """
     small, large = pairs
     starts = np.searchsorted(key, np.arange(sizes[0] + 1) * sizes[1])
-    # Looked up in a table as long as there is room for one.
+    # A table is used if there is room for it.
     table = np.zeros(sizes[0] * sizes[1] if sizes[0] * sizes[1] <= _TABLE else 0, np.bool_)
     if len(table):
         table[key] = True
@@ -257,7 +259,7 @@ def _holding(
 def _parts(
     family: SetFamily, need: Ints, alive: Bools, wanted: Bools
 ) -> list[tuple[SetFamily, Ints]]:
-    """Remaining sets, as families that share no element, the one with the first set first."""
+    """Return the remaining sets as independent families, ordered by first set."""
     rows = alive[family.set_of] & wanted[family.members]
     sets, members = family.set_of[rows], family.members[rows]
     group = _joined(sets, members, len(family), len(need))[sets]
@@ -279,10 +281,10 @@ def _parts(
 
 
 def _joined(sets: Ints, members: Ints, many: int, elements: int) -> Ints:
-    """(many,): of each set the first one that it has to do with, by elements that they share, and so on."""
+    """Return the first set that each set is connected with through shared elements, (many,)."""
     first = np.arange(many)
     while True:
-        # Of each element the first set that is known; what is first of its sets learns of it, and all of these.
+        # Propagate the least set number through elements and sets.
         least = np.full(elements, many)
         np.minimum.at(least, members, first[sets])
         found = first.copy()
@@ -295,35 +297,34 @@ def _joined(sets: Ints, members: Ints, many: int, elements: int) -> Ints:
 
 
 # Bounds of set covers from below ----------------------------------------------------------------
-# A price for each element: if no set costs less than the prices of its elements, no cover costs less than all
-# prices together (the dual of the linear programme). Any prices at all give a bound too, if what sets cost less
-# than their elements is taken off (Lagrange). Prices are found by steps along subgradients; they also suggest
-# covers.
-#
-# Sources. Held, Wolfe, Crowder, "Validation of subgradient optimization", Mathematical Programming 6 (1974);
-# Beasley, "A Lagrangian heuristic for set-covering problems", Naval Research Logistics 37 (1990); Caprara,
-# Fischetti, Toth, "A heuristic method for the set covering problem", Operations Research 47 (1999).
+# Each element gets a price. If no set costs less than the prices of its elements, no cover costs
+# less than the sum of all prices (the dual of the linear programme). Arbitrary prices also give a
+# bound, after a correction for sets cheaper than their elements (Lagrange). Subgradient steps find
+# the prices; they also suggest covers. Sources: Held, Wolfe, Crowder, "Validation of subgradient
+# optimization", Mathematical Programming 6 (1974); Beasley, "A Lagrangian heuristic for
+# set-covering problems", Naval Research Logistics 37 (1990); Caprara, Fischetti, Toth, "A heuristic
+# method for the set covering problem", Operations Research 47 (1999).
 
 ROUNDS: Final = 400
-"""Steps along subgradients at most."""
+"""Greatest number of subgradient steps."""
 
 PATIENCE: Final = 20
-"""Steps without a better bound after which they become half as long."""
+"""Steps without a better bound before the step length is halved."""
 
 TRIES: Final = 10
-"""Every so many steps the prices suggest a cover."""
+"""Interval of steps after which the prices suggest a cover."""
 
 _MEMBERSHIPS: Final = 200_000_000
-"""Memberships that all steps may look at together: fewer steps where there are very many."""
+"""Greatest number of memberships in all steps together; very large problems get fewer steps."""
 
 
 def bounded(family: SetFamily, cover: Ints) -> tuple[float, Ints, Floats]:
-    """A bound from below, and a cover at most as dear as a given one.
+    """Return a lower bound, and a cover that costs at most as much as the given one.
 
     Parameters
     ----------
     family : SetFamily
-        Each element needs at least one set, and is in as many as it needs.
+        Each element needs at least one set, and has enough sets.
     cover : int64
 
     Returns
@@ -331,7 +332,7 @@ def bounded(family: SetFamily, cover: Ints) -> tuple[float, Ints, Floats]:
     low : float
     cover : int64
     prices : (E,) float64
-        Those of the elements that give the bound.
+        Prices of the elements that give the bound.
     """
     set_of, need, cost = family.set_of, family.need, family.cost
     often = np.diff(family.starts)
@@ -367,13 +368,13 @@ def bounded(family: SetFamily, cover: Ints) -> tuple[float, Ints, Floats]:
 
 
 def _suggested(family: SetFamily, left: Floats) -> Ints:
-    """A cover of the sets that cost least beyond the prices of their elements."""
+    """Return a cover from the sets with the least cost above the prices of their elements."""
     order = np.lexsort((family.rank, left / np.maximum(np.diff(family.starts), 1)))
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
     of_element = np.lexsort((place[family.set_of], family.members))
     starts, _ = family.by_element()
-    # Of each element the sets that come first in this order, as many as it needs.
+    # For each element the first sets in this order, as many as it needs.
     within = np.arange(len(of_element)) - starts[family.members[of_element]]
     first = within < family.need[family.members[of_element]]
     chosen = np.unique(family.set_of[of_element[first]])
@@ -381,37 +382,38 @@ def _suggested(family: SetFamily, left: Floats) -> Ints:
 
 
 # Covers by HiGHS, a solver of integer programmes (the extra [solver]) ----------------------------
-# It finds covers that the greedy choice misses, and proves that there is none cheaper. Without it, the greedy
-# choice and the bound of prices stand as they are.
+# The solver finds covers that the greedy choice misses, and proves optimality. Without it, the
+# greedy choice and the price bound remain.
 
 NODES: Final = 2_000
-"""Nodes of branch and bound, in all parts together: counted, so that answers are the same everywhere."""
+"""Branch-and-bound nodes in all parts together: counted, so that results are the same on every machine."""
 
 LARGEST: Final = 100_000
-"""Most memberships of a part that is given to the solver: of larger ones the first relaxation takes minutes."""
+"""Greatest number of memberships of a part for the solver: the first relaxation of larger parts
+takes minutes."""
 
 SECONDS: Final = 20.0
-"""Time for one part at most: a guard against relaxations that do not end; nodes are used up long before."""
+"""Time limit of a part: guards against endless relaxations; the node limit is usually reached earlier."""
 
 _LOOK_S: Final = 0.1
-"""How often to look for signals while it solves; s."""
+"""Interval for signal checks during solving; s."""
 
 
 def has_solver() -> bool:
-    """Return true if HiGHS is installed."""
+    """True if HiGHS is installed."""
     return find_spec("highspy") is not None
 
 
 def improved(family: SetFamily, cover: Ints, nodes: int) -> tuple[Ints, float, int]:
-    """Return a cover at most as dear as a given one, a bound from below, and the nodes that were looked at.
+    """Return a cover that costs at most as much as the given one, a lower bound, and the used nodes.
 
     Parameters
     ----------
     family : SetFamily
-        Each element is in as many sets as it needs.
+        Each element has enough sets.
     cover : int64
     nodes : int
-        Most nodes of branch and bound. Where nothing is proven the bound is 0.
+        Greatest number of branch-and-bound nodes. Without a proof the bound is 0.
     """
     if nodes <= 0 or len(family.members) > LARGEST or not has_solver():
         return cover, 0.0, 0
@@ -447,7 +449,7 @@ def improved(family: SetFamily, cover: Ints, nodes: int) -> tuple[Ints, float, i
 
 
 def _silent() -> Any:
-    """Return a solver that writes nothing: since version 1.15 a new one writes its name to stdout."""
+    """Return a silent solver: since version 1.15 a new solver prints its name to stdout."""
     import highspy  # pyright: ignore[reportMissingImports, reportMissingTypeStubs]
 
     class Silent(highspy.Highs):
@@ -459,8 +461,8 @@ def _silent() -> Any:
 
 
 def _run(solver: Any) -> None:
-    """Solve in a thread, so that whatever a handler of signals raises meanwhile ends it."""
-    # All solvers of a process share one lock; one that was interrupted holds it until it has stopped.
+    """Solve in a thread, so that an exception from a signal handler stops it."""
+    # All solvers of a process share one lock; an interrupted solver holds it until it stops.
     while not solver.wait(_LOOK_S)[0]:
         pass
     solver.HandleUserInterrupt = True
@@ -474,7 +476,7 @@ def _run(solver: Any) -> None:
 
 
 def _programme(family: SetFamily) -> Any:
-    """Return the integer programme of a cover: 0 or 1 for each set, a row for each element."""
+    """Return the integer programme of a cover: a binary variable per set, a row per element."""
     import highspy  # pyright: ignore[reportMissingImports, reportMissingTypeStubs]
 
     sets, elements = len(family), len(family.need)
@@ -492,30 +494,28 @@ def _programme(family: SetFamily) -> Any:
     return made
 
 
-# Set cover: few sets, or cheap ones, that together hold every element as often as is asked ------
-# What must be taken is taken, what is superfluous is dropped, what is left falls into parts that have nothing
-# to do with one another. Each part is covered greedily and bounded from below; a part whose bound is not met is
-# given to HiGHS, if that is installed. So the answer is exact where that is
-# cheap, and beside it stands how far from the best it can be at most.
-#
-# Source. Under a budget: Khuller, Moss, Naor, "The budgeted maximum coverage problem", Information Processing
-# Letters 70 (1999).
+# Set cover: few or cheap sets that together hold every element as often as needed. Required sets
+# are taken, redundant ones are dropped, and the rest splits into independent parts. Each part is
+# covered greedily and bounded from below. A part whose cover exceeds its bound is given to HiGHS,
+# if that is installed. So the result is exact if that is cheap, and otherwise has a bound for its
+# distance from the optimum. Source, with a budget: Khuller, Moss, Naor, "The budgeted maximum
+# coverage problem", Information Processing Letters 70 (1999).
 
 
 @dataclass(frozen=True)
 class Cover:
-    """Sets that were chosen.
+    """Chosen sets of a cover.
 
     Attributes
     ----------
     chosen : int64
-        In the order in which they bring most for what they cost.
+        Ordered by gain per cost.
     cost : float
-        Of all of them.
+        Total cost.
     bound : float
-        No sets that do the same cost less.
+        Lower bound for the cost of any cover.
     greedy : float
-        What the greedy choice would cost, once all that must be taken is taken.
+        Cost of the greedy choice, after the required sets.
     """
 
     chosen: Ints
@@ -525,18 +525,18 @@ class Cover:
 
     @property
     def exact(self) -> bool:
-        """True if there is nothing cheaper."""
+        """True if the cover is proven to be the cheapest."""
         return self.cost <= self.bound + ROUNDING * max(self.cost, 1)
 
 
 def minimal(family: SetFamily, nodes: int = NODES) -> Cover:
-    """Return the cheapest sets that hold each element as often as it needs; or cheap ones, and a bound.
+    """Return a cheap cover that meets all needs, with a lower bound for its cost.
 
     Parameters
     ----------
     family : SetFamily
     nodes : int
-        Nodes that the solver may look at, in all parts together; 0: greedy choice and bound alone.
+        Greatest number of solver nodes, in all parts together; 0 for greedy choice and bound only.
     """
     forced, rest = reduced(family)
     chosen, bound = [forced], float(family.cost[forced].sum())
@@ -558,17 +558,17 @@ def minimal(family: SetFamily, nodes: int = NODES) -> Cover:
 
 @dataclass(frozen=True)
 class Fitted:
-    """Sets that were chosen under a budget.
+    """Chosen sets within a budget.
 
     Attributes
     ----------
     chosen : int64
-        In order.
+        In order of choice.
     cost : float
     met : int
-        How much of all needs they meet: of each element as many sets as it needs at most, times its weight.
+        Amount of met needs: for each element at most its need, times its weight.
     most : float
-        No sets within the budget meet more.
+        Upper bound for any sets within the budget.
     """
 
     chosen: Ints
@@ -578,10 +578,10 @@ class Fitted:
 
 
 def within(family: SetFamily, budget: float) -> Fitted:
-    """Sets within a budget that meet as much as can be: greedy, or the best set alone.
+    """Choose sets within a budget that meet most needs: greedy, or the best single set.
 
-    The bound is that of submodular functions: whatever has been chosen, the best choice meets no more than that
-    and the largest gains of single sets that fit the budget together, the last one in part.
+    The bound is that of submodular functions: for any current choice, the optimum meets at most its
+    needs plus the largest gains of single sets that fit the budget together, the last one in part.
     """
     chosen = or_alone(family, greedy(family, budget), budget)
     at = np.unique(np.linspace(0, len(chosen), 16).astype(np.int64)).tolist()
@@ -605,24 +605,23 @@ def _at_most(family: SetFamily, chosen: Ints, budget: float) -> float:
     return met(family, chosen) + min(more, float((left * family.weight).sum()))
 
 
-# Units that overlap, where what they share costs once: few, cheap, or as good as a budget allows ----
-# What some clips cost together in frames, seconds or bytes is what their union costs. *Pieces* are the
-# stretches between one beginning or end of a unit and the next: each unit is a row of pieces, and pieces do
-# not overlap. So a set of pieces is never worse than the units that they are of, and what is known of covers
-# by pieces bounds covers by units. Units are chosen greedily, by what they bring for the pieces that no
-# chosen one has.
+# Overlapping units, whose shared frames cost once: few, cheap, or best within a budget. The cost of
+# clips in frames, seconds or bytes is the cost of their union. *Pieces* are the stretches between
+# consecutive beginnings and ends of units: each unit is a range of pieces, and pieces do not
+# overlap. A set of pieces is never worse than its units; therefore bounds for covers by pieces also
+# hold for covers by units. Units are chosen greedily, by gain per cost of their uncovered pieces.
 
 
 @dataclass(frozen=True)
 class UnitPieces:
-    """Units as rows of pieces.
+    """Units as ranges of pieces.
 
     Attributes
     ----------
     begin, end : (U,) int64
-        Ascending, both.
+        Both ascending.
     cost : (P,) float64
-        Of each piece.
+        Cost of each piece.
     """
 
     begin: Ints
@@ -630,17 +629,17 @@ class UnitPieces:
     cost: Floats
 
     def left(self, one: int, taken: Bools) -> float:
-        """Cost of a unit beyond the pieces that are taken."""
+        """Return the cost of a unit without the taken pieces."""
         own = slice(int(self.begin[one]), int(self.end[one]))
         return float(self.cost[own][~taken[own]].sum())
 
     def beside(self, one: int) -> range:
-        """The units that share a piece with a unit, and itself."""
+        """Return the units that share a piece with a unit, including itself."""
         low = int(np.searchsorted(self.end, self.begin[one], side="right"))
         return range(low, int(np.searchsorted(self.begin, self.end[one])))
 
     def together(self, picked: Ints) -> float:
-        """Cost of units together."""
+        """Return the total cost of units."""
         taken = np.zeros(len(self.cost), np.bool_)
         for one in picked.tolist():
             taken[self.begin[one] : self.end[one]] = True
@@ -648,7 +647,7 @@ class UnitPieces:
 
 
 def pieces(units: Units, measure: Measure) -> tuple[Units, UnitPieces]:
-    """The pieces of units, and the units as rows of them."""
+    """Return the pieces of units, and the units as ranges of pieces."""
     cuts = np.unique(np.concatenate([units.begin, units.end]))
     parts = replace(units, begin=cuts[:-1], end=cuts[1:])
     cost = parts.summed(units.weights(measure), measure)
@@ -657,9 +656,9 @@ def pieces(units: Units, measure: Measure) -> tuple[Units, UnitPieces]:
 
 
 def cheapest(units: Units, held: Holdings, measure: Measure, rank: Ints) -> Cover:
-    """Units that hold everything, and whose union costs little: the greedy choice, or the fewest units.
+    """Return units that hold all elements at a low total cost: the greedy choice, or the fewest units.
 
-    The bound is that of the pieces, chosen one by one.
+    The bound comes from single pieces.
     """
     parts, spans = pieces(units, measure)
     family = held.family(units, units.costs(measure), 1, rank)
@@ -673,9 +672,9 @@ def cheapest(units: Units, held: Holdings, measure: Measure, rank: Ints) -> Cove
 
 
 def affordable(units: Units, held: Holdings, measure: Measure, rank: Ints, budget: float) -> Fitted:
-    """Units whose union is within a budget, and that hold as much as can be: greedy, or the best one alone.
+    """Return units within a budget that hold most elements: greedy, or the best single unit.
 
-    The bound is that of the pieces, chosen one by one.
+    The bound comes from single pieces.
     """
     parts, spans = pieces(units, measure)
     family = held.family(units, units.costs(measure), 1, rank)
@@ -687,11 +686,11 @@ def affordable(units: Units, held: Holdings, measure: Measure, rank: Ints, budge
 
 
 def _greedy(family: SetFamily, spans: UnitPieces, budget: float = math.inf) -> Ints:
-    """Units, one after another, each the one that brings most for what it costs beyond those before it."""
+    """Choose units one after another by gain per additional cost."""
     taken = np.zeros(len(spans.cost), np.bool_)
 
     def cheapened(one: int) -> Iterator[tuple[int, float]]:
-        """Prices of units that share pieces with one that is taken."""
+        """Yield the new prices of units that share pieces with a taken unit."""
         taken[spans.begin[one] : spans.end[one]] = True
         for other in spans.beside(one):
             yield other, max(spans.left(other, taken), 1e-9)
@@ -700,7 +699,7 @@ def _greedy(family: SetFamily, spans: UnitPieces, budget: float = math.inf) -> I
 
 
 def _thinned(family: SetFamily, spans: UnitPieces, chosen: Ints) -> Ints:
-    """Without the units that the others make superfluous, those first that cost most beyond the others."""
+    """Remove redundant units, those with the greatest savings first."""
     times = np.zeros(len(spans.cost) + 1, np.int64)
     np.add.at(times, spans.begin[chosen], 1)
     np.add.at(times, spans.end[chosen], -1)

@@ -1,9 +1,9 @@
-"""Probabilities that cases fail, learned from the outcomes of other cases.
+"""Failure probabilities of cases, learned from the outcomes of other cases.
 
-A case is told by the ego's three most critical neighbours in its most critical frame. The model is gradient
-boosting of trees (scikit-learn, the extra ``[learn]``); without it a logistic regression on ranks. No case is
-judged by a model that has seen its own outcome: cases with known outcomes are judged in five parts, each by a
-model of the other four, and the rest by a model of them all.
+The features of a case come from the ego's three most critical neighbours in its most critical
+frame. The model is gradient boosting of trees (scikit-learn, the extra ``[learn]``), or else a
+logistic regression on ranks. A model never judges a case whose outcome it was trained on: cases
+with known outcomes are judged in five folds, and the others by a model of all outcomes.
 """
 
 from __future__ import annotations
@@ -34,32 +34,32 @@ _NUMBERS: Final = (
 _PARTS: Final = 5
 _THREADED: Final = 100_000
 _TOGETHER: Final = 1 << 17
-"""Cases that are judged together by the plain model."""
+"""Cases that the plain model judges at a time."""
 
 
 def boosted() -> bool:
-    """Tell whether gradient boosting is installed."""
+    """True if gradient boosting is installed."""
     return find_spec("sklearn") is not None
 
 
 def model_name() -> str:
-    """Name of the model that is used."""
+    """Return the name of the model in use."""
     return "gradient boosting" if boosted() else "logistic regression on ranks"
 
 
 def features_of(units: Units, rows: Ints) -> Singles:
-    """Numbers of the ego and its most critical neighbours in one frame of each unit.
+    """Return features of the ego and its most critical neighbours in one frame of each unit.
 
     Parameters
     ----------
     units : Units
     rows : (U,) int64
-        The row of the frame of each unit.
+        Row of the frame of each unit.
 
     Returns
     -------
     (U, 44) float32
-        NaN: not known, or there are not as many neighbours.
+        NaN for unknown values and missing neighbours.
     """
     wide = len(_NUMBERS) + 3
     frames, place = np.unique(units.frame_id[rows], return_inverse=True)
@@ -79,7 +79,7 @@ def features_of(units: Units, rows: Ints) -> Singles:
 
 
 def _filled(column: Any) -> Floats:
-    """A column with NaN where it is NULL; what is beyond single precision is its bound."""
+    """Replace NULL by NaN, and clip a column to single precision."""
     most = float(np.finfo(np.float32).max)
     return np.clip(np.ma.filled(np.ma.asarray(column).astype(np.float64), np.nan), -most, most)
 
@@ -101,7 +101,7 @@ def _sql() -> str:
 
 
 def cross_fitted(x: Singles, failed: Bools, known: Bools, seed: int) -> Floats:
-    """(U,): the probability that each case fails, by models that have not seen its outcome.
+    """Return failure probabilities of cases, (U,), by models that were not trained on their outcomes.
 
     Parameters
     ----------
@@ -113,13 +113,13 @@ def cross_fitted(x: Singles, failed: Bools, known: Bools, seed: int) -> Floats:
     Raises
     ------
     ConfigError
-        There is no failure to learn from, or nothing else.
+        The outcomes have no failures, or only failures.
     """
     _check(failed, known)
     found = np.empty(len(x))
     if not known.all():
         found[~known] = fitted(x[known], failed[known], x[~known], seed)
-    # Neighbours in time are alike: parts are stretches of the store, and no draw.
+    # Neighbours in time are similar: folds are contiguous parts of the store, not random.
     for part in np.array_split(np.flatnonzero(known), _PARTS):
         others = known.copy()
         others[part] = False
@@ -131,12 +131,12 @@ def cross_fitted(x: Singles, failed: Bools, known: Bools, seed: int) -> Floats:
 def learned_elsewhere(
     x: Singles, others: Singles, failed: Bools, known: Bools, seed: int
 ) -> Floats:
-    """(U,): the probability that each case fails, learned from cases that are not among them.
+    """Return failure probabilities of cases, (U,), learned from other cases.
 
     Raises
     ------
     ConfigError
-        There is no failure to learn from, or nothing else.
+        The outcomes have no failures, or only failures.
     """
     _check(failed, known)
     return fitted(others[known], failed[known], x, seed)
@@ -152,8 +152,8 @@ def _check(failed: Bools, known: Bools) -> None:
 
 
 def fitted(x: Singles, failed: Bools, asked: Singles, seed: int) -> Floats:
-    """(Q,): the probability of failure of what is asked, by a model of outcomes."""
-    told = ~np.isnan(x).all(axis=0)  # boosting takes no column of which nothing is known
+    """Train a model on outcomes; return failure probabilities of other cases, (Q,)."""
+    told = ~np.isnan(x).all(axis=0)  # boosting rejects columns without known values
     x, asked = x[:, told], asked[:, told]
     if len(np.unique(failed)) < 2 or not told.any():
         return np.full(len(asked), float(failed.mean()) if len(failed) else 0.5)
@@ -166,7 +166,7 @@ def fitted(x: Singles, failed: Bools, asked: Singles, seed: int) -> Floats:
         threadpool_limits,
     )
 
-    # Small trees that learn slowly: failures are few.
+    # Small trees with a low learning rate: failures are rare.
     made: Any = Boosting
     model = made(
         max_iter=200,
@@ -176,13 +176,13 @@ def fitted(x: Singles, failed: Bools, asked: Singles, seed: int) -> Floats:
         early_stopping=False,
         random_state=seed % (1 << 32),
     )
-    # Of few cases threads wait for one another longer than they work.
+    # For few cases threads wait longer than they work.
     with threadpool_limits(1 if len(x) < _THREADED else None):
         return model.fit(x, failed).predict_proba(asked)[:, 1]
 
 
 def _logistic(x: Singles, failed: Bools, asked: Singles) -> Floats:
-    """Logistic regression on ranks, with a penalty of half the squared weights, by Newton's method."""
+    """Return a logistic regression on ranks by Newton's method, with an L2 penalty."""
     columns = [np.sort(column[~np.isnan(column)]) for column in x.T]
     known = _ranked(x, columns)
     weights, penalty = np.zeros(known.shape[1]), np.ones(known.shape[1])
@@ -204,7 +204,7 @@ _STEPS: Final = 50
 
 
 def _ranked(x: Singles, columns: Sequence[Singles]) -> Floats:
-    """A column of ones; of each number its place among those that are known, −½ … ½, and if it is known."""
+    """Return a column of ones; and for each feature its rank (−½ … ½), and a flag for known values."""
     parts = [np.ones(len(x))]
     for values, known in zip(x.T, columns, strict=True):
         there = ~np.isnan(values)

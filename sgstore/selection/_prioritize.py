@@ -1,17 +1,17 @@
-"""Order of test cases: the most critical first, the most diverse first, both, or as other outcomes teach.
+"""Order of test cases: by risk, by diversity, by both, or learned from outcomes.
 
-The *risk* of a case goes by measures of criticality of the ego and others that move, each the worst value
-in its frames. Those of what was recorded later (``pet``) are of a whole encounter, in each frame that has
-both. Measures have different units and scales, so cases are ranked by each of them, and the ranks
-are added up (Borda count): no weight, no threshold. A rank is one more than the number of cases that are more
-critical, as ``rank()`` in SQL. A case of which a measure is not known comes after those of which it is. An
-expression of the query language is a measure, too, its least value being the worst:
-``robustness(ego.speed < 10)``.
+The *risk* of a case comes from measures of criticality between the ego and other moving entities:
+the worst value in its frames. A measure of the later recording (``pet``) belongs to a complete
+encounter, in each frame with both entities. Measures have different units and scales; therefore
+cases are ranked by each measure, and the ranks are added (Borda count), without weights or
+thresholds. A rank is one more than the number of more critical cases, as ``rank()`` in SQL. Cases
+with an unknown value are last. An expression of the query language is also a measure; its least
+value is the worst: ``robustness(ego.speed < 10)``.
 
 For *diversity* the class of a case is the situation in its most critical frame, or its class in an
-abstraction. Cases come in rounds:
-one of each class, then a second one of each that has two, and so on. As each case brings one class, no order of
-the same cases has more classes in its first k cases, whatever k is.
+abstraction. Cases are ordered in rounds: one of each class, then a second one of each class with
+two, and so on. Each case adds one class; therefore no order of the same cases has more classes in
+its first k cases, for any k.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ if TYPE_CHECKING:
     from sgstore.world import Bools, Floats, Ints
 
 MEASURES: Final = ("closing_time", "ttc_mild")
-"""Measures of risk by default: what happens at the closing speed, and by mild manoeuvres of both."""
+"""Default measures of risk: at the closing speed, and for mild manoeuvres of both."""
 
 RANKED: Final = {name: one for name, one in PAIR_FUNCTIONS.items() if one.sql and one.worse}
-"""Measures by which cases can be ranked, of pairs in a frame."""
+"""Measures of pairs in a frame that can rank cases."""
 
 LATER: Final = {name: one for name, one in RECORDED.items() if one.worse}
-"""Those of what was recorded later, too."""
+"""Measures of the later recording that can rank cases."""
 
 
 _TOLD: Final = 1 << 15
@@ -66,7 +66,7 @@ _OWN: Final = "of its class"
 
 
 class Priority(StrEnum):
-    """Rule of an order: the most critical first, one of each class first, both, or the likeliest to fail."""
+    """Rule of an order: by risk, by diversity, both, or by failure probability."""
 
     risk = "risk"
     diverse = "diverse"
@@ -82,18 +82,19 @@ class PrioritySpec:
     ----------
     by : Priority
     measures : tuple of str
-        Numbers of pairs of which it is known which way is worse, and expressions, whose least value is worst.
+        Numbers of pairs with a known worse direction, and expressions, whose least value is worst.
     unit : SelectionUnit
     clip_s : float
         Length of clips; s.
     stride_s : float or None
-        From the beginning of one clip to that of the next; ``None``: their length.
+        Time from the start of one clip to the start of the next; ``None`` means their length.
     abstraction : str
-        Whose classes are told apart; ``situation``: whom the ego could meet soonest, from where, and where.
+        Abstraction of the classes; ``situation``: the entity that the ego could meet first, with
+        direction and place.
     budget : Budget or None
-        What is ordered ends with it.
+        Limit of the order.
     seed : int
-        Of the order of cases that are equal.
+        Random seed for the order of equal cases.
     """
 
     by: Priority = Priority.risk
@@ -106,7 +107,7 @@ class PrioritySpec:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse measures that are none.
+        """Reject unknown measures.
 
         Raises
         ------
@@ -123,7 +124,7 @@ class PrioritySpec:
             )
 
     def as_dict(self, query: str) -> dict[str, Any]:
-        """All of it as plain values, as a lock says it."""
+        """Return all values as plain values for a lock."""
         clip = self.unit is SelectionUnit.clip
         return {
             "query": query or None,
@@ -142,19 +143,19 @@ class PrioritySpec:
 
 @dataclass(frozen=True)
 class WorstValues:
-    """The worst value of a measure in each unit.
+    """Worst value of a measure in each unit.
 
     Attributes
     ----------
     name : str
     value : (U,) float64
-        NaN: not known in any frame.
+        NaN if unknown in all frames.
     row : (U,) int64
-        The first row of the units' frames that has it.
+        First row with this value among the units' frames.
     other : (U,) int64
-        The entity, beside the ego, by its node id; −1: it is of none.
+        The other entity by node id; −1 for no other entity.
     blind : int
-        Pairs in these frames of which no gap is known, as a size or a heading is missing.
+        Number of pairs in these frames without a known gap, because a size or heading is missing.
     """
 
     name: str
@@ -164,7 +165,7 @@ class WorstValues:
     blind: int = 0
 
     def ranks(self) -> Floats:
-        """(U,): one more than the number of units that are worse; unknown ones are last."""
+        """Return one more than the number of worse units, (U,); unknown ones are last."""
         sign = _sign(self.name)
         filled = np.where(np.isnan(self.value), np.inf, sign * self.value)
         _, place, many = np.unique(filled, return_inverse=True, return_counts=True)
@@ -172,7 +173,7 @@ class WorstValues:
 
 
 def _sign(name: str) -> float:
-    """Sign that makes the worst value of a measure the least one: 1, or −1."""
+    """Return the sign that makes the worst value of a measure the least one: 1 or −1."""
     known = (RANKED | LATER).get(name)
     return -1.0 if known is not None and known.worse == "high" else 1.0
 
@@ -186,20 +187,20 @@ class Prioritized:
     spec : PrioritySpec
     units : Units
     picked : int64
-        Numbers of units, in order, as far as the budget goes.
+        Indices of units, in order, within the budget.
     risk : (U,) float64
-        Share of all units that are no more critical, by the sum of ranks, or no more likely to fail; above 0,
-        and 1 for the first.
+        Share of units with equal or lower risk, by the sum of ranks, or with equal or lower failure
+        probability; above 0, and 1 for the first.
     worst : tuple of WorstValues
-        Of each measure.
+        For each measure.
     code : (U,) int64
-        Class of each unit, where that was asked; −1 where it is not known.
+        Class of each unit, if needed; −1 if unknown.
     said : list of str
-        What a person must know of the order.
+        Notes about the order for users.
     chance : (U,) float64
-        Probability of failure of each unit, where it was learned.
+        Failure probability of each unit, if it was learned.
     names : list of str
-        Of the classes, where they are situations.
+        Names of the classes, if they are situations.
     """
 
     spec: PrioritySpec
@@ -214,19 +215,19 @@ class Prioritized:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the columns of :meth:`rows`."""
+        """Return the names of the columns of :meth:`rows`."""
         likely = ["probability"] * bool(len(self.chance))
         return ("place", "unit", "risk", *likely, *(one.name for one in self.worst), "reason")
 
     @property
     def types(self) -> tuple[str, ...]:
-        """The database's types of these columns."""
+        """Return the database types of these columns."""
         return ("BIGINT", "VARCHAR", *["DOUBLE"] * (len(self.columns) - 3), "VARCHAR")
 
     def rows(self) -> Iterator[tuple[Any, ...]]:
-        """The units in order, with the reasons: made some thousand at a time, as they are asked for.
+        """Yield the units in order, with reasons, made in chunks of some thousand.
 
-        The store is asked at once, and not again.
+        The store is read once, before the first row.
         """
         sql = f"SELECT trace_id, node_id, kind FROM entities WHERE kind {MET}"  # noqa: S608  names of ours
         found = self.units.chosen.one_store.file.rows(sql).values
@@ -270,11 +271,11 @@ class Prioritized:
             yield from zip(places, names, risk, *columns, said, strict=True)
 
     def reasons(self) -> list[str]:
-        """Reasons for the place of each unit, in the order of :attr:`picked`."""
+        """Return reasons for the place of each unit, in the order of :attr:`picked`."""
         return [row[-1] for row in self.rows()]
 
     def table(self) -> ReportTable:
-        """All of :meth:`rows` at once: ``place``, ``unit``, ``risk``, the measures, ``reason``."""
+        """Return all of :meth:`rows` as a table: ``place``, ``unit``, ``risk``, the measures, ``reason``."""
         return ReportTable(self.columns, list(self.rows()), self.said)
 
 
@@ -291,17 +292,17 @@ def prioritize(
     chosen : ChosenFrames
     spec : PrioritySpec
     outcomes : mapping of str to bool, optional
-        Known outcomes to learn from, as :func:`sgstore.coverage.read_outcomes` reads them.
+        Known outcomes to learn from, as read by :func:`sgstore.coverage.read_outcomes`.
     learn_from : ChosenFrames, optional
-        Frames that the outcomes are about; by default those that are ordered. Units with outcomes that are
-        ordered themselves are judged by models that have not seen theirs.
+        Frames of the outcomes; by default the frames to order. A model never judges a unit whose
+        outcome it was trained on.
 
     Raises
     ------
     AbstractionError
-        There is no such abstraction.
+        The abstraction is unknown.
     ConfigError
-        Units have no meaning, or there is nothing to learn from.
+        The units are invalid, or there are no outcomes to learn from.
     """
     if spec.by is Priority.learned and outcomes is None:
         raise ConfigError("to learn an order takes known outcomes")
@@ -350,7 +351,7 @@ def _learned(
     outcomes: Mapping[str, bool],
     learn_from: ChosenFrames | None,
 ) -> tuple[Floats, str]:
-    """(U,): the probability that each unit fails; and from how many outcomes it was learned."""
+    """Return the failure probability of each unit, (U,), and a note about the training outcomes."""
     x = features_of(units, key)
     if learn_from is None:
         failed, known = outcomes_of(units, outcomes)
@@ -383,7 +384,7 @@ def _said(
 
 
 def _lacking(spec: PrioritySpec, units: Units, worst: Sequence[WorstValues]) -> list[str]:
-    """What frames and pairs lack so that nothing is known of whom the ego could meet."""
+    """Return notes about missing values of frames and pairs that hide possible conflicts."""
     told: list[str] = []
     of_pairs = bool({*spec.measures} & {*RANKED, *LATER}) or spec.by is Priority.learned
     if spec.by is Priority.diverse:
@@ -406,21 +407,21 @@ def _lacking(spec: PrioritySpec, units: Units, worst: Sequence[WorstValues]) -> 
 
 
 def _places(total: Floats, rank: Ints) -> Ints:
-    """(U,): places in the order of a number, from 0 on."""
+    """Return the places in the order of a number, (U,), from 0 on."""
     found = np.empty(len(total), np.int64)
     found[np.lexsort((rank, total))] = np.arange(len(total))
     return found
 
 
 def _in_rounds(order: Ints, code: Ints) -> Ints:
-    """Units of an order in rounds: the first ones of each class, the second ones, and so on."""
+    """Reorder units in rounds: the first of each class, then the second of each, and so on."""
     turn = _turns(code[order])
-    turn[code[order] == UNKNOWN] = len(order) + 1  # of no class: they bring none
+    turn[code[order] == UNKNOWN] = len(order) + 1  # without a class: last
     return order[np.argsort(turn, kind="stable")]
 
 
 def _turns(code: Ints) -> Ints:
-    """(n,): how many of the same class have come so far, each itself included."""
+    """Return the count of the same class so far, (n,), including itself."""
     order = np.argsort(code, kind="stable")
     fresh = np.append(True, np.diff(code[order]) != 0)[: len(code)]
     places = np.arange(len(code))
@@ -430,7 +431,7 @@ def _turns(code: Ints) -> Ints:
 
 
 def _together(*orders: Ints) -> Ints:
-    """One order of several: places are added up; of those that are equal the first order decides."""
+    """Merge several orders by the sum of places; the first order decides ties."""
     places = np.empty((len(orders), len(orders[0])), np.int64)
     for place, order in zip(places, orders, strict=True):
         place[order] = np.arange(len(order))
@@ -438,7 +439,7 @@ def _together(*orders: Ints) -> Ints:
 
 
 def _classes(units: Units, abstraction: str) -> Ints:
-    """(N,): classes of the frames of units; −1 where one is not known."""
+    """Return the classes of the frames of units, (N,); −1 for unknown ones."""
     of = classed(units.chosen, abstraction)
     code = np.full(len(units.frame_id), UNKNOWN, np.int64)
     code[np.searchsorted(units.frame_id, of.frame_id)] = of.code
@@ -448,9 +449,9 @@ def _classes(units: Units, abstraction: str) -> Ints:
 def worst_values(
     units: Units, measures: Sequence[str], told: Situations | None = None
 ) -> tuple[WorstValues, ...]:
-    """The worst value of each measure in each unit: of the ego and others that move, or an expression's.
+    """Return the worst value of each measure in each unit.
 
-    ``told``: where the situations of frames go, too, which cost little beside numbers of pairs.
+    ``told`` receives the situations of frames, which are cheap in addition to numbers of pairs.
     """
     pairs = _worst_of_pairs(units, [name for name in measures if name in RANKED], told)
     later = _worst_of_encounters(units, [name for name in measures if name in LATER])
@@ -459,7 +460,7 @@ def worst_values(
 
 
 def _most_critical(units: Units, worst: Sequence[WorstValues]) -> Ints:
-    """(U,): the row of the most critical frame of each unit, by the first measure that is known of it."""
+    """Return the row of the most critical frame of each unit, (U,), by its first known measure."""
     row = units.begin
     for one in reversed(worst):
         row = np.where(np.isnan(one.value), row, one.row)
@@ -467,7 +468,7 @@ def _most_critical(units: Units, worst: Sequence[WorstValues]) -> Ints:
 
 
 def _worst_of_encounters(units: Units, measures: Sequence[str]) -> dict[str, WorstValues]:
-    """Of what was recorded later: the value of an encounter is that of each frame that has both."""
+    """Return worst values of recorded measures; an encounter has one value for all common frames."""
     if not measures:
         return {}
     value, other = (np.full((len(measures), len(units.frame_id)), fill) for fill in (np.inf, -1))
@@ -507,7 +508,7 @@ def _worst_of_pairs(
     for i, name in enumerate(measures):
         column = RANKED[name].column or name
         sign = "-" if RANKED[name].worse == "high" else ""
-        # Of those that are equally bad the one with the least id: the same whatever the order of rows.
+        # Ties go to the smallest id, independent of the order of rows.
         least = f"min(ROW({sign}{column}, dst)) FILTER (WHERE {column} IS NOT NULL)"
         columns.append(f"{least} AS worst{i}")
     columns.append("count(*) - count(gap) AS blind")
@@ -545,7 +546,7 @@ def _worst_of_pairs(
 
 
 def _worst_of(units: Units, name: str, frames: Floats, who: Ints) -> WorstValues:
-    """The worst value of each unit, of values of frames; inf: not known."""
+    """Return the worst value of each unit from values of frames; inf means unknown."""
     ranges = np.stack([units.begin, units.end], axis=1).ravel()
     least = np.minimum.reduceat(np.append(frames, np.inf), ranges)[::2]
     row = units.begin.copy()
@@ -556,14 +557,14 @@ def _worst_of(units: Units, name: str, frames: Floats, who: Ints) -> WorstValues
 
 
 def _times(units: Units) -> Floats:
-    """(N,): seconds since their traces began, of the frames of units."""
+    """Return the times of the frames of units since the start of their traces, (N,); s."""
     found = units.chosen.one_store.file.arrays("SELECT frame_id, t FROM frames ORDER BY frame_id")
     at = np.searchsorted(found["frame_id"].astype(np.int64), units.frame_id)
     return found["t"].astype(np.float64)[at]
 
 
 def _or_none(values: Floats) -> list[float | None]:
-    """Values as plain ones; None: not known."""
+    """Return plain values; None means unknown."""
     found: list[float | None] = values.tolist()
     for place in np.flatnonzero(np.isnan(values)).tolist():
         found[place] = None
@@ -577,7 +578,7 @@ def _reasons(
     who: Mapping[tuple[int, int], str],
     times: Floats,
 ) -> list[str]:
-    """What a measure says of each unit; nothing where it is not known."""
+    """Return a measure's reason for each unit; empty for unknown values."""
     name, value = worst.name, worst.value[part]
     when = times[worst.row[part]].tolist()
     known = RANKED | LATER
@@ -611,24 +612,24 @@ def locked_order(
     payloads: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Lock:
-    """The lock of units in an order, with the reasons.
+    """Return the lock of units in an order, with the reasons.
 
     Parameters
     ----------
     order : Prioritized
     query : str
-        The query whose frames were put in order; empty: all.
+        Query of the ordered frames; empty means all frames.
     parameters : mapping, optional
         Values of ``$name`` in the query.
     payloads : bool
-        Whether the messages of the recordings count, too; then they must be there.
+        True to include the messages of the recordings, which must then exist.
     progress : callable, optional
-        Called with the number of cases done and of all.
+        Called with the number of finished cases and the total.
 
     Raises
     ------
     TraceError
-        A recording is gone, was replaced, or is damaged.
+        A recording is missing, was replaced, or is damaged.
     """
     units = order.units
     names = names_of_units(units, order.picked)
@@ -642,30 +643,31 @@ def locked_order(
 
 
 def failed_in_order(order: Prioritized, outcomes: Mapping[str, bool]) -> Bools:
-    """Outcomes of the cases in their order, as far as they are known: true where one failed.
+    """Return the known outcomes of the cases in their order: True for a failure.
 
     Parameters
     ----------
     order : Prioritized
     outcomes : mapping of str to bool
-        As :func:`sgstore.coverage.read_outcomes` reads them. A clip or a trace fails if one of its frames does.
+        As read by :func:`sgstore.coverage.read_outcomes`. A clip or a trace fails if one of its
+        frames fails.
 
     Raises
     ------
     ConfigError
-        No outcome is about a case.
+        The outcomes match none of the cases.
     """
     failed, known = outcomes_of(order.units, outcomes)
     return failed[order.picked][known[order.picked]]
 
 
 def outcomes_of(units: Units, outcomes: Mapping[str, bool]) -> tuple[Bools, Bools]:
-    """(U,): units that failed, and units with a known outcome.
+    """Return masks (U,) of failed units, and of units with a known outcome.
 
     Raises
     ------
     ConfigError
-        No outcome is about a unit.
+        The outcomes match none of the units.
     """
     told = told_outcomes(outcomes, units.chosen, units.frame_id)
     ranges = np.stack([units.begin, units.end], axis=1).ravel()

@@ -1,6 +1,6 @@
 """Families of sets as columns, and greedy choice.
 
-Sets of elements, as columns.
+A family has sets of elements, stored as columns.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def distinct(values: Ints) -> Ints:
-    """Values, ascending, each once; quick where they are nearly so."""
+    """Return the distinct values, ascending; fast for almost sorted values."""
     if (np.diff(values) <= 0).any():
         values = np.sort(values, kind="stable")
         values = values[np.append(True, np.diff(values) != 0)]
@@ -27,7 +27,7 @@ def distinct(values: Ints) -> Ints:
 
 
 def spread(begin: Ints, end: Ints) -> tuple[Ints, Ints]:
-    """Ranges, and all whole numbers in each of them."""
+    """Expand ranges: the index of the range, and all integers in it."""
     many = end - begin
     unit = np.repeat(np.arange(len(many)), many)
     return unit, np.arange(len(unit)) + np.repeat(begin - (np.cumsum(many) - many), many)
@@ -40,17 +40,18 @@ class SetFamily:
     Attributes
     ----------
     starts : (S + 1,) int64
-        Where the elements of each set begin in ``members``.
+        Start of the elements of each set in ``members``.
     members : (M,) int64
         Elements, 0 … E - 1, each once in a set.
     cost : (S,) float64
-        Above zero.
+        Positive cost of each set.
     need : (E,) int64
-        In how many sets of the answer each element must be; of one that is in fewer sets, in all of these.
+        Number of sets that each element needs in a cover; an element with fewer sets needs all of
+        them.
     rank : (S,) int64
-        Of sets that are equally good the one of the lowest rank is taken.
+        Tie-breaker: of equally good sets the lowest rank is taken.
     weight : (E,) int64
-        How much an element counts where not all can be had.
+        Weight of an element if not all can be covered.
     """
 
     starts: Ints
@@ -70,7 +71,7 @@ class SetFamily:
         need: int = 1,
         rank: Ints | None = None,
     ) -> SetFamily:
-        """A family of pairs (2, M) of a set and an element, in any order; a pair may come twice."""
+        """Build a family from pairs (2, M) of set and element, in any order, with possible duplicates."""
         key = distinct(pairs[0].astype(np.int64) * max(elements, 1) + pairs[1])
         of_set, members = np.divmod(key, max(elements, 1))
         starts = np.searchsorted(of_set, np.arange(sets + 1))
@@ -89,38 +90,38 @@ class SetFamily:
 
     @property
     def whole(self) -> bool:
-        """True if all costs are whole numbers."""
+        """True if all costs are integers."""
         return bool((self.cost == np.round(self.cost)).all())
 
     @property
     def set_of(self) -> Ints:
-        """(M,): the set of each of ``members``."""
+        """Return the set of each of ``members``, (M,)."""
         return np.repeat(np.arange(len(self)), np.diff(self.starts))
 
     def elements(self, one: int) -> Ints:
-        """The elements of a set."""
+        """Return the elements of a set."""
         return self.members[self.starts[one] : self.starts[one + 1]]
 
     def by_element(self) -> tuple[Ints, Ints]:
-        """Sets of each element, one after another, and the place at which those of each begin."""
+        """Return the sets of each element in sequence, and their starts."""
         order = np.argsort(self.members, kind="stable")
         starts = np.searchsorted(self.members[order], np.arange(len(self.need) + 1))
         return starts, self.set_of[order]
 
     def gains(self, open_: Bools) -> Floats:
-        """(S,): the weight of those elements of each set that are open."""
+        """Return the weight of the open elements of each set, (S,)."""
         rows = open_[self.members]
         weight = self.weight[self.members[rows]].astype(np.float64)
         return np.bincount(self.set_of[rows], weight, len(self)).astype(np.float64)
 
     def covered(self, chosen: Ints) -> Ints:
-        """(E,): how many of some sets hold each element."""
+        """Return the number of chosen sets that hold each element, (E,)."""
         taken = np.zeros(len(self), np.bool_)
         taken[chosen] = True
         return np.bincount(self.members[taken[self.set_of]], minlength=len(self.need))
 
     def part(self, sets: Ints, wanted: Bools, need: Ints) -> SetFamily:
-        """Only some sets, and of them only the elements that are wanted; these are numbered anew."""
+        """Return some sets with only the wanted elements, which are renumbered."""
         kept = np.zeros(len(self), np.bool_)
         kept[sets] = True
         rows = kept[self.set_of] & wanted[self.members]
@@ -135,8 +136,8 @@ class SetFamily:
 
 
 # Sets that are chosen one after another, and what of a choice is superfluous --------------------
-# Source. Greedy and its factor H(n): Chvátal, "A greedy heuristic for the set-covering problem", Mathematics of
-# Operations Research 4 (1979).
+# Source of the greedy choice and its factor H(n): Chvátal, "A greedy heuristic for the set-covering
+# problem", Mathematics of Operations Research 4 (1979).
 
 
 def greedy(
@@ -144,26 +145,26 @@ def greedy(
     budget: float = math.inf,
     cheapened: Callable[[int], Iterable[tuple[int, float]]] | None = None,
 ) -> Ints:
-    """Sets, one after another, each the one that brings most new elements for its cost.
+    """Choose sets one after another by gain of new elements per cost.
 
     Parameters
     ----------
     family : SetFamily
     budget : float
-        What all may cost together; sets that do not fit are passed over.
+        Limit for the total cost; sets that do not fit are skipped.
     cheapened : callable, optional
-        Called with each set that is taken → sets that cost less from then on, and what they cost now.
+        Function from a taken set to sets that become cheaper, with their new costs.
 
     Returns
     -------
     int64
-        In the order in which they were taken.
+        In the order of choice.
     """
     need = family.need.copy()
     gain = family.gains(need > 0)
     often = np.bincount(family.members, minlength=len(need))
     if cheapened is None and (often <= need).all() and family.cost.sum() <= budget:
-        # Each is taken, and none makes another one worth less.
+        # All sets are taken, and none reduces the gain of another.
         order = np.lexsort((family.rank, -gain / family.cost))
         return order[: np.count_nonzero(gain)]
     starts, of_element = family.by_element()
@@ -190,20 +191,21 @@ def greedy(
         gain[one] = 0
         for other, price in cheapened(one) if cheapened else ():
             cost[other] = price
-            if gain[other]:  # it may be worth more now, and fit a budget that it did not
+            if gain[other]:  # its gain may have grown, and it may fit the budget now
                 heapq.heappush(heap, (-gain[other] / price, rank[other], other))
     return np.array(chosen, np.int64)
 
 
 def thinned(family: SetFamily, chosen: Ints, order: Ints | None = None) -> Ints:
-    """Without the sets that the others make superfluous.
+    """Remove sets that the others make redundant.
 
     Parameters
     ----------
     family : SetFamily
     chosen : int64
     order : int64, optional
-        Places in ``chosen``, those first that are to go. By default the dearest, and of these the latest.
+        Indices into ``chosen``, first candidates first. By default the most expensive, and of these
+        the latest.
     """
     spare = family.covered(chosen) - family.need
     keep = np.ones(len(chosen), np.bool_)
@@ -218,7 +220,7 @@ def thinned(family: SetFamily, chosen: Ints, order: Ints | None = None) -> Ints:
 
 
 def ordered(family: SetFamily, chosen: Ints) -> Ints:
-    """Chosen sets in the order in which they bring most for what they cost; then those that bring nothing."""
+    """Order chosen sets by gain per cost; sets without gain are last."""
     chosen = np.sort(chosen)
     wanted = np.ones(len(family.need), np.bool_)
     need = np.minimum(family.need, family.covered(chosen))
@@ -228,12 +230,12 @@ def ordered(family: SetFamily, chosen: Ints) -> Ints:
 
 
 def met(family: SetFamily, chosen: Ints) -> int:
-    """Amount of all needs that some sets meet: of each element no more than it needs, times its weight."""
+    """Return the amount of met needs: for each element at most its need, times its weight."""
     return int((np.minimum(family.covered(chosen), family.need) * family.weight).sum())
 
 
 def or_alone(family: SetFamily, chosen: Ints, budget: float) -> Ints:
-    """Chosen sets; or the best one that a budget allows, if that meets more alone."""
+    """Return the chosen sets, or the best single set within the budget if it meets more."""
     gain = family.gains(family.need > 0)
     single = np.flatnonzero(family.cost <= budget)
     best = single[np.lexsort((family.rank[single], -gain[single]))[:1]]

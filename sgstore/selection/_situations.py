@@ -1,4 +1,4 @@
-"""Situations of the ego: who it could meet soonest, from where, and where that is."""
+"""Situations of the ego: the first possible conflict partner, its direction, and the place."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
 
 _FIXED: Final = (*SIGNALS, "building", "pole", "barrier", "vegetation")
 MET: Final = f"NOT IN ({', '.join(map(literal, _FIXED))})"
-"""Of a kind in SQL: one that the ego could meet."""
+"""SQL condition for kinds that the ego could meet."""
 
 OTHERS: Final = f"src_is_ego AND dst_kind {MET}"
-"""Pairs of the ego and those that it could meet: who drives below a traffic light does not meet it."""
+"""Pairs of the ego and entities that it could meet, without traffic lights, for example."""
 
 SITUATION: Final = "situation"
-"""Name of these classes beside those of abstractions."""
+"""Name of these classes in place of an abstraction."""
 
 NOBODY: Final = "nobody"
-"""The situation where there is no other."""
+"""Situation without other entities."""
 
 _NOBODY: Final = -1
 
 _FRAMES: Final = 1 << 17
-"""Frames whose pairs are looked at together."""
+"""Frames whose pairs are read together."""
 
 _DIRECTIONS: Final = ("", " of the same direction", " that crosses", " that comes towards it")
 _WAYS: Final = ("", " in its way", " beside its way")
@@ -45,7 +45,7 @@ WHO: Final = """
     + CASE WHEN lat_gap <= 0 THEN 4 WHEN lat_gap > 0 THEN 8 ELSE 0 END
     + CASE WHEN lon > 0 THEN 1 WHEN lon <= 0 THEN 2 ELSE 0 END))[4] AS situation
 """
-"""The situation of a frame, of the pairs of :data:`OTHERS` in it, as a number; SQL."""
+"""SQL of the situation of a frame as a number, from the pairs of :data:`OTHERS`."""
 
 _SQL: Final = f"""
   SELECT frame_id, {WHO} FROM world_criticality WHERE {OTHERS} AND frame_id BETWEEN ? AND ? GROUP BY frame_id
@@ -53,19 +53,19 @@ _SQL: Final = f"""
 
 
 def frames_in_parts(frames: Ints) -> Iterator[tuple[int, Ints]]:
-    """Frames, ascending, so many at a time; each with the place of its first."""
+    """Yield chunks of ascending frames, each with the index of its first frame."""
     for start in range(0, len(frames), _FRAMES):
         yield start, frames[start : start + _FRAMES]
 
 
 def situations(units: Units, rows: Ints) -> tuple[Ints, list[str]]:
-    """(U,): the situation in one frame of each unit, as a place in a list of all.
+    """Return the situation in one frame of each unit, (U,), as an index into a list of all.
 
     Parameters
     ----------
     units : Units
     rows : (U,) int64
-        The row of the frame of each unit.
+        Row of the frame of each unit.
     """
     frames, place = np.unique(units.frame_id[rows], return_inverse=True)
     told = Situations.of_frames(units, len(frames))
@@ -79,7 +79,7 @@ def situations(units: Units, rows: Ints) -> tuple[Ints, list[str]]:
 
 
 class Situations:
-    """Situations of so many frames by their numbers; nobody is there where nothing is told."""
+    """Situations of frames by index; a frame without an entry has no other entity."""
 
     def __init__(self, count: int, kinds: Sequence[str]) -> None:
         self._code = np.full(count, _NOBODY, np.int64)
@@ -87,16 +87,16 @@ class Situations:
 
     @classmethod
     def of_frames(cls, units: Units, count: int) -> Situations:
-        """None yet, of so many frames of a store."""
+        """Make an empty record for frames of a store."""
         sql = "SELECT unnest(enum_range(NULL::kind))::VARCHAR"
         return cls(count, [one for (one,) in units.chosen.one_store.file.rows(sql).values])
 
     def add(self, rows: Ints, codes: Any) -> None:
-        """Tell the situations of some frames."""
+        """Set the situations of some frames."""
         self._code[rows] = codes
 
     def of(self, rows: Ints) -> tuple[Ints, list[str]]:
-        """The situations of some frames, as places in a list of all of theirs."""
+        """Return the situations of some frames, as indices into a list."""
         used, code = np.unique(self._code[rows], return_inverse=True)
         names = list(map(self._name, used.tolist()))
         order = sorted(range(len(names)), key=names.__getitem__)

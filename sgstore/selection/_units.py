@@ -1,4 +1,4 @@
-"""Units of a selection: frames, clips or whole traces; and the elements that each of them holds."""
+"""Units of a selection: frames, clips or whole traces, with their elements."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ if TYPE_CHECKING:
 
 
 MOST: Final = 150_000_000
-"""Most memberships of elements in units that are held at once: more are an error, not a part of the answer."""
+"""Greatest number of memberships in memory; more are an error, never a partial result."""
 
 _CELLS: Final = 50_000_000
-"""Truth values that are looked at together."""
+"""Truth values that are processed together."""
 
 
 class SelectionUnit(StrEnum):
-    """Unit that is chosen or not: a frame, consecutive frames of some seconds, a whole trace."""
+    """Unit of selection: a frame, consecutive frames of some seconds, or a whole trace."""
 
     frame = "frame"
     clip = "clip"
@@ -56,7 +56,7 @@ Measure = Literal["units", "frames", "seconds", "bytes"]
 
 @dataclass(frozen=True)
 class Budget:
-    """Most that may be selected.
+    """Limit of a selection.
 
     Attributes
     ----------
@@ -69,12 +69,12 @@ class Budget:
 
     @classmethod
     def parse(cls, text: str) -> Budget:
-        """``600s``, ``10min``, ``2h``, ``5GB``, ``300MiB``, ``1000frames``, ``40units`` as a budget.
+        """Parse a budget: ``600s``, ``10min``, ``2h``, ``5GB``, ``300MiB``, ``1000frames``, ``40units``.
 
         Raises
         ------
         ConfigError
-            It is none of these, or nothing at all.
+            The text is invalid or zero.
         """
         found = _BUDGET.fullmatch(text)
         if found is None or float(found[1]) <= 0 or found[2].lower() not in _MEASURES:
@@ -106,22 +106,22 @@ _MEASURES: Final[dict[str, tuple[float, Measure]]] = {
 
 @dataclass(frozen=True)
 class Units:
-    """Frames in units, which may overlap.
+    """Frames in units, which can overlap.
 
     Attributes
     ----------
     chosen : ChosenFrames
-        The frames that were asked for.
+        The frames to select from.
     unit : SelectionUnit
     frame_id : (N,) int64
         The frames of all units, ascending.
     asked : (N,) bool
-        Whether a frame is one that was asked for: only these count. Others are in whole traces.
+        True for frames to select from: only these count. Whole traces can have others.
     log_time_ns : (N,) int64
     begin, end : (U,) int64
-        The rows of each unit, the last one not included; both ascend, and each row is in a unit.
+        Row range of each unit, end excluded; both ascend, and each row is in a unit.
     others : int
-        How many units there are beside these: such as hold what one of these holds, and cost no less.
+        Number of omitted units: those with the same elements as a unit here, and no lower cost.
     """
 
     chosen: ChosenFrames
@@ -138,7 +138,7 @@ class Units:
 
     @property
     def total(self) -> int:
-        """Number of units with those that are left out."""
+        """Return the number of units, including omitted ones."""
         return len(self) + self.others
 
     @property
@@ -148,34 +148,34 @@ class Units:
 
     @property
     def sizes(self) -> Ints:
-        """(U,): how many frames each unit has."""
+        """Return the number of frames of each unit, (U,)."""
         return self.end - self.begin
 
     @property
     def first(self) -> Ints:
-        """(U,): ids of the first frames of the units."""
+        """Return the ids of the first frames of the units, (U,)."""
         return self.frame_id[self.begin]
 
     @property
     def last(self) -> Ints:
-        """(U,): ids of their last frames."""
+        """Return the ids of the last frames of the units, (U,)."""
         return self.frame_id[self.end - 1]
 
     def codes(self, of: Classed) -> Ints:
-        """(N,): the class of each frame; unknown of those that were not asked for."""
+        """Return the class of each frame, (N,); unknown outside the frames to select from."""
         place = np.searchsorted(of.frame_id, self.frame_id)
         there = np.append(of.frame_id, -1)[place] == self.frame_id
         return np.where(there, np.append(of.code, UNKNOWN)[place], UNKNOWN)
 
     def rows_of(self, picked: Ints) -> Ints:
-        """Rows of the frames of some units, ascending, each once."""
+        """Return the distinct rows of the frames of some units, ascending."""
         step = np.zeros(len(self.frame_id) + 1, np.int64)
         np.add.at(step, self.begin[picked], 1)
         np.add.at(step, self.end[picked], -1)
         return np.flatnonzero(np.cumsum(step)[:-1])
 
     def cases(self, picked: Ints, splits: Mapping[int, str] | None = None) -> list[CasePart]:
-        """Some units as cases of a lock, in order; ``splits``: the split that a unit belongs to."""
+        """Return units as ordered cases of a lock; ``splits``: the split of each unit."""
         found: list[CasePart] = []
         for unit in sorted(picked.tolist()):
             rows = slice(self.begin[unit], self.end[unit])
@@ -185,7 +185,7 @@ class Units:
         return found
 
     def members(self) -> Iterator[tuple[Ints, Ints]]:
-        """Units and rows of their frames, unit after unit, whole units at a time."""
+        """Yield units and rows of their frames, in chunks of whole units."""
         ends = np.cumsum(self.sizes)
         low = 0
         while low < len(self):
@@ -196,7 +196,7 @@ class Units:
             low = high
 
     def weights(self, measure: Measure) -> Floats:
-        """(N,): what each frame costs; it lasts the median period of its trace."""
+        """Return the cost of each frame, (N,); its duration is the median period of its trace."""
         match measure:
             case "units" | "frames":
                 return np.ones(len(self.frame_id))
@@ -209,22 +209,22 @@ class Units:
                 return found
 
     def costs(self, measure: Measure) -> Floats:
-        """(U,): what each unit costs alone."""
+        """Return the cost of each unit alone, (U,)."""
         if measure == "units":
             return np.ones(len(self))
         return self.summed(self.weights(measure), measure)
 
     def summed(self, weights: Floats, measure: Measure) -> Floats:
-        """(U,): the weights of the frames of each unit; nothing is free."""
+        """Return the total weight of the frames of each unit, (U,); always positive."""
         if not len(self):
             return np.zeros(0)
         ranges = np.stack([self.begin, self.end], axis=1).ravel()
         found = np.add.reduceat(np.append(weights, 0.0), ranges)[::2]
-        # A trace of one frame has no period, a frame perhaps no message.
+        # A trace of one frame has no period, and a frame may have no messages.
         return np.maximum(found, 1e-3 if measure == "seconds" else 1.0)
 
     def together(self, picked: Ints, measure: Measure) -> float:
-        """Cost of some units together: a frame that is in several of them costs once."""
+        """Return the total cost of units; a shared frame costs once."""
         if measure == "units":
             return float(len(picked))
         if not self.overlap:
@@ -232,7 +232,7 @@ class Units:
         return float(self.weights(measure)[self.rows_of(picked)].sum())
 
     def ranks(self, seed: int) -> Ints:
-        """(U,): an order of the units at random, the same in every store that has the same traces."""
+        """Return a random order of the units, (U,), equal in all stores with the same traces."""
         mixed = _mixed(self.first.astype(np.uint64) + np.uint64(seed * int(_STEP) % (1 << 64)))
         order = np.lexsort((self.first, mixed))
         rank = np.empty(len(order), np.int64)
@@ -246,7 +246,7 @@ _STEP: Final = np.uint64(0x9E3779B97F4A7C15)
 def _mixed(
     words: np.ndarray[tuple[int], np.dtype[np.uint64]],
 ) -> np.ndarray[tuple[int], np.dtype[np.uint64]]:
-    """SplitMix64 (Steele, Lea, Flood, 2014)."""
+    """Mix the words with SplitMix64 (Steele, Lea, Flood, 2014)."""
     words = words + _STEP
     words = (words ^ (words >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     words = (words ^ (words >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -256,12 +256,12 @@ def _mixed(
 def units_of(
     chosen: ChosenFrames, unit: SelectionUnit, clip_s: float = 2.0, stride_s: float | None = None
 ) -> Units:
-    """The units of some frames.
+    """Divide frames into units.
 
-    A clip is a part of a run of consecutive frames that were asked for, of a given time. The first one begins
-    with the run, the others a stride after one another, until one reaches the end of the run; that one may be
-    shorter. A step in time of more than 2.5 median periods ends a run. A trace is taken whole if one of its
-    frames was asked for.
+    A clip is a part of a run of consecutive frames, of a given length. The first clip begins with
+    the run, the others follow at the stride, until one reaches the end of the run; the last one may
+    be shorter. A step in time of more than 2.5 median periods ends a run. A trace is taken
+    completely if one of its frames is selected from.
 
     Parameters
     ----------
@@ -270,13 +270,13 @@ def units_of(
     clip_s : float
         Length of clips; s.
     stride_s : float, optional
-        From the beginning of one clip to that of the next; s. Shorter than they are long, they overlap. By
-        default as long.
+        Time from the start of one clip to the start of the next; s. Clips overlap if it is below
+        their length. By default the length.
 
     Raises
     ------
     ConfigError
-        Clips would have no length, or frames would lie between them.
+        The length of clips is not positive, or frames would be between clips.
     """
     stride_s = clip_s if stride_s is None else stride_s
     if not clip_s > 0:
@@ -307,24 +307,25 @@ def units_of(
 
 
 def _ranges(fresh: Bools) -> tuple[Ints, Ints]:
-    """Begin and end of ranges whose first rows are known."""
+    """Return begin and end of ranges from a mask of their first rows."""
     begin = np.flatnonzero(fresh)
     return begin, np.append(begin[1:], len(fresh))
 
 
 def _clips(frames: Units, time_ns: Ints, clip_s: float, stride_s: float) -> tuple[Ints, Ints]:
-    """Begin and end of clips."""
+    """Return begin and end of clips."""
     period = periods_of(frames.chosen.store, frames.frame_id)
     fresh = run_begins(frames.chosen.store, frames.frame_id, time_ns)
     starts, ends = _ranges(fresh)
     run = np.cumsum(fresh) - 1
-    # Frames stand at whole periods, more or less: what is a hair early belongs to the next clip.
+    # Frames are at approximate multiples of the period: a slightly early frame belongs to the next
+    # clip.
     since = time_ns - time_ns[starts][run] + (period * 0.25).astype(np.int64)
     length, stride = max(round(clip_s * 1e9), 1), max(round(stride_s * 1e9), 1)
     part = since // stride
     fresh[1:] |= part[1:] != part[:-1]
     begin = np.flatnonzero(fresh)
-    # Runs one after another on one axis of time, so far apart that no clip of one reaches the next.
+    # Runs are laid in sequence on one time axis, so far apart that no clip reaches the next run.
     far = np.cumsum(since[ends - 1] + 2 * length) - since[ends - 1]
     end = np.searchsorted(since + far[run], far[run[begin]] + part[begin] * stride + length)
     reaches = end == ends[run[begin]]
@@ -339,17 +340,18 @@ class Holdings:
     Attributes
     ----------
     classed : Classed or None
-        The frames with their classes; ``None``: the elements are sequences, or bundles told what units hold.
+        The frames with their classes; ``None`` for sequences, and for elements from bundles.
     pairs : (2, M) int64
-        Units, and the elements that each holds; each pair once, in order.
+        Units with their elements; each pair once, in order.
     weight : (E,) int64
-        How many combinations an element stands for: those that are in the same frames are one.
+        Number of combinations that an element represents: combinations with equal frames are
+        merged.
     frames : (E,) int64
-        Frames that were asked for with each.
+        Number of frames with each element, of those to select from.
     kind : str
-        What the elements are.
+        Description of the elements.
     has : (C, E) bool or None
-        Elements of the classes that occur; ``None``: they are the elements.
+        Elements of the occurring classes; ``None`` if the classes are the elements.
     """
 
     classed: Classed | None
@@ -361,21 +363,21 @@ class Holdings:
 
     @property
     def total(self) -> int:
-        """Number of classes or combinations."""
+        """Return the number of classes or combinations."""
         return int(self.weight.sum())
 
     def family(self, units: Units, cost: Floats, need: int, rank: Ints) -> SetFamily:
-        """The units as sets of their elements."""
+        """Return the units as sets of their elements."""
         found = SetFamily.of(self.pairs, len(units), len(self.frames), cost, need, rank)
         return replace(found, weight=self.weight)
 
     def over(self, units: Units) -> Holdings:
-        """The same of other units of the same frames.
+        """Return the elements of other units of the same frames.
 
         Raises
         ------
         ConfigError
-            The elements are sequences, which may be in a clip and in no part of it.
+            The elements are sequences, which a clip can have without any of its parts.
         """
         if self.classed is None:
             raise ConfigError(
@@ -387,23 +389,23 @@ class Holdings:
 
 
 def holdings(units: Units, abstraction: str, combos: int = 0, *, of_ego: bool = False) -> Holdings:
-    """Elements of units: their classes, or the combinations of so many features in their frames.
+    """Return the elements of units: classes, or combinations of features in their frames.
 
     Parameters
     ----------
     units : Units
     abstraction : str
     combos : int
-        0: classes.
+        0: classes; k: combinations of k features.
     of_ego : bool
-        Whether only features count that speak of the ego, or of a lane by how it lies to the ego.
+        True if only features of the ego, and of lanes relative to it, count.
 
     Raises
     ------
     AbstractionError
-        There is no such abstraction.
+        The abstraction is unknown.
     ConfigError
-        There are more combinations, or combinations in units, than can be gone through.
+        There are too many combinations.
     """
     of = classed(units.chosen, abstraction)
     pairs = classes_of(units, of)
@@ -417,28 +419,28 @@ def holdings(units: Units, abstraction: str, combos: int = 0, *, of_ego: bool = 
 
 
 def kind_of(abstraction: str) -> str:
-    """What elements are that are classes."""
+    """Return the description of elements that are classes."""
     return f"classes in {abstraction}"
 
 
 def sequence_holdings(units: Units, k: int, names: Sequence[str], within_s: float) -> Holdings:
-    """Elements of units: the sequences of k manoeuvres that happen in their frames.
+    """Return the elements of units: the sequences of k manoeuvres in their frames.
 
     Parameters
     ----------
     units : Units
     k : int
     names : sequence of str
-        Manoeuvres, as :func:`sgstore.coverage.manoeuvres_named` takes them.
+        Manoeuvres, as in :func:`sgstore.coverage.manoeuvres_named`.
     within_s : float
-        Longest time from the first to the last; s.
+        Greatest time from the first to the last; s.
 
     Raises
     ------
     ConfigError
-        There are more sequences than can be gone through.
+        There are too many sequences.
     QueryError
-        A manoeuvre is no pattern.
+        A manoeuvre is not a valid pattern.
     """
     happened = happenings(units.chosen, manoeuvres_named(names))
     check_sequences(len(happened.names), k)
@@ -459,7 +461,7 @@ def sequence_holdings(units: Units, k: int, names: Sequence[str], within_s: floa
 
 
 def classes_of(units: Units, of: Classed) -> Ints:
-    """(2, M): units, and the classes that occur, counted from 0, that each holds."""
+    """Return pairs of units and their occurring classes (from 0), (2, M)."""
     present = of.present()
     number = np.full(len(of.names) + 1, UNKNOWN)
     number[present] = np.arange(len(present))
@@ -477,7 +479,7 @@ def classes_of(units: Units, of: Classed) -> Ints:
 
 
 def _distinct_combinations(found: Combinations) -> tuple[Bools, Ints, Ints]:
-    """Combinations by the classes that have them: (classes, E), how many are alike, and frames of each."""
+    """Return distinct combinations by class, (classes, E), with multiplicity and frame counts."""
     has = found.features.there
     there = np.flatnonzero(found.frames)
     number: dict[bytes, int] = {}
@@ -508,7 +510,7 @@ def _distinct_combinations(found: Combinations) -> tuple[Bools, Ints, Ints]:
 
 
 def _of_units(pairs: Ints, has: Bools) -> Ints:
-    """Units and their elements, of units and their classes, and of classes and their elements."""
+    """Join units with classes and classes with elements to units with elements."""
     held = 0
     parts: list[Ints] = []
     unit, row = pairs
@@ -527,7 +529,7 @@ def _of_units(pairs: Ints, has: Bools) -> Ints:
 
 
 def _whole_units(unit: Ints, step: int) -> Iterator[tuple[int, int]]:
-    """Ranges of rows that end where a unit ends, about ``step`` long."""
+    """Yield ranges of about ``step`` rows that end at a unit's end."""
     low = 0
     while low < len(unit):
         high = int(np.searchsorted(unit, unit[min(low + step, len(unit)) - 1], side="right"))
@@ -536,7 +538,7 @@ def _whole_units(unit: Ints, step: int) -> Iterator[tuple[int, int]]:
 
 
 def kept(pairs: Ints, weight: Ints, picked: Ints, units: int) -> Ints:
-    """Number of elements that are kept after each of some units."""
+    """Return the number of kept elements after each picked unit."""
     place = np.full(units, -1)
     place[picked] = np.arange(len(picked))
     rows = place[pairs[0]] >= 0
@@ -551,27 +553,27 @@ def kept(pairs: Ints, weight: Ints, picked: Ints, units: int) -> Ints:
 
 
 def numbers_of_frames(units: Units, text: str) -> tuple[Ints, Floats]:
-    """Numbers of the frames of units that were asked for.
+    """Return a number for each frame to select from.
 
     Parameters
     ----------
     units : Units
     text : str
-        An expression; of a condition its robustness counts.
+        An expression; for a condition its robustness counts.
 
     Returns
     -------
     rows : (R,) int64
-        Of those frames, among the frames of the units.
+        Rows of those frames among the frames of the units.
     value : (R,) float64
-        NaN where it is not known.
+        NaN if unknown.
 
     Raises
     ------
     ConfigError
-        It is neither a number nor a condition.
+        The value is neither a number nor a condition.
     QueryError, ExportError
-        It is no expression, or has several values in one frame.
+        The text is not an expression, or has several values in one frame.
     """
     from sgstore.exporters import Labels
 
@@ -589,19 +591,19 @@ def numbers_of_frames(units: Units, text: str) -> tuple[Ints, Floats]:
         raise ConfigError(f"the measure {text} is {wrong!r}; expected a number, or a condition")
     value = np.array([np.nan if one is None else float(one) for one in found], np.float64)
     if condition is not None and np.isinf(value).any():
-        # What is not known fails infinitely, too, and should not come first.
+        # An unknown condition has a margin of minus infinity, too, and must not come first.
         margin = _margins(units, f"CHECK ALWAYS ({condition}) ROBUSTNESS")[rows]
         value[np.isinf(value) & np.isnan(margin)] = np.nan
     return rows, value
 
 
 def _condition_in(text: str) -> str | None:
-    """The condition of which an expression is the robustness, and nothing more."""
+    """Return the condition of an expression that is only a robustness."""
     begun = "MATCH () RETURN "
     try:
         match = parse(begun + text)[-1]
     except QueryError:
-        return None  # a whole query
+        return None  # a complete query
     items = match.returns.items if isinstance(match, MatchClause) and match.returns else ()
     call = items[0].value if len(items) == 1 else None
     if not isinstance(call, Call) or call.name.lower() != "robustness" or not call.arguments:
@@ -611,7 +613,7 @@ def _condition_in(text: str) -> str | None:
 
 
 def least_values(units: Units, text: str) -> Floats:
-    """(U,) the least value of :func:`numbers_of_frames` in each unit; NaN where none is known."""
+    """Return the least value of :func:`numbers_of_frames` in each unit, (U,); NaN if unknown."""
     rows, value = numbers_of_frames(units, text)
     frames = np.full(len(units.frame_id), np.nan)
     frames[rows] = value
@@ -619,7 +621,7 @@ def least_values(units: Units, text: str) -> Floats:
 
 
 def _least(units: Units, frames: Floats) -> Floats:
-    """(U,) the least of a value of each frame of the units; NaN where none is known."""
+    """Return the least of a value of each frame of the units, (U,); NaN if unknown."""
     ranges = np.stack([units.begin, units.end], axis=1).ravel()
     return np.fmin.reduceat(np.append(frames, np.nan), ranges)[::2]
 
@@ -628,25 +630,26 @@ _CHECK: Final = re.compile(r"\s*(DEFINE|USING|CHECK)\b", re.IGNORECASE)
 
 
 def is_check(text: str) -> bool:
-    """Tell whether a text is a ``CHECK``, and no expression."""
+    """True if a text is a ``CHECK``."""
     return bool(_CHECK.match(text))
 
 
 def least_of_check(units: Units, text: str) -> Floats:
-    """(U,) the least margin by which each unit meets a check; NaN where it is not known.
+    """Return the least margin of each unit for a check, (U,); NaN if unknown.
 
     Raises
     ------
     ConfigError
-        It is several checks, asks for no margin, or has one for a whole trace only and the units are others.
+        The text has several checks, no ``ROBUSTNESS``, or a margin for whole traces only with other
+        units.
     QueryError
-        It is none.
+        The check is invalid.
     """
     return _least(units, _margins(units, text))
 
 
 def _margins(units: Units, text: str) -> Floats:
-    """(N,) margins of a check in the frames of the units; NaN where they are not known, or not asked for."""
+    """Return margins of a check in the frames of the units, (N,); NaN if unknown or not selected from."""
     run = units.chosen.store.check(text)
     if len(run.names) > 1:
         raise ConfigError("several checks have no order together: give one of them")
