@@ -1,4 +1,4 @@
-"""sgstore.readers."""
+"""Readers of recordings: one package per flavour, and their common base."""
 
 import lazy_loader
 

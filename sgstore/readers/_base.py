@@ -1,8 +1,8 @@
-"""The base of all flavours: the first reading of a recording, and the open trace.
+"""Base of all readers: the first reading of a recording, and the open trace.
 
-A flavour has a :class:`Survey`, which reads a recording once and finds out what must be known before its
-frames can be read; a :class:`~sgstore.readers._blocks.MessageDecoder`, which makes frames of messages; and a
-:class:`MessageTrace`, which has what is known and hands out blocks.
+A flavour (a format of recordings) has three classes. Its :class:`Survey` reads a recording once and collects
+the facts that are needed before the first frame. Its :class:`~sgstore.readers._blocks.MessageDecoder` converts
+messages into frames. Its :class:`MessageTrace` stores the facts and returns blocks of frames.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ Ref = tuple[int, int, int, int, int]
 
 
 def ref_of(run: Messages, row: int) -> Ref:
-    """Reference to one message of a run."""
+    """Return the reference to one message of a run."""
     return (
         int(run.channel[row]),
         int(run.log_time_ns[row]),
@@ -57,7 +57,7 @@ def ref_of(run: Messages, row: int) -> Ref:
 
 
 def refs_of(refs: Iterable[Ref], channels: tuple[Channel, ...]) -> MessageRefs:
-    """References as columns, in file order; each once."""
+    """Return message references as columns, in file order, without duplicates."""
     index = {channel.id: i for i, channel in enumerate(channels)}
     ordered = sorted(set(refs), key=lambda ref: (ref[2] if ref[2] >= 0 else ref[3], ref[3]))
     columns = np.array(ordered, np.int64).reshape(-1, 5).T
@@ -66,7 +66,7 @@ def refs_of(refs: Iterable[Ref], channels: tuple[Channel, ...]) -> MessageRefs:
 
 
 def channels_of(recording: Recording, role: Callable[[int], str]) -> tuple[Channel, ...]:
-    """The channels of a recording in order of their ids; ``role``: that of a channel, by its id."""
+    """Return the channels of a recording, sorted by id. ``role`` returns the role for a channel id."""
     counts = recording.counts or {}
     channels: list[Channel] = []
     for number, record in sorted(recording.channels.items()):
@@ -88,14 +88,14 @@ def channels_of(recording: Recording, role: Callable[[int], str]) -> tuple[Chann
 def frame_refs(
     channels: tuple[Channel, ...], window: tuple[int, int]
 ) -> Callable[[Messages], MessageRefs]:
-    """A function that gives the references of those messages of a run that belong to frames.
+    """Return a function that selects the references of a run's messages that belong to frames.
 
     Parameters
     ----------
     channels : tuple of Channel
-        Messages of those whose role is neither ``ground_truth`` nor ``payload`` last, and belong to none.
+        Only messages of channels with the role ``ground_truth`` or ``payload`` belong to frames.
     window : tuple of int
-        Log times, both included; what a clip carries in from outside them belongs to no frame.
+        First and last log time, both included. A clip may contain messages outside; they belong to no frame.
     """
     start, end = window
     index = np.full(IDS, -1, np.int64)
@@ -112,14 +112,14 @@ def frame_refs(
     return refs
 
 
-# The first reading --------------------------------------------------------------------------------
+# First reading.
 
 BEGINNING: Final = 1_000_000_000
-"""How long after the first frame a message still comes with it; ns of log time."""
+"""Maximum delay of a context message after the first frame; ns of log time."""
 
 
 def count_ref(told: dict[Key, tuple[int, Ref]], key: Key, ref: Ref, times: int = 1) -> int:
-    """Count how often something was told, and keep the message that told it first; the count until now."""
+    """Add to a count, and remember its first message. Return the count before."""
     before, first = told.get(key, (0, ref))
     told[key] = before + times, first
     return before
@@ -127,18 +127,18 @@ def count_ref(told: dict[Key, tuple[int, Ref]], key: Key, ref: Ref, times: int =
 
 @dataclass(slots=True)
 class Lead:
-    """A channel whose messages may be frames.
+    """Channel whose messages may be frames.
 
     Attributes
     ----------
     frames : int
-        How many of its messages are frames.
+        Number of its messages that are frames.
     weight : int
-        How much is in them, by the measure of the flavour.
+        Amount of its content; the unit depends on the flavour.
     first_ns : int
-        Least log time of its frames.
+        Minimum log time of its frames.
     stamps : Stamps
-        The times in its messages.
+        Times in its messages.
     """
 
     frames: int = 0
@@ -151,32 +151,32 @@ AnyLead = TypeVar("AnyLead", bound=Lead)
 
 
 class Survey(Generic[AnyLead]):
-    """The first reading of a recording: what must be known before its frames can be read.
+    """First reading of a recording, which collects the facts needed for its frames.
 
-    What it cannot read is reported when the frames are read.
+    Unreadable messages are reported later, during the reading of the frames.
 
     Parameters
     ----------
     recording : Recording
     wanted : str
-        Id or name that the user gave for the ego; empty: as the recording says.
+        Id or name of the ego from the user; empty: the ego of the recording.
 
     Attributes
     ----------
     recording : Recording
     wanted : str
     leads : dict
-        Channel id → :class:`Lead`, of the channels that may lead.
+        Channel id → :class:`Lead`, for each candidate of the leading channel.
     leading : int
-        Id of the one that does, whose messages are the frames; -1: it is not known yet.
+        Id of the leading channel, whose messages are the frames. -1 means not known yet.
     map_text, map_name : str
-        The road map, and what the recording calls it; empty if it has none.
+        The road map and its name in the recording; empty without a map.
     lost_lanes : list of str
-        Lanes that make no part of it, and why.
+        Lanes missing in the map, with the reasons.
     notes, about_ego : list of str
-        What is odd but lost nothing: of the recording, and of the choice of the ego.
+        Oddities without loss of data: of the recording, and of the choice of the ego.
     lost : LossTally
-        What could not be used.
+        Unusable parts.
     """
 
     def __init__(self, recording: Recording, wanted: str) -> None:
@@ -194,39 +194,39 @@ class Survey(Generic[AnyLead]):
         self._window = recording.window
 
     def meet(self, channel: int) -> bool:
-        """Return whether a channel leads or lasts, so that its only message is no context of its own.
+        """True if a channel contains frames or lasting facts. Its messages are then not treated as context.
 
-        It is asked once for each channel, before its first message is looked at.
+        It is called once per channel, before its first message is examined.
         """
         raise NotImplementedError
 
     def watches(self, channel: int, *, met: bool) -> bool:
-        """Return whether the messages of a channel are to be looked at; ``met``: what :meth:`meet` said.
+        """True if the messages of a channel must be examined. ``met`` is the result of :meth:`meet`.
 
-        It is asked for each run of messages. From ``False`` the answer does not change.
+        It is called for each run of messages. A result of ``False`` is final.
         """
         del channel
         return met
 
     def keeps(self, channel: int) -> bool:
-        """Return whether the messages of a channel will be asked for again when the frames are read."""
+        """True if the reading of the frames needs the messages of a channel again."""
         raise NotImplementedError
 
     def look(self, run: Messages, row: int) -> None:
-        """Look at one message."""
+        """Examine one message."""
         raise NotImplementedError
 
     def rank(self, lead: AnyLead) -> tuple[int, ...]:
-        """Order of the channels that may lead: the greatest does."""
+        """Return the sort key of a candidate. The greatest key wins."""
         return lead.weight, lead.frames
 
     def read(self) -> Self:
-        """Read the recording from end to end.
+        """Read the whole recording, and return the survey.
 
         Raises
         ------
         OutOfOrder
-            Its messages are not in order of time: a new survey reads them sorted.
+            The messages are not in order of time. A new survey reads them sorted.
         TraceError
             The file cannot be read, or a schema is malformed.
         """
@@ -250,7 +250,7 @@ class Survey(Generic[AnyLead]):
     def _look_through(
         self, run: Messages, watched: NDArray[np.bool_], firsts: list[tuple[int, int]]
     ) -> None:
-        """Look at the watched messages of a run; meet each new channel with its first message, not before."""
+        """Examine the watched messages of a run. Each new channel is classified at its first message."""
         start = 0
         for stop, channel in [*firsts, (len(run), -1)]:
             for row in np.flatnonzero(watched[run.channel[start:stop]]).tolist():
@@ -261,13 +261,13 @@ class Survey(Generic[AnyLead]):
                 watched[channel] = self.watches(channel, met=met)
 
     def see_stamp(self, run: Messages, row: int, stamp_ns: int | None) -> None:
-        """Take note of the time in a message of a channel that may lead, unless a clip carries it in."""
+        """Record the time in a message of a candidate channel, if its log time is in the window."""
         log_time, (start, end) = int(run.log_time_ns[row]), self._window
         if start <= log_time <= end:
             self.leads[int(run.channel[row])].stamps.see(log_time, stamp_ns)
 
     def count(self, run: Messages, row: int, weight: int) -> None:
-        """Count a frame of a channel that may lead; what a clip carries in from outside of it is none."""
+        """Count a frame of a candidate channel, if its log time is in the window."""
         log_time, (start, end) = int(run.log_time_ns[row]), self._window
         if start <= log_time <= end:
             lead = self.leads[int(run.channel[row])]
@@ -276,7 +276,7 @@ class Survey(Generic[AnyLead]):
             lead.first_ns = min(lead.first_ns, log_time)
 
     def first_lead(self) -> int:
-        """The channel that leads all others; -1 if none has a frame. Of equal ones it is the first topic."""
+        """Return the best candidate channel; -1 if all lack frames. Equal candidates are sorted by topic."""
         ranked = [
             ([-number for number in self.rank(lead)], self.topic(channel), channel)
             for channel, lead in self.leads.items()
@@ -285,7 +285,7 @@ class Survey(Generic[AnyLead]):
         return min(ranked)[-1] if ranked else -1
 
     def alike(self, channel: int) -> list[int]:
-        """The channels of one topic and one definition, the least first: their messages are those of one."""
+        """Return the channels with the same topic and definition, sorted by id. They count as one channel."""
         channels = self.recording.channels
         return [number for number in sorted(channels) if self._key(number) == self._key(channel)]
 
@@ -296,69 +296,68 @@ class Survey(Generic[AnyLead]):
         return record.topic, record.message_encoding, *named
 
     def shared_stamps(self, channel: int, stamps: Stamps) -> Stamps:
-        """The stamps of a channel like this one that may lead, else ``stamps``."""
+        """Return the stamps of a candidate channel with the same topic and definition, else ``stamps``."""
         leads = self.leads
         return next((leads[one].stamps for one in self.alike(channel) if one in leads), stamps)
 
     def no_frames(self) -> str:
-        """The reason why no channel leads."""
+        """Return the reason for a recording without a leading channel."""
         raise NotImplementedError
 
     def ego_named(self, name: str) -> str | None:
-        """The id of the ego that a name means; None if a reading that begins with it may find more.
+        """Return the id of the ego for a name. ``None`` means that a new reading may find it.
 
         Raises
         ------
         TraceError
-            Nothing bears the name, or several things do.
+            The name does not exist, or is ambiguous.
         """
-        asked = copy(self)  # what an ego is found by stays; the ego that was found does, too
+        asked = copy(self)  # The copy shares the collected facts; the current ego stays.
         asked.wanted, asked.about_ego = name, []
         return asked.find_ego()
 
     def find_ego(self) -> str:
-        """Find the ego, and return its id; empty if there is none.
+        """Return the id of the ego; empty without an ego.
 
         Raises
         ------
         TraceError
-            Nothing bears the name that the user gave, or several things do.
+            The given name does not exist, or is ambiguous.
         """
         raise NotImplementedError
 
     def role(self, channel: int) -> str:
-        """The role of a channel."""
+        """Return the role of a channel."""
         return "ground_truth" if channel in self.alike(self.leading) else "payload"
 
     def context(self) -> Iterable[Ref]:
-        """Messages that later ones depend on."""
+        """Return the messages that later messages depend on."""
         return self.once(self.leads[self.leading].first_ns)
 
     def tell(self, report: TraceReport) -> None:
-        """Say in a report what is known before the frames are read."""
+        """Add the findings of the first reading to a report."""
         report.warnings += [*self.notes, *self.about_ego]
         report.about_ego += self.about_ego
         report.losses += self.lost.losses()
 
     def once(self, first_ns: int) -> list[Ref]:
-        """The only message of each channel that has no other and came with the first frame.
+        """Return the messages of channels that have only one message, near the first frame.
 
-        What is told once and at the beginning, such as the calibration of a camera, is told for all that
-        follows.
+        Such a message, for example a camera calibration, is valid for the whole recording.
         """
         latest = first_ns + BEGINNING
         return [ref for count, ref in self._others.values() if count == 1 and ref[1] <= latest]
 
     def topic(self, channel: int) -> str:
-        """The topic of a channel."""
+        """Return the topic of a channel."""
         return self.recording.channels[channel].topic
 
 
-# The recording ------------------------------------------------------------------------------------
+# Open recording.
 
 
 class MessageTrace:
-    """A recording that is open: a context manager that closes it.
+    """Open recording, a context manager that closes its file.
 
     Parameters
     ----------
@@ -366,11 +365,11 @@ class MessageTrace:
     digest : str
         SHA-256 of the file.
     channels : tuple of Channel
-        Those of the recording, with their roles.
+        Channels of the recording, with their roles.
     ego : str
-        Id of the ego; empty if there is none.
+        Id of the ego; empty without an ego.
     context : iterable of Ref
-        Messages that later ones depend on.
+        Messages that later messages depend on.
     **more
         Other attributes of :class:`~sgstore.world.TraceInfo`.
 
@@ -379,7 +378,7 @@ class MessageTrace:
     recording : Recording
     info : TraceInfo
     report : TraceReport
-        Filled while blocks are read.
+        Filled during the reading of blocks.
     """
 
     name: ClassVar[str] = ""
@@ -425,27 +424,27 @@ class MessageTrace:
         self.recording.close()
 
     def ego_named(self, name: str) -> str | None:
-        """The id of the ego that a name means; None if the recording must be opened for it to be known.
+        """Return the id of the ego for a name. ``None`` means that the recording must be opened again.
 
         Raises
         ------
         TraceError
-            Nothing bears the name, or several things do.
+            The name does not exist, or is ambiguous.
         """
         del name
         return None
 
     def decoder(self, report: TraceReport) -> MessageDecoder[Any]:
-        """A decoder that has read nothing yet. What is known already goes to the report of its reading."""
+        """Return a new decoder, and add the known findings to the report of its reading."""
         raise NotImplementedError
 
     def blocks(self, size: int = 60) -> Iterator[FrameBlock]:
-        """The frames of the trace, ``size`` at a time; block i begins at frame ``i * size``.
+        """Yield the frames of the trace in blocks of ``size`` frames. Block i begins at frame ``i * size``.
 
         Raises
         ------
         TraceError
-            The file cannot be read any more, has no frame, or no frame has the ego that was asked for.
+            The file is no longer readable, has no frame, or the requested ego is in no frame.
         """
         first_steps = self._first_steps()
         report = self.report = TraceReport()
@@ -460,7 +459,7 @@ class MessageTrace:
             raise TraceError(f"no frame: {reason}", path=self.info.path, channel=topic)
 
     def _first_steps(self) -> list[int]:
-        """Times between the first frames; ns."""
+        """Return the time differences between the first frames; ns."""
         decoder = self.decoder(TraceReport())
         times: list[int] = []
         for run in self.recording.walk(TraceReport(), rank=self._rank):
@@ -477,21 +476,21 @@ AnySurvey = TypeVar("AnySurvey", bound=Survey[Any])
 
 
 class SurveyedTrace(MessageTrace, Generic[AnySurvey]):
-    """A recording that was read once when it was opened.
+    """Open recording with a finished first reading.
 
     Parameters
     ----------
     make : callable
-        Makes that first reading, not begun yet. It is called again if messages are not in order of time.
+        Makes a new :class:`Survey`. It is called again if messages are not in order of time.
     digest : str
-        SHA-256 of the file, if it is known; else the file is hashed.
+        SHA-256 of the file if known; empty: the file is hashed.
     **more
         Other attributes of :class:`~sgstore.world.TraceInfo`.
 
     Raises
     ------
     TraceError
-        A schema is malformed, no frame can be read, or nothing bears the name given for the ego.
+        A schema is malformed, no frame can be read, or the name of the ego does not exist.
     """
 
     def __init__(self, make: Callable[[], AnySurvey], digest: str, **more: Any) -> None:
@@ -526,28 +525,28 @@ class SurveyedTrace(MessageTrace, Generic[AnySurvey]):
         return stamps.steps[:FIRST_STEPS] or super()._first_steps()
 
     def ego_named(self, name: str) -> str | None:
-        """The id of the ego that a name means, by what the first reading found."""
+        """Return the id of the ego for a name, from the results of the first reading."""
         return self._survey.ego_named(name)
 
 
-# Flavours that tell plain frames: messages → frames → blocks of frames ----------------------------
+# Readers with complete frames in messages: messages → frames → blocks of frames.
 
 _LATEST: Final = 1 << 62
-"""Simulation times lie between this and its negative; ns."""
+"""Limit of the absolute value of simulation times; ns."""
 _MOTION: Final = slice(POSE.index("vx"), POSE.index("yaw_rate") + 1)
 _LONGEST_REASON: Final = 200
 _NO_EGO: Final = "no frame has an ego"
 
 
 class TraceMessage(NamedTuple):
-    """One message of a recording.
+    """Message of a recording.
 
     Attributes
     ----------
     channel : Channel
         Its topic, schema and encoding.
     log_time_ns : int
-        As the file has it.
+        Log time in the file; ns.
     data : bytes
     """
 
@@ -557,24 +556,24 @@ class TraceMessage(NamedTuple):
 
 
 class FramesTrace(MessageTrace):
-    """Base class of a flavour whose messages tell plain frames.
+    """Base class of a reader whose messages are complete frames.
 
-    A subclass has a ``name``, and says with :meth:`role` which channels it reads and with :meth:`frame` what
-    a message tells. It is then a reader, for an entry point of the group ``sgstore.readers``.
+    A subclass defines ``name``, :meth:`role` (the channels to read) and :meth:`frame` (the conversion of a
+    message). It is then a reader for an entry point of the group ``sgstore.readers``.
 
     Parameters
     ----------
     recording : Recording
     ego : str
-        Id of the ego in all frames; empty: as each frame says.
+        Id of the ego in all frames; empty: the ego of each frame.
     digest : str
-        SHA-256 of the file, if it is known; else the file is hashed.
+        SHA-256 of the file if known; empty: the file is hashed.
 
     Attributes
     ----------
     info : TraceInfo
     report : TraceReport
-        Filled while blocks are read.
+        Filled during the reading of blocks.
 
     Raises
     ------
@@ -583,9 +582,9 @@ class FramesTrace(MessageTrace):
 
     Notes
     -----
-    Frames mean what they mean to :meth:`sgstore.sgg.SceneGraphGenerator.step`, with two differences. A
-    velocity, acceleration or yaw rate that is not told is derived by differences from the frames around it. A
-    static entity that is told only after the first frame is kept as one that does not move from then on.
+    Frames have the same meaning as for :meth:`sgstore.sgg.SceneGraphGenerator.step`, with two differences. A
+    missing velocity, acceleration or yaw rate is derived from the frames before and after. A static entity that
+    first appears after the first frame counts as a moving one at rest.
     """
 
     def __init__(self, recording: Recording, *, ego: str = "", digest: str = "") -> None:
@@ -597,7 +596,7 @@ class FramesTrace(MessageTrace):
         self._map_losses = LossTally()
         self._ego = ""
         first, refs, map_text = self._beginning()
-        self._ego = ego if ego != first else ""  # frames that name others may still do so
+        self._ego = ego if ego != first else ""  # Frames with other egos keep them.
         super().__init__(
             recording,
             digest or digest_of(recording.path),
@@ -609,7 +608,7 @@ class FramesTrace(MessageTrace):
         )
 
     def ego_named(self, name: str) -> str:
-        """The id of the ego that a name means: ids are all that frames tell."""
+        """Return the name unchanged, because frames contain only ids."""
         return name
 
     @staticmethod
@@ -619,60 +618,60 @@ class FramesTrace(MessageTrace):
         Parameters
         ----------
         channel : Channel
-            Its topic, schema and encoding; its own role is not known yet.
+            Its topic, schema and encoding; its role is not set yet.
 
         Returns
         -------
         str
-            ``ground_truth``: its messages tell frames. ``map``: its first message is the road map. ``payload``:
-            neither; a frame refers to its messages.
+            ``ground_truth``: its messages are frames. ``map``: its first message is the road map. ``payload``:
+            all others; frames refer to its messages.
         """
         raise NotImplementedError
 
     def frame(self, message: TraceMessage) -> Frame | None:
-        """Return the frame that a message tells.
+        """Convert a message into a frame.
 
         Parameters
         ----------
         message : TraceMessage
-            Of a channel whose role is ``ground_truth``; they come in order of their log times.
+            Of a channel with the role ``ground_truth``. Messages come in order of their log times.
 
         Returns
         -------
         Frame or None
-            ``None``: the message alone is no frame.
+            ``None`` means that the message alone is not a frame.
 
         Notes
         -----
-        Whatever it raises makes the message a loss, with the channel, the time and the reason.
+        If it raises any exception, the message becomes a loss with channel, time and reason.
         """
         raise NotImplementedError
 
     def start(self) -> None:
-        """Forget earlier messages: :meth:`frame` is given them from the first one on.
+        """Reset the state before the messages are read again from the first one.
 
-        Only a flavour that puts several messages together needs it.
+        Only readers that combine several messages need it.
         """
 
     def map_text(self, message: TraceMessage) -> str:
-        """Return the OpenDRIVE text that a message of a channel with the role ``map`` holds."""
+        """Return the OpenDRIVE text in a message of a channel with the role ``map``."""
         return message.data.decode("utf-8")
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:
-        """True if a channel of a recording tells frames of this flavour."""
+        """True if a channel of the recording contains frames of this flavour."""
         return any(channel.role == "ground_truth" for channel in _channels(cls, recording))
 
     def decoder(self, report: TraceReport) -> _FramesDecoder:
-        """A decoder that has read nothing yet."""
+        """Return a new decoder."""
         self.start()
         report.losses += self._map_losses.losses()
         return _FramesDecoder(self, self._channels, self._ego, self.recording.window, report)
 
     def _beginning(self) -> tuple[str, list[Ref], str]:
-        """The ego of the first frame, the messages that later ones depend on, and the road map.
+        """Return the ego of the first frame, the context messages, and the road map.
 
-        Reads the recording as far as it takes to find them.
+        The recording is read only as far as necessary.
         """
         decoder = self.decoder(TraceReport())
         maps = {c.id for c in self._channels.values() if c.role == "map" and c.messages}
@@ -695,20 +694,20 @@ class FramesTrace(MessageTrace):
     def _read_map(self, run: Messages, row: int) -> str:
         try:
             return self.map_text(_message(self._channels, run, row))
-        except Exception as error:  # noqa: BLE001  whatever a flavour of another package does
+        except Exception as error:  # noqa: BLE001  a reader of another package can raise anything
             _lose(self._map_losses, self._channels, run, row, error)
             return ""
 
 
 class _FramesDecoder(MessageDecoder[FrameRows]):
-    """Messages → frames, which are whole as they come.
+    """Decoder of messages that are complete frames.
 
     Attributes
     ----------
     first : str or None
-        The ego of the first frame; ``None``: there was no frame yet.
+        The ego of the first frame. ``None`` means no frame yet.
     has_static : bool
-        Whether anything is static.
+        True if an entity is static.
     """
 
     def __init__(
@@ -725,17 +724,17 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
         self.has_static = False
         self._trace, self._named, self._ego = trace, channels, ego
         self._known: dict[str, tuple[int, Entity]] = {}
-        self._late: dict[int, Entity] = {}  # static, but told when frames had been handed out
+        self._late: dict[int, Entity] = {}  # Static entities that appeared after the first block.
         self._begun = self._has_ego = False
 
     def decode(self, run: Messages, row: int) -> FrameRows | None:
-        """The frame that a message is; one that cannot be read, or contradicts others, is a loss."""
+        """Return the frame of a message. An unreadable or contradictory frame is a loss."""
         try:
             frame = self._trace.frame(_message(self._named, run, row))
             if frame is None:
                 return None
             self._check(frame)
-        except Exception as error:  # noqa: BLE001  whatever a flavour of another package does
+        except Exception as error:  # noqa: BLE001  a reader of another package can raise anything
             _lose(self._unreadable, self._named, run, row, error)
             return None
         self.first = frame.ego if self.first is None else self.first
@@ -745,17 +744,17 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
             if entity.static and entity.ident not in self._known:
                 self._stand(entity)
         log_time = int(run.log_time_ns[row])
-        if not self.is_inside(log_time):  # a clip brings it for what stands
+        if not self.is_inside(log_time):  # A clip contains it for its static entities.
             return None
         self._begun = True
         return self._rows(frame, log_time)
 
     def complete(self, frames: list[FrameRows]) -> list[FrameRows]:
-        """The same frames: a message tells all of one."""
+        """Return the frames unchanged, because each message is a complete frame."""
         return frames
 
     def settle(self) -> None:
-        """Report what could not be read, and the lack of an ego."""
+        """Report unreadable messages, and a missing ego."""
         super().settle()
         if self._has_ego or not self._report.frames:
             return
@@ -764,7 +763,7 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
         self._warn_of_egos(_NO_EGO)
 
     def _check(self, frame: object) -> None:
-        """Raise if a frame cannot follow those before it; nothing of it is remembered then."""
+        """Raise if a frame contradicts earlier ones. The state of the decoder does not change."""
         if not isinstance(frame, Frame):
             raise TypeError(f"{type(frame).__name__} is no Frame")
         if abs(frame.time_ns) >= _LATEST:
@@ -775,10 +774,10 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
         return self._known[ident][1].static if ident in self._known else None
 
     def _stand(self, entity: Entity) -> None:
-        """Enter what never moves.
+        """Add a static entity.
 
-        Scenery stands in all frames of its block. So what comes later than the first frame gets a row in each
-        frame instead: else it would depend on where a block begins.
+        Scenery is valid in all frames of its block. A static entity after the first frame therefore gets a row
+        in each frame instead. Otherwise, the result would depend on the start of a block.
         """
         self.has_static = True
         if not self._begun:
@@ -823,7 +822,7 @@ def _meaning(entity: Entity) -> TypeMeaning:
 
 
 def _driven(moving: dict[int, Entity]) -> dict[int, tuple[float, ...]]:
-    """Node id → how it is driven, of those of which anything is told."""
+    """Return the control inputs by node id, for entities with at least one known input."""
     told = ((node, entity.numbers[len(POSE) :]) for node, entity in moving.items())
     return {node: inputs for node, inputs in told if not np.isnan(inputs).all()}
 
@@ -831,7 +830,7 @@ def _driven(moving: dict[int, Entity]) -> dict[int, tuple[float, ...]]:
 def _channels(
     flavour: FramesTrace | type[FramesTrace], recording: Recording
 ) -> tuple[Channel, ...]:
-    """The channels of a recording, each with the role that a flavour gives it."""
+    """Return the channels of a recording, with the roles of a flavour."""
     found = channels_of(recording, lambda _: "payload")
     return tuple(replace(channel, role=flavour.role(channel)) for channel in found)
 
@@ -848,7 +847,7 @@ def _lose(
     row: int,
     error: Exception,
 ) -> None:
-    """Count a message that could not be read."""
+    """Count an unreadable message."""
     topic = channels[int(run.channel[row])].topic
     reason = f"{topic!r}: {error!r}"[:_LONGEST_REASON]
     losses.add(reason, int(run.log_time_ns[row]), int(run.length[row]))

@@ -1,11 +1,9 @@
-"""Blocks of frames: rows of decoded messages, entities, and numbers that a recording lacks.
+"""Construction of frame blocks from decoded messages, with entities and derived numbers.
 
-The :class:`MessageDecoder` of a flavour makes :class:`FrameRows` of messages and enters what it meets into a
-:class:`EntityTable`.
-:func:`assemble` makes blocks of that, ahead of what it hands out: a velocity that the recording lacks is
-the difference of two positions, the second of them may belong to the first frame of the next block, and
-what else is told of that frame may stand behind the message that leads. So a value never depends on where
-a block begins or ends.
+The :class:`MessageDecoder` of a flavour converts messages into :class:`FrameRows` and adds entities to an
+:class:`EntityTable`. :func:`assemble` makes blocks of them and reads ahead, for two reasons. A missing velocity
+is the difference of two positions, and the second one may be in the next block. Other messages about a frame
+may follow its leading message. The values therefore never depend on the limits of a block.
 """
 
 from __future__ import annotations
@@ -51,55 +49,55 @@ if TYPE_CHECKING:
     Steps = tuple[Ints, Ints, Floats, Floats]
 
 Called: TypeAlias = "tuple[TypeMeaning, str]"
-"""What an entity is, and the simulator's own name of its type."""
+"""Meaning of an entity's type, and the simulator's own name of the type."""
 
 
 Raw = TypeVar("Raw")
 
 NAN: Final = float("nan")
 FAR: Final = 1e9
-"""Greatest coordinate of anything on earth, in any projection; m. Beyond it a pose is not usable."""
+"""Greatest coordinate on earth, in any projection; m. Larger values are unusable."""
 
 UPRIGHT: Final = 1 - 1e-13
-"""Sine of the pitch beyond which rounding leaves no heading and roll of their own."""
+"""Sine of the pitch above which rounding makes heading and roll indistinguishable."""
 
 NEAR_REFS: Final = 250_000
-"""Messages behind a frame, and before the next one, that are referred to however many there are."""
+"""Maximum number of message references after a frame, and before the next one."""
 
 MOST_EVENTS: Final = 10_000
-"""Events that a report lists; a vehicle that leans on a wall collides in every frame. Blocks have them all."""
+"""Maximum number of events in a report. Blocks contain all: a vehicle at a wall collides in every frame."""
 
 _X, _HEADING, _VELOCITY, _ACCELERATION, _YAW_RATE = 0, 3, 6, 9, 12
 
 
 NO_INPUTS: Final = (NAN,) * len(INPUTS)
-"""Controls of whom the recording tells none."""
+"""Control inputs of an entity without recorded ones."""
 
 
 @dataclass(slots=True)
 class FrameRows:
-    """One frame, decoded.
+    """Decoded frame.
 
     Attributes
     ----------
     time_ns, log_time_ns : int
         Simulation time; log time of the leading message.
     ego : int
-        Node id, -1 where it is absent.
+        Node id; -1 if absent.
     node, lights, light_state : (n,) int64
         As in :class:`sgstore.world.States`.
     values : (n, 16) float64
         Columns :data:`POSE`.
     controls : tuple of float
-        :data:`sgstore.world.INPUTS` of the ego; NaN where the recording has none.
+        :data:`sgstore.world.INPUTS` of the ego; NaN for missing ones.
     driven : mapping
-        Node id → the same, of other vehicles than the ego.
+        Node id → the same inputs, of vehicles other than the ego.
     kinds : mapping
-        Node id → what the frame says that it is, of entities that were entered as another kind.
+        Node id → kind in this frame, for entities that were added with another kind.
     seconds : float
-        Time since the frame before; s. NaN: it is not known, or too long to derive anything across it.
+        Time since the previous frame; s. NaN means unknown, or too long to derive numbers.
     returned : int
-        Entities up to this frame whose id another one had before; see :class:`LifetimeTracker`.
+        Number of entities up to this frame with a reused id; see :class:`LifetimeTracker`.
     """
 
     time_ns: int
@@ -119,7 +117,7 @@ class FrameRows:
         return len(self.node)
 
     def with_heads(self, heads: tuple[Ints, Floats, Ints]) -> FrameRows:
-        """The same, and behind it the rows of traffic lights: node ids, columns :data:`POSE`, states."""
+        """Return the frame with additional rows of traffic lights: node ids, columns :data:`POSE`, states."""
         node, values, light_state = heads
         if not len(node):
             return self
@@ -133,7 +131,7 @@ class FrameRows:
 
 
 class EntityRow(NamedTuple):
-    """A row of :class:`sgstore.world.Entities`."""
+    """Row of :class:`sgstore.world.Entities`."""
 
     ident: str
     kind: int
@@ -148,28 +146,28 @@ class EntityRow(NamedTuple):
 
 @dataclass(slots=True)
 class EntityTable:
-    """The entities of a trace in the order in which they were met; the index is the node id. And its events.
+    """Entities of a trace in order of appearance, indexed by node id; also its events.
 
     Attributes
     ----------
     report : TraceReport
-        Takes up the type names that nothing maps.
+        Receives the type names without a mapping.
     size : int
-        How many there are.
+        Number of entities.
     absurd : int
-        Numbers that nothing on earth has, in states and poses.
+        Number of impossible values in states and poses.
     happened : int
-        How many events there were.
+        Number of events.
     faults : FaultTally
-        Sizes and speeds that no body has.
+        Implausible sizes and speeds.
     impossible : (2,) int64
-        Derived velocities and accelerations that no body has.
+        Number of implausible derived velocities and accelerations.
 
     Notes
     -----
-    A decoder knows an entity by the number that :meth:`enter` returned: there is one for each id. Node ids are
-    the same numbers until an id returns as another entity (:meth:`enter_again`): that one gets the next node
-    id, and those of later entities move up by one (:meth:`nodes_of`).
+    A decoder identifies an entity by the number that :meth:`enter` returned: one number per id. Node ids equal
+    these numbers until an id returns as another entity (:meth:`enter_again`). This entity gets the next node
+    id, and the node ids of later entities increase by one (:meth:`nodes_of`).
     """
 
     report: TraceReport
@@ -198,18 +196,18 @@ class EntityTable:
         pose: tuple[float, ...] | None = None,
         trailer: str = "",
     ) -> int:
-        """Enter an entity and return its node id.
+        """Add an entity and return its node id.
 
         Parameters
         ----------
         ident : str
-            The simulator's own id; where another entity bears it too, the kind is appended.
+            The simulator's own id. If another entity has the same id, the kind is appended.
         meaning : TypeMeaning
         type_name, map_ref : str
         pose : tuple of float, optional
-            Columns :data:`POSE` of an entity that never moves.
+            Columns :data:`POSE` of a static entity.
         trailer : str
-            Id of the trailer that it pulls; empty: none, or not known.
+            Id of the trailer that it pulls. Empty: no trailer, or an unknown one.
         """
         if ident in self._idents:
             ident = f"{ident}:{meaning.kind}"
@@ -237,46 +235,46 @@ class EntityTable:
         return node
 
     def entered(self, number: int) -> EntityRow:
-        """The entity with a number."""
+        """Return the entity with a number."""
         return self._rows[number]
 
     def enter_again(self, row: EntityRow, before: int) -> int:
-        """Enter another entity with an id that is known, and return its node id.
+        """Add another entity with a known id, and return its node id.
 
         Parameters
         ----------
         row : EntityRow
         before : int
-            How many ids are known when it is met.
+            Number of ids known before it appears.
         """
         self._returned.append((before, row))
         return before + len(self._returned) - 1
 
     def turn(self, number: int, lifetime: int, seq: int) -> None:
-        """Note which of its entities an id has from a frame on."""
+        """Record the lifetime of an id that is valid from a frame on."""
         self._turns.setdefault(self._rows[number].ident, []).append((seq, lifetime))
 
     @property
     def returned(self) -> int:
-        """How many entities have an id that another one had before."""
+        """Number of entities with a reused id."""
         return len(self._returned)
 
     def nodes_of(self, numbers: Ints) -> Ints:
-        """Node ids of the first entities with some numbers; below 0: as they are."""
+        """Return the node ids of the first entities with some numbers. Negative numbers stay."""
         if not self._returned:
             return numbers
         places = np.array([place for place, _ in self._returned], np.int64)
         return numbers + np.searchsorted(places, numbers, side="right")
 
     def happen(self, event: Event) -> None:
-        """Take up an event."""
+        """Add an event."""
         self.happened += 1
         self._events.append(event)
         if self.happened <= MOST_EVENTS:
             self.report.events.append(event)
 
     def take_events(self) -> tuple[Event, ...]:
-        """The events that were not taken yet."""
+        """Remove and return the events since the last call."""
         events, self._events = self._events, []
         if self._turns:
             events = [
@@ -290,13 +288,13 @@ class EntityTable:
         return tuple(events)
 
     def _lifetime(self, ident: str, seq: int) -> int:
-        """Which of the entities with an id a frame has."""
+        """Return the lifetime of an id in a frame."""
         turns = self._turns.get(ident, ())
         at = bisect_right(turns, seq, key=itemgetter(0))
         return turns[at - 1][1] if at else 1
 
     def settle(self) -> None:
-        """Report what is odd, once everything was taken."""
+        """Add the warnings about implausible numbers to the report, at the end of the reading."""
         warn = self.report.warnings.append
         if self.absurd:
             warn(f"{self.absurd} numbers of {FAR:g} and more are taken as missing")
@@ -310,7 +308,7 @@ class EntityTable:
             warn(f"of {self.happened} events the report lists the first {MOST_EVENTS}")
 
     def plausible(self, values: Floats, nodes: Sequence[int] | Ints) -> Floats:
-        """The numbers of entities without those that no body has; these are counted.
+        """Return the numbers of entities without implausible ones, which are counted.
 
         Parameters
         ----------
@@ -325,19 +323,19 @@ class EntityTable:
         return values
 
     def count_unknown(self, type_name: str) -> None:
-        """Count an entity whose type name nothing maps to a kind of its own."""
+        """Count an entity with an unmapped type name."""
         unknown = self.report.unknown_types
         unknown[type_name] = unknown.get(type_name, 0) + 1
 
     def take(self, upto: int, returned: int) -> tuple[Entities, States]:
-        """The entities that were not taken yet, and the poses of the static ones.
+        """Return the entities since the last call, and the poses of the static ones.
 
         Parameters
         ----------
         upto : int
-            How many ids are known.
+            Number of known ids.
         returned : int
-            How many entities have an id that another one had before.
+            Number of entities with a reused id.
         """
         rows = self._rows[self._taken : upto]
         for place, row in reversed(self._returned[self._returned_taken : returned]):
@@ -366,10 +364,9 @@ class EntityTable:
 
 
 class LossTally:
-    """Losses by their reason.
+    """Counter of losses by reason.
 
-    A reason that comes again adds to the loss that there is; beyond :attr:`MOST` reasons the others are
-    counted together.
+    A repeated reason adds to the existing loss. After :attr:`MOST` reasons, further ones are counted together.
     """
 
     MOST: ClassVar[int] = 1000
@@ -378,7 +375,7 @@ class LossTally:
         self._found: dict[str, Loss] = {}
 
     def add(self, reason: str, log_time_ns: int, size: int = 0) -> None:
-        """Count one more, of ``size`` bytes."""
+        """Add a loss of ``size`` bytes."""
         if reason not in self._found and len(self._found) >= self.MOST:
             reason = "and more of the same kinds"
         last = self._found.get(reason) or Loss(reason, 0, 0, log_time_ns, log_time_ns)
@@ -391,30 +388,30 @@ class LossTally:
         )
 
     def losses(self) -> list[Loss]:
-        """One loss for each reason; ``messages`` is how often."""
+        """Return one loss per reason, with its number of messages."""
         return list(self._found.values())
 
 
 class MessageDecoder(Generic[Raw]):
-    """Messages → frames, in two steps, so that the numbers of many frames can be read at once.
+    """Converter of messages into frames, in two steps, to process the numbers of many frames at once.
 
     Parameters
     ----------
     channels : collection of int
-        Ids of the channels whose messages it asks for: those that are frames, and those that say more about the
-        same instants.
+        Ids of the channels to decode: channels of frames, and channels with further facts about the same
+        instants.
     window : tuple of int
-        Log times, both included, between which messages are frames; others only tell what lasts.
+        First and last log time of frames, both included. Other messages only provide lasting facts.
     report : TraceReport
-        Takes up what cannot be used.
+        Receives losses and warnings.
 
     Attributes
     ----------
     roster : EntityTable
-        Takes up entities while messages are decoded.
+        Receives the entities of decoded messages.
     channels : frozenset of int
     sure_kinds : bool
-        Whether kinds are certain, as those of a simulator; see :class:`LifetimeTracker`.
+        True if kinds are certain, as from a simulator; see :class:`LifetimeTracker`.
     """
 
     sure_kinds: ClassVar[bool] = True
@@ -430,22 +427,22 @@ class MessageDecoder(Generic[Raw]):
         self._untimed = 0
 
     def decode(self, run: Messages, row: int) -> Raw | None:
-        """The frame that a message is, or ``None`` if it is none."""
+        """Return the frame of a message. ``None`` means that the message is not a frame."""
         raise NotImplementedError
 
     def complete(self, frames: list[Raw]) -> list[FrameRows]:
-        """The same frames with their numbers.
+        """Return the frames with all their numbers.
 
-        Each has been followed by another, or by the end of the recording: what belongs to the same instant
-        may stand behind the message that leads.
+        It is called for a frame only after the next frame or the end of the recording, because other messages
+        about the same instant may follow the leading message.
         """
         raise NotImplementedError
 
     def settle(self) -> None:
-        """Report what could not be used, once all frames are read."""
+        """Report the losses, after all frames are read."""
         losses = self._report.losses
         losses += self._unreadable.losses()
-        for loss in self._unusable.losses():  # of states, which are no messages
+        for loss in self._unusable.losses():  # These losses are states, not messages.
             reason = f"{loss.reason}: {loss.messages} states were left out"
             losses.append(replace(loss, reason=reason, messages=0, bytes=0))
         if self._untimed:
@@ -453,15 +450,15 @@ class MessageDecoder(Generic[Raw]):
             self._report.warnings.append(words)
 
     def is_inside(self, log_time_ns: int) -> bool:
-        """Return whether a message logged then is a frame; a clip brings others for what lasts."""
+        """True if a message with this log time can be a frame. Clips also contain earlier messages."""
         return self._window[0] <= log_time_ns <= self._window[1]
 
     def lose(self, reason: str, run: Messages, row: int) -> None:
-        """Count a message that cannot be read."""
+        """Count an unreadable message."""
         self._unreadable.add(reason, int(run.log_time_ns[row]), int(run.length[row]))
 
     def _warn_of_egos(self, words: str) -> None:
-        """Warn of the lack of an ego; who names the egos is not concerned."""
+        """Add a warning about a missing ego. It is dropped if the user names the egos."""
         self._report.warnings.append(words)
         self._report.about_ego.append(words)
 
@@ -473,32 +470,32 @@ def assemble(
     refs: Callable[[Messages], MessageRefs],
     first_steps: Iterable[int] = (),
 ) -> Iterator[FrameBlock]:
-    """Blocks of frames from the messages of a recording.
+    """Yield blocks of frames from the messages of a recording.
 
     Parameters
     ----------
     runs : iterable of Messages
         In file order.
     size : int
-        Frames of a block; the last may have fewer.
+        Frames per block; the last block may have fewer.
     decoder : MessageDecoder
     refs : callable
-        The references of those messages that belong to frames.
+        Returns the references of a run's messages that belong to frames.
     first_steps : iterable of int
         Times between the first frames; ns.
 
     Yields
     ------
     FrameBlock
-        Its messages are those from its first frame up to the next block's; what was logged with a frame comes
-        with it.
+        Its messages are those from its first frame up to the next block. Messages with the log time of a frame
+        belong to this frame.
     """
     wanted = np.zeros(IDS, np.bool_)
     wanted[[*decoder.channels]] = True
     raw: list[Raw] = []
-    sizes: list[int] = []  # how many ids are known with each of them
+    sizes: list[int] = []  # Number of known ids at each frame.
     lives = LifetimeTracker(decoder.roster, first_steps, sure_kinds=decoder.sure_kinds)
-    done: list[FrameRows] = []  # the frame before the block, and those of it that are complete
+    done: list[FrameRows] = []  # The frame before the block, and its completed frames.
     open_refs: list[MessageRefs] = []
     block_refs: list[MessageRefs] = []
     between = _Between()
@@ -511,7 +508,7 @@ def assemble(
             if frame is None:
                 continue
             window = size + (first > 0)
-            if len(done) + len(raw) > window:  # the frame behind the block is complete now, too
+            if len(done) + len(raw) > window:  # The frame after the block is complete, too.
                 done += lives.follow(_on_earth(decoder.complete(raw), decoder.roster), sizes)
                 yield _block(first, done, size, block_refs, decoder.roster, known)
                 first, done, raw, sizes = first + size, done[-2:], [], []
@@ -545,10 +542,10 @@ def assemble(
 
 @dataclass(slots=True)
 class _Between:
-    """References of messages between two frames: if they are very many, the first and the last of them.
+    """Buffer of message references between two frames. Of very many, it stores only the first and last.
 
-    A recording may hold hours of pictures without any ground truth. What stands far from every frame is the
-    payload of none.
+    A recording may contain hours of pictures without ground truth. Messages far from every frame are not
+    needed.
     """
 
     dropped: int = 0
@@ -561,12 +558,12 @@ class _Between:
         if self._total > 3 * NEAR_REFS:
             whole, near = chained(self._parts), np.arange(NEAR_REFS)
             self.dropped += len(whole) - 2 * NEAR_REFS
-            # As copies, so that the whole is not kept alive by a part of it.
+            # As copies, so that a part does not keep the whole array alive.
             self._parts = [taken(whole, near), taken(whole, near + len(whole) - NEAR_REFS)]
             self._total = 2 * NEAR_REFS
 
     def split(self, log_time_ns: int) -> tuple[list[MessageRefs], list[MessageRefs]]:
-        """All of them: those of other log times, and those of this one; then there are none."""
+        """Remove all references. Return those of other log times, and those of the given log time."""
         if not self._total:
             return self.take(), []
         whole = chained(self.take())
@@ -574,13 +571,13 @@ class _Between:
         return [taken(whole, np.flatnonzero(~same))], [taken(whole, np.flatnonzero(same))]
 
     def take(self) -> list[MessageRefs]:
-        """All of them, in order; then there are none."""
+        """Remove and return all references, in order."""
         parts, self._parts, self._total = self._parts, [], 0
         return parts
 
 
 def counted(blocks: Iterable[FrameBlock], report: TraceReport) -> Iterator[FrameBlock]:
-    """The same blocks, while a report counts their frames and states and watches their clock."""
+    """Yield the blocks unchanged, and add their frames, states and clock steps to the report."""
     last: int | None = None
     back, still = 0, 0
     for block in blocks:
@@ -606,9 +603,9 @@ def _block(
     roster: EntityTable,
     known: int,
 ) -> FrameBlock:
-    """The block of ``size`` frames in a window, which has the frames before and behind it too, if any.
+    """Return the block of ``size`` frames in a window that also contains the frames before and after it.
 
-    ``known``: how many entities had been met before the next block's first frame.
+    ``known``: number of entities before the first frame of the next block.
     """
     skipped = int(first > 0)
     frames = window[skipped : skipped + size]
@@ -650,27 +647,28 @@ def _block(
 
 
 FIRST_STEPS: Final = 64
-"""Steps of the clock whose median is the period of a recording, at any time of it."""
+"""Number of clock steps; their median is the current period of a recording."""
 
 
 class LifetimeTracker:
-    """Frames in order, each with the time since the one before and the node ids of its entities.
+    """Assignment of node ids and time steps to frames, for ids that are reused by other entities.
 
-    Node ids depend on lifetimes: :class:`~sgstore.world.Lives` has the rule. Most ids have one entity in all
-    frames. They are compared as arrays, and only the rows that may be another entity one by one.
+    Node ids depend on lifetimes, by the rule of :class:`~sgstore.world.Lives`. Most ids have the same entity in
+    all frames. They are compared as arrays; only the rows of possibly different entities are processed one by
+    one.
 
     Parameters
     ----------
     roster : EntityTable
-        Takes up the other entities.
+        Receives the additional entities.
     first_steps : iterable of int
         Times between the first frames of the recording; ns.
     sure_kinds : bool
-        False: the kind of an entity in a frame is a guess.
+        False means that the kind of an entity in a frame is a guess.
     """
 
     MOST: ClassVar[int] = 20
-    """Entities that a report names."""
+    """Maximum number of reused ids listed in a report."""
 
     def __init__(
         self, roster: EntityTable, first_steps: Iterable[int], *, sure_kinds: bool = True
@@ -681,14 +679,16 @@ class LifetimeTracker:
         self._time: int | None = None
         self._seq = self._run = 0
         self._gaps: list[int] = []
-        self._seen = np.zeros((0, 2), np.int64)  # of each id: time, and run of the clock; -1: never
+        self._seen = np.zeros(
+            (0, 2), np.int64
+        )  # For each id: time, and run of the clock; -1 if never seen.
         self._places = np.zeros((0, 3))
-        # Node id and lifetime of the entities of each id that was called another kind, or has leapt.
+        # Node id and lifetime of the entities of each id with a changed kind or a jump.
         self._lives: dict[int, Lives[tuple[int, int]]] = {}
         self._warnings: list[str] = []
 
     def follow(self, frames: list[FrameRows], sizes: list[int]) -> list[FrameRows]:
-        """The next frames; ``sizes``: how many ids are known with each."""
+        """Return the next frames with their final node ids. ``sizes``: number of known ids at each frame."""
         runs: list[int] = []
         for frame in frames:
             seconds = self._seconds(frame.time_ns)
@@ -704,7 +704,7 @@ class LifetimeTracker:
         ]
 
     def settle(self) -> None:
-        """Report which ids have returned, and the gaps of the clock."""
+        """Add warnings about reused ids and gaps of the clock to the report."""
         warnings = self._roster.report.warnings
         warnings += self._warnings[: self.MOST]
         if len(self._warnings) > self.MOST:
@@ -717,14 +717,14 @@ class LifetimeTracker:
             )
 
     def _seconds(self, time_ns: int) -> float:
-        """Time since the last frame; NaN: nothing is derived across it."""
+        """Return the time since the last frame; s. NaN means that numbers must not be derived across it."""
         last, self._time = self._time, time_ns
         step = 0 if last is None else time_ns - last
         if step < 0:
             self._run += 1
         if step <= 0:
             return NAN
-        # A median is at least the least: most steps need no median.
+        # The median is at least the minimum, so most steps do not need it.
         short = not self._steps or step <= 3 * min(self._steps)
         joined = short or step <= derivable_ns(float(np.median(self._steps)))
         self._steps.append(step)
@@ -733,9 +733,9 @@ class LifetimeTracker:
         return step / 1e9 if joined else NAN
 
     def _earlier(self, frames: list[FrameRows], runs: list[int]) -> list[dict[int, Sight | None]]:
-        """For each frame: row → where its id was seen before, for rows that may be another entity.
+        """Return, for each frame, the rows that may be another entity, with the last place of their id.
 
-        These are rows at a leap, and rows of ids that some of these frames call another kind.
+        These are ids with a jump, and ids with a different kind in some frame.
         """
         counts = [len(frame) for frame in frames]
         found: list[dict[int, Sight | None]] = [{} for _ in frames]
@@ -750,7 +750,7 @@ class LifetimeTracker:
         times = np.array([frame.time_ns for frame in frames], np.int64)
         now = np.repeat(np.stack([times, np.array(runs)], axis=1), counts, axis=0)[rows]
         placed = np.isfinite(place[:, :2]).all(axis=1) & ~lamp
-        # The latest row of the same id at a known place, up to this one and before it.
+        # The latest row of the same id with a known place: up to this row, and before it.
         at, begins = np.arange(len(ids)), np.diff(ids, prepend=-1) != 0
         first = np.maximum.accumulate(np.where(begins, at, 0))
         latest = np.maximum.accumulate(np.where(placed, at, -1))
@@ -783,7 +783,7 @@ class LifetimeTracker:
     def _entered(
         self, frame: FrameRows, run: int, earlier: dict[int, Sight | None], size: int
     ) -> FrameRows:
-        """A frame with the node ids of its entities; those that have returned are entered."""
+        """Return a frame with the node ids of its entities. Entities with a reused id are added."""
         numbers, nodes = frame.node.tolist(), self._roster.nodes_of(frame.node).tolist()
         for row, number in enumerate(numbers):
             if row not in earlier and number not in self._lives:
@@ -807,7 +807,7 @@ class LifetimeTracker:
         )
 
     def _follow(self, number: int, kind: int, here: Sight, called: Called | None, size: int) -> int:
-        """The node id of an id in a frame."""
+        """Return the node id of an id in a frame."""
         lives = self._lives[number]
         before = lives.last
 
@@ -822,7 +822,7 @@ class LifetimeTracker:
         return node
 
     def _enter(self, number: int, called: Called | None, size: int, why: str) -> tuple[int, int]:
-        """Enter another entity of an id, and return its node id and its lifetime."""
+        """Add another entity of an id, and return its node id and lifetime number."""
         row = self._roster.entered(number)
         if called is not None:
             meaning, type_name = called
@@ -841,7 +841,7 @@ class LifetimeTracker:
 
 
 def _on_earth(frames: list[FrameRows], roster: EntityTable) -> list[FrameRows]:
-    """The same frames without numbers that nothing on earth has; they are counted, and missing from now on."""
+    """Replace impossible numbers of frames by NaN, and count them."""
     values = np.concatenate([frame.values for frame in frames] or [np.zeros((0, len(POSE)))])
     absurd = np.abs(values) >= FAR
     if absurd.any():
@@ -859,7 +859,7 @@ def _on_earth(frames: list[FrameRows], roster: EntityTable) -> list[FrameRows]:
 
 
 def _controls(nodes: Ints, ego: Ints, frames: list[FrameRows], counts: Ints) -> dict[str, Floats]:
-    """Control inputs in the rows of the ego and of others that have any; nothing where no frame tells any."""
+    """Return the columns of control inputs, of the ego and other vehicles; empty if all are unknown."""
     inputs = np.array([frame.controls for frame in frames], np.float64)
     others = [frame.driven for frame in frames]
     if np.isnan(inputs).all() and not any(others):
@@ -882,32 +882,33 @@ def _states(node: Ints, values: Floats, **more: NDArray[np.generic]) -> States:
 def derive(
     node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bools, rows: slice
 ) -> tuple[Floats, Ints, Ints]:
-    """Velocities, accelerations and yaw rates that a recording lacks, by differences.
+    """Derive missing velocities, accelerations and yaw rates from differences.
 
     Parameters
     ----------
     node, frame : (n,) int64
-        Node id and frame of each row; frames ascend, a node comes once in a frame.
+        Node id and frame of each row. Frames ascend; a node has one row per frame.
     seconds : (F,) float64
-        Time from the frame before to each frame; s. NaN: nothing may be derived across it.
+        Time from the previous frame to each frame; s. NaN: numbers must not be derived across it.
     values : (n, 16) float64
-        Columns :data:`POSE`; NaN is what is lacking.
+        Columns :data:`POSE`; NaN for missing numbers.
     fixed : (n,) bool
-        Rows of what does not move; nothing is derived for them.
+        Rows of static entities, which are skipped.
     rows : slice
-        The rows that are wanted; those outside it are only differed from.
+        Rows of the result. Other rows are only used for differences.
 
     Returns
     -------
     values : (m, 16) float64
-        The wanted rows. A velocity is the difference of the positions one frame before and one behind,
-        or of one of them and this, where the entity is not in the other, time stands still, or no body moves
-        so fast; NaN if in neither. An acceleration is the difference of velocities likewise if they were
-        read, else the second difference of positions: it needs both neighbours, and is NaN if no body has it.
+        The requested rows. A velocity is the difference of the positions one frame before and one frame after.
+        It is one-sided if the entity is absent in one of them, time stands still, or the step is implausibly
+        fast; it is NaN if both sides fail. An acceleration is the difference of recorded velocities, by the
+        same rule. Without them, it is the second difference of positions, which needs both sides. Implausible
+        accelerations are NaN.
     derived : (m,) int64
         Bit 0: velocity, bit 1: acceleration, bit 2: yaw rate.
     impossible : (2,) int64
-        How many velocities and accelerations are missing or one-sided because no body has them.
+        Number of velocities and accelerations that are missing or one-sided because of implausible values.
     """
     wanted = values[rows].copy()
     derived, impossible = np.zeros(len(wanted), np.int64), np.zeros(2, np.int64)
@@ -928,7 +929,9 @@ def derive(
         slopes = slopes_of()
         found = lacking[:, bit] & np.isfinite(slopes).all(axis=1)
         if column == _ACCELERATION:
-            bent = np.isnan(values[rows, _VELOCITY])  # of positions: noise grows with the square
+            bent = np.isnan(
+                values[rows, _VELOCITY]
+            )  # From positions, where noise grows with the square.
             hard = found & bent & (np.hypot(slopes[:, 0], slopes[:, 1]) > HARDEST)
             impossible[1] = int(hard.sum())
             found &= ~hard
@@ -938,7 +941,7 @@ def derive(
 
 
 def _neighbours(node: Ints, frame: Ints, seconds: Floats, rows: slice) -> Steps:
-    """Rows of the same node one frame before and behind; steps of time to them, NaN where there is none."""
+    """Return the rows of the same node one frame before and after, and the time steps (NaN if absent)."""
     span = int(node.max()) + 1
     keys = frame * span + node
     order = np.argsort(keys)
@@ -956,7 +959,7 @@ def _neighbours(node: Ints, frame: Ints, seconds: Floats, rows: slice) -> Steps:
 
 
 def _possible(values: Floats, rows: slice, steps: Steps) -> tuple[Steps, Bools]:
-    """The steps without those in which no body moves so far, and which rows have lost one."""
+    """Return the steps without implausibly fast ones, and a mask of the affected rows."""
     before, behind, since, until = steps
     position = values[:, _X : _X + 3]
     lost = np.zeros(len(since), np.bool_)
@@ -970,9 +973,9 @@ def _possible(values: Floats, rows: slice, steps: Steps) -> tuple[Steps, Bools]:
 
 
 def _slope(values: Floats, rows: slice, steps: Steps, turn: float = 0.0) -> Floats:
-    """Slope at each row: over both steps where there are two, else over the one there is.
+    """Return the slope at each row, over both steps or the only available one.
 
-    ``turn``: values are the same modulo this, and differences the smallest that there are.
+    ``turn``: period of the values, for example 2π; differences are then the smallest possible.
     """
     before, behind, since, until = steps
     back = values[rows] - values[before]
@@ -987,7 +990,7 @@ def _slope(values: Floats, rows: slice, steps: Steps, turn: float = 0.0) -> Floa
 
 
 def _accelerations(values: Floats, rows: slice, steps: Steps, moving: Steps) -> Floats:
-    """Accelerations; ``moving``: the steps in which a body may have moved as its positions say."""
+    """Return the accelerations. ``moving`` contains the steps with plausible changes of position."""
     velocity = values[:, _VELOCITY : _VELOCITY + 3]
     position = values[:, _X : _X + 3]
     before, behind, since, until = moving

@@ -1,4 +1,4 @@
-"""Cameras of what is read frame by frame: the picture that belongs to one of the last frames."""
+"""Camera pictures for recent frames, from a recording or a running simulator."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from sgstore.world import Channel, FrameBlock, Ints
 
 KEPT: Final = 3000
-"""Frames whose pictures can be asked for."""
+"""Number of recent frames with available pictures."""
 
 MOST_BYTES: Final = 64 << 20
-"""Bytes of pictures that are kept of a running world."""
+"""Maximum size of the stored pictures of a running simulator; bytes."""
 
 
 class Cameras(Protocol):
-    """Cameras, and what they have seen.
+    """Protocol of cameras with recent pictures.
 
     Attributes
     ----------
@@ -35,12 +35,12 @@ class Cameras(Protocol):
     topics: tuple[str, ...]
 
     def at(self, seq: int, topic: str) -> Media | None:
-        """Picture of a camera at a frame; ``None`` where there is none, or it is not kept any more."""
+        """Return the picture of a camera at a frame. ``None`` means missing or no longer stored."""
         ...
 
 
 class RecordedCameras:
-    """Cameras of a recording whose blocks are read one after the other.
+    """Cameras of a recording whose blocks are read in order.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class RecordedCameras:
     Attributes
     ----------
     topics : tuple of str
-        As the recording calls its channels of pictures.
+        Topics of its picture channels.
     """
 
     def __init__(self, path: Path, channels: Sequence[Channel]) -> None:
@@ -62,7 +62,7 @@ class RecordedCameras:
         self._known: tuple[int, Ints, Ints] = 0, np.zeros(0, np.int64), np.zeros((5, 0), np.int64)
 
     def followed(self, blocks: Iterable[FrameBlock]) -> Iterator[FrameBlock]:
-        """The same blocks; where the pictures of each are is remembered."""
+        """Yield the blocks unchanged, and remember the positions of their pictures."""
         mine = [row for row, _ in self._rows.values()]
         for block in blocks:
             _, times, places = self._known
@@ -76,12 +76,12 @@ class RecordedCameras:
             yield block
 
     def at(self, seq: int, topic: str) -> Media | None:
-        """Picture of a camera at a frame: the nearest in log time, as ingest joins them by default.
+        """Return the picture of a camera nearest to a frame in log time, like the default of an ingest.
 
         Raises
         ------
         TraceError
-            The recording cannot be read any more.
+            The recording is no longer readable.
         """
         (first, times, places), (row, channel) = self._known, self._rows[topic]
         mine = places[1:, places[0] == row]
@@ -97,13 +97,13 @@ class RecordedCameras:
 
 
 class LiveCameras:
-    """Cameras on the ego of a running CARLA.
+    """Cameras on the ego of a running CARLA simulator.
 
     Parameters
     ----------
     attached : Sensors
     sensors : sequence of Sensor
-        What is attached; all but cameras are left aside.
+        Attached sensors; only cameras are used.
     """
 
     def __init__(self, attached: Sensors, sensors: Sequence[Sensor]) -> None:
@@ -114,7 +114,7 @@ class LiveCameras:
         self._bytes = 0
 
     def take(self, seq: int, time_ns: int) -> None:
-        """Take a frame, and what was measured until it is here."""
+        """Record a frame, and the pictures that arrived up to it."""
         self._times.append((seq, time_ns))
         for reading in self._attached.waiting():
             if reading.sensor in self.topics:
@@ -125,7 +125,7 @@ class LiveCameras:
             self._bytes -= self._pictures.popleft()[2].nbytes
 
     def at(self, seq: int, topic: str) -> Media | None:
-        """The last picture of a camera before a frame, or of it, as it is kept."""
+        """Return the last picture of a camera at or before a frame. ``None`` means missing."""
         time_ns = next((time for number, time in tuple(self._times) if number == seq), None)
         if time_ns is None:
             return None

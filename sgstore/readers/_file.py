@@ -1,4 +1,4 @@
-"""Files that are no MCAP, told in its words."""
+"""Base of files in other formats, with the interface of an MCAP file."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ if TYPE_CHECKING:
 
 
 class MessageFile:
-    """A file of messages alone: no profile, zstd, nothing beside them, and any log time.
+    """File with messages only, without the other record types of MCAP.
 
     Attributes
     ----------
     has_log_times : bool
-        ``False``: a log time is the time in a message.
+        ``False``: the log time of a message is the time in its data.
     window : tuple of int
-        All log times there are.
+        The full range of log times.
     profile, compression : str
     metadata, attachments
-        What an MCAP file that holds the same has.
+        Values for an MCAP file with the same contents.
     """
 
     has_log_times = False
@@ -40,13 +40,13 @@ class MessageFile:
         self.close()
 
     def close(self) -> None:
-        """Close what is open; here nothing is."""
+        """Do nothing, because no file stays open."""
 
     def settle_order(self, rank: Callable[[int], int]) -> None:
-        """Do nothing: the order of such a file is its own."""
+        """Do nothing, because the order of such a file is fixed."""
         del rank
 
     def pieces(self, place: RecordPlace) -> Iterator[memoryview]:
-        """The bytes of an attachment; there are none."""
+        """Return an empty iterator, because such a file has no attachments."""
         del place
         return iter(())

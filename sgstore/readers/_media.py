@@ -1,14 +1,12 @@
-"""Media in sensor messages: pictures and video.
+"""Pictures and video in sensor messages.
 
-What a message of a sensor carries: a picture as a file, a frame of a video with all that it needs.
+Messages contain pictures in a field ``data``, with another field for the format:
+``sensor_msgs/CompressedImage``, ``foxglove.CompressedImage``, ``foxglove.CompressedVideo`` and similar types.
+They are read by the schema in the file, for any type name. All other messages are returned unchanged.
 
-Messages wrap pictures: ``sensor_msgs/CompressedImage``, ``foxglove.CompressedImage``,
-``foxglove.CompressedVideo`` and their like have a field ``data`` and one that names its format. They are read
-by the schema in the file, whatever their name. All other messages are given as they are.
-
-A frame of H.264 or H.265 cannot be decoded alone: it needs the key frame before it, the frames between, and
-the parameter sets, which mostly stand with the key frame. They are told from one another by the types of their
-NAL units, so that no decoder is needed.
+A frame of H.264 or H.265 cannot be decoded alone. It needs the key frame before it, the frames between, and the
+parameter sets, which are usually stored with the key frame. The types of the NAL units distinguish them without
+a decoder.
 
 Source: ITU-T H.264 (08/2021), table 7-1 and annex B; ITU-T H.265 (08/2021), table 7-1 and annex B; Foxglove
 schema ``CompressedVideo``.
@@ -58,9 +56,9 @@ if TYPE_CHECKING:
 
 
 MAX_RUN: Final = 10_000
-"""Most messages that are looked through for a key frame: minutes of video."""
+"""Maximum number of messages searched for a key frame: minutes of video."""
 MAX_RUN_BYTES: Final = 256 << 20
-"""Most bytes of a run of video."""
+"""Maximum size of a run of video; bytes."""
 
 _PICTURES: Final = {
     "jpeg": rb"\xff\xd8\xff",
@@ -69,12 +67,12 @@ _PICTURES: Final = {
     "tiff": rb"II\*\x00|MM\x00\*",
     "bmp": rb"BM",
 }
-"""How files of pictures begin."""
+"""First bytes of picture files."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Codec:
-    """A way to code video: what its NAL units are, by their types."""
+    """Video codec, with the meaning of its NAL unit types."""
 
     name: str
     named: re.Pattern[str]
@@ -96,21 +94,21 @@ _CODECS: Final = (
 """Key frames: IDR of H.264; BLA, IDR and CRA of H.265. Parameter sets: SPS and PPS, and VPS of H.265."""
 
 _UNIT: Final = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
-"""A start code of annex B and the first byte of the unit behind it; no unit has one inside."""
+"""A start code of annex B and the first byte of its unit. Start codes never occur inside units."""
 
 
 @dataclass(frozen=True, slots=True)
 class Media:
-    """Content that a message carries.
+    """Media content of a message.
 
     Attributes
     ----------
     form : str
-        ``jpeg``, ``png``, ``webp``, ``tiff``, ``bmp``: the file of a picture; ``h264``, ``h265``: a video in
-        the format of annex B, whose last picture is that of the message; ``message``: the message as it is.
+        ``jpeg``, ``png``, ``webp``, ``tiff``, ``bmp``: a picture file; ``h264``, ``h265``: a video in the
+        format of annex B, which ends with the picture of the message; ``message``: the unchanged message.
     data : bytes
     messages : int
-        How many messages it was made of: of a video, those from the key frame on.
+        Number of messages in the content. For a video: the messages from the key frame on.
     """
 
     form: str
@@ -119,13 +117,13 @@ class Media:
 
 
 def read_carried(path: Path, *, channel: int, chunk_offset: int, offset: int, length: int) -> Media:
-    """Content of one message of a recording, by its channel's id and its place.
+    """Return the media content of one message, by its channel id and position.
 
     Raises
     ------
     TraceError
-        As :func:`~sgstore.mcap._fetch.message_at`; or it is a frame of a video that cannot be decoded,
-        because the recording has no key frame or no parameter sets before it, or is damaged between.
+        As :func:`~sgstore.mcap._fetch.message_at`; or a video frame cannot be decoded, because the recording
+        lacks an earlier key frame or parameter sets, or is damaged between.
     """
     message = read_message(path, chunk_offset=chunk_offset, offset=offset, length=length)
     with open_recording(path) as recording:
@@ -145,23 +143,20 @@ def read_carried(path: Path, *, channel: int, chunk_offset: int, offset: int, le
     return Media(codec.name, b"".join([*sets, *run]), len(run))
 
 
-# What is in a message -------------------------------------------------------------------------------------
-
-
 def picture_form(data: bytes) -> str:
-    """Format of a picture by how its file begins; empty if it is none that is known."""
+    """Return the format of a picture file by its first bytes; empty if unknown."""
     return next((name for name, start in _PICTURES.items() if re.match(start, data, re.DOTALL)), "")
 
 
 def record_reader(
     channel: Channel, schema: Schema | None
 ) -> Callable[[bytes], Mapping[str, Any] | None]:
-    """A function that reads a message of a channel as a record of its fields.
+    """Return a function that converts a message of a channel into a record of its fields.
 
-    Its field ``data`` has bytes, or an array of them; ``None`` where there is no such field. A sensor view of
-    OSI has the picture of its first camera as ``data``, the content of a file whose ``format`` is empty.
+    The field ``data`` contains bytes or an array of them; the function returns ``None`` without such a field.
+    For an OSI sensor view, ``data`` is the picture file of its first camera, with an empty ``format``.
 
-    It raises ``TraceError`` where a message is malformed.
+    The function raises ``TraceError`` for a malformed message.
     """
     encoding = channel.message_encoding
     try:
@@ -172,7 +167,7 @@ def record_reader(
             view = schema.name == SENSOR_VIEW
             made = message_class(schema, _CAMERA_FIELDS if view else None)
             return partial(_of_sensor_view if view else _of_protobuf, made)
-    except TraceError:  # a schema that cannot be read: nothing is known of its messages
+    except TraceError:  # The schema is unreadable, so its messages are unknown.
         return lambda _message: None
     return _of_json if encoding == "json" else lambda _message: None
 
@@ -205,9 +200,11 @@ def _of_json(message: bytes) -> Mapping[str, Any] | None:
 
 
 def _unwrapping(recording: Recording, channel: int) -> Callable[[bytes], tuple[bytes, str]]:
-    """A function that gives the data in messages of a channel, and what they call its format; empty: none."""
+    """Return a function that extracts the data and format of a message; both empty without a picture."""
     if channel not in recording.channels:
-        for _ in recording.walk(Findings()):  # no summary: channels come with their messages
+        for _ in recording.walk(
+            Findings()
+        ):  # Without a summary, channels are known only after a walk.
             if channel in recording.channels:
                 break
     about = recording.channels.get(channel)
@@ -221,7 +218,7 @@ def _unwrapping(recording: Recording, channel: int) -> Callable[[bytes], tuple[b
         except TraceError:
             if about.message_encoding == "cdr":
                 raise
-            record = {}  # another kind of message
+            record = {}  # A message of another type.
         data, form = record.get("data"), record.get("format", record.get("encoding"))
         if isinstance(data, np.ndarray) and data.dtype.itemsize == 1:
             data = data.tobytes()
@@ -232,9 +229,9 @@ def _unwrapping(recording: Recording, channel: int) -> Callable[[bytes], tuple[b
     return unwrap
 
 
-# Pictures of OSI's sensor views are bare pixels; how many, of what and in which order a configuration says.
-# What a PNG can hold without loss (grey and red-green-blue, of 8 and 16 bits) becomes one; of any other the
-# message is all there is.
+# Pictures in OSI sensor views are raw pixels. A configuration contains their number, type and order. Formats
+# that PNG can store without loss (grey and RGB, 8 and 16 bits) are converted to PNG. For others, the message is
+# returned unchanged.
 #
 # Source: open-simulation-interface 3.8.0 (osi_sensorview.proto, osi_sensorviewconfiguration.proto).
 
@@ -257,14 +254,14 @@ _PIXELS: Final = {
     "CHANNEL_FORMAT_RGB_U8_LIN": (3, "u1"),
     "CHANNEL_FORMAT_RGB_U16_LIN": (3, "<u2"),
 }
-"""Formats of channels → how many there are, and the type of their numbers."""
+"""Format of the channels → number of channels, and type of their numbers."""
 _RIGHT_TO_LEFT, _BOTTOM_TO_TOP = 2, 3
 MAX_SIDE: Final = 1 << 16
-"""Most pixels of a picture from side to side; more than any camera has."""
+"""Maximum width or height of a picture, more than any camera has; pixels."""
 
 
 def _of_sensor_view(made: type[Any], message: bytes) -> Mapping[str, Any] | None:
-    """The picture of the first camera that has one, as a file."""
+    """Return the picture file of the first camera with a picture."""
     try:
         cameras = getattr(made.FromString(message), "camera_sensor_view", ())
         seen = next((camera for camera in cameras if camera.image_data), None)
@@ -275,7 +272,7 @@ def _of_sensor_view(made: type[Any], message: bytes) -> Mapping[str, Any] | None
 
 
 def _camera_picture(camera: Any) -> bytes:
-    """The picture of a ``CameraSensorView``: a file in the place of pixels, or the one that they make."""
+    """Return the picture of a ``CameraSensorView``: its embedded file, or a file made of its pixels."""
     data, told = bytes(camera.image_data), camera.view_configuration
     if picture_form(data) in {"jpeg", "png"}:
         return data
@@ -297,24 +294,24 @@ def _camera_picture(camera: Any) -> bytes:
 
 
 _COLOURS: Final = {1: 0, 2: 4, 3: 2, 4: 6}
-"""Numbers of a pixel → the colour type: grey, grey and alpha, red green blue, these and alpha."""
+"""Numbers per pixel → PNG colour type: grey, grey and alpha, RGB, RGB and alpha."""
 
 
 def png(pixels: NDArray[Any]) -> bytes:
-    """A picture as a PNG file.
+    """Return a picture as the bytes of a PNG file.
 
-    Each row is written as its difference to the one above (filter 2), which costs little and makes most
-    pictures a third smaller.
+    Each row is stored as its difference from the row above (filter 2). This is fast, and most files become a
+    third smaller.
 
     Parameters
     ----------
     pixels : (height, width) or (height, width, 1 … 4), uint8 or uint16
-        Grey; grey and alpha; red, green, blue; these and alpha.
+        Grey; grey and alpha; red, green, blue; red, green, blue, alpha.
 
     Raises
     ------
     ExportError
-        They are no picture of that kind, or it is empty.
+        The array has another shape or type, or is empty.
     """
     channels = 1 if pixels.ndim == 2 else pixels.shape[-1]
     if pixels.ndim not in {2, 3} or channels not in _COLOURS or not pixels.size:
@@ -337,21 +334,18 @@ def png(pixels: NDArray[Any]) -> bytes:
     )
 
 
-# Video ----------------------------------------------------------------------------------------------------
-
-
 def _decodable(
     codec: _Codec, last: bytes, before: Iterator[tuple[bytes, str]]
 ) -> tuple[list[bytes], list[bytes]]:
-    """The frames from the key frame to the last one, and parameter sets that stand before all of them.
+    """Return the frames from the key frame to the last frame, and the parameter sets for their start.
 
     Parameters
     ----------
     codec : _Codec
     last : bytes
-        The frame that is wanted.
+        The requested frame.
     before : iterator of (bytes, str)
-        Those before it, latest first.
+        Earlier frames, latest first.
     """
     run, size = [last], len(last)
     while not _is_key(codec, run[-1]):
@@ -372,7 +366,9 @@ def _decodable(
         kinds = sorted(missing - sets.keys())
         reason = f"no parameter sets ({codec.name}, NAL units of type {kinds}) before its key frame"
         raise TraceError(f"{reason}: it cannot be decoded")
-    return run[::-1], [sets[kind] for kind in sorted(sets)]  # VPS, SPS, PPS: in either codec
+    return run[::-1], [
+        sets[kind] for kind in sorted(sets)
+    ]  # The order is VPS, SPS, PPS in both codecs.
 
 
 def _is_key(codec: _Codec, data: bytes) -> bool:
@@ -380,7 +376,7 @@ def _is_key(codec: _Codec, data: bytes) -> bool:
 
 
 def _parameters(codec: _Codec, data: bytes) -> dict[int, bytes]:
-    """The parameter sets in the data of a frame, by type, each with its start code."""
+    """Return the parameter sets in the data of a frame by type, each with its start code."""
     units = list(_UNIT.finditer(data))
     ends = [unit.start() for unit in units[1:]] + [len(data)]
     found: dict[int, bytes] = {}
@@ -391,18 +387,18 @@ def _parameters(codec: _Codec, data: bytes) -> dict[int, bytes]:
     return found
 
 
-# The messages of a channel before one of them in time. Chunks that end later are read first: where messages are
-# in order, these are the chunk of the message and those just before it.
+# Search for the earlier messages of a channel. Chunks with later ends are read first. If messages are in order,
+# these are the chunk of the message and the chunks directly before it.
 
 _Row = tuple[int, int, int, "Callable[[], bytes]"]
-"""Log time; place of the chunk, outside chunks of the message; offset; data. The first three give the order."""
+"""Log time; offset of the chunk or, outside chunks, of the message; offset; data. Sorted by the first three."""
 
 
 @dataclass(frozen=True, slots=True)
 class _FilmSource:
-    """A chunk of a file with messages of a channel, or all messages outside chunks.
+    """Source of video messages: a chunk of a file, or all its messages outside chunks.
 
-    ``base``: where the file begins in its bag. ``chunk``: byte offset, -1 outside chunks. ``end_ns``: latest
+    ``base``: position of the file in its bag. ``chunk``: byte offset, -1 outside chunks. ``end_ns``: maximum
     log time of the messages.
     """
 
@@ -413,7 +409,7 @@ class _FilmSource:
     end_ns: int
 
     def rows(self) -> list[_Row]:
-        """The messages of the channel."""
+        """Return the messages of the channel."""
         if self.chunk < 0:
             return _outside_chunks(self.path, self.channel, self.base)
         with open_regular(self.path) as file:
@@ -431,7 +427,7 @@ class _FilmSource:
 
 
 def _before(path: Path, channel: int, chunk_offset: int, offset: int) -> Iterator[bytes]:
-    """The messages of a channel before one of them in time, the latest first."""
+    """Yield the messages of a channel that are earlier than a given one, latest first."""
     chunked = chunk_offset >= 0
     at = chunk_offset if chunked else offset
     parts = [*_parts(path, channel)]
@@ -464,7 +460,7 @@ def _copied(messages: Messages, row: int) -> bytes:
 
 
 def _parts(path: Path, channel: int) -> Iterator[tuple[Path, int, int]]:
-    """The files of a recording, where each begins, and the id of a channel of the recording in it."""
+    """Yield the files of a recording, their positions, and the channel id in each file."""
     folder = bag_folder(path)
     if folder is None:
         yield path, 0, channel
@@ -479,7 +475,7 @@ def _parts(path: Path, channel: int) -> Iterator[tuple[Path, int, int]]:
 
 
 def _chunks(path: Path) -> list[tuple[int, int, int]]:
-    """Byte offset, first and last log time of the chunks of a file."""
+    """Return byte offset, first and last log time of the chunks of a file."""
     with open_regular(path) as file:
         offsets: list[int] = read_summary(file, file.seek(0, 2)).chunk_offsets.tolist()
     if not offsets:

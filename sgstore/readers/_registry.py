@@ -1,8 +1,8 @@
-"""Recordings → blocks of frames: one file for each flavour, and the guarded MCAP reader that all of them use.
+"""Selection of the reader for a recording, and access to its messages.
 
-A flavour is a class like :class:`~sgstore.readers.osi._trace.OsiTrace` that is listed in :data:`READERS`, or
-that an installed package names as an entry point of the group ``sgstore.readers``: it recognises a recording
-by the schemas of its channels, and reads it. ``docs/flavours.md`` says how to add one.
+A flavour is a class like :class:`~sgstore.readers.osi._trace.OsiTrace`. It is listed in :data:`READERS`, or an
+installed package provides it as an entry point of the group ``sgstore.readers``. It recognises a recording by
+the schemas of its channels. ``docs/flavours.md`` explains how to add one.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ if TYPE_CHECKING:
 
 ENDINGS: Final = (
     *(".mcap", *_OSI_ENDINGS),
-    *dict.fromkeys((*_SCENARIO_ENDINGS, *_SUMO_ENDINGS)),  # both have XML
+    *dict.fromkeys((*_SCENARIO_ENDINGS, *_SUMO_ENDINGS)),  # Both have the suffix .xml.
 )
-"""How the names of recordings end, where a folder is searched for them; see :func:`is_recording`."""
+"""Suffixes of recordings, for the search in a folder; see :func:`is_recording`."""
 
 
 RecordingFile = McapFile | OsiFile | CommonRoadFile | SumoFile
-"""A file of messages, whatever it is."""
+"""A file of messages in any format."""
 
 
 class RecordingReader(Protocol):
-    """A flavour of recording: the class of its traces. One that takes ``mapping`` too is given it."""
+    """Protocol of a reader: the class of its traces. The argument ``mapping`` is optional."""
 
     name: str
 
@@ -55,44 +55,45 @@ class RecordingReader(Protocol):
         ...
 
     def recognises(self, recording: Recording) -> bool:
-        """Return whether a recording is of this flavour, by the schemas of its channels."""
+        """True if a recording has this flavour, by the schemas of its channels."""
         ...
 
 
 READERS: Final[tuple[RecordingReader, ...]] = tuple(
     plugins.READERS.load(name) for name in plugins.READERS.own
 )
-"""The flavours of recordings, in the order in which they are asked."""
+"""Readers, in the order of their tests."""
 
 
 def readers() -> Iterator[RecordingReader]:
-    """All flavours, in the order in which they are asked: :data:`READERS`, then those of other packages.
+    """Yield all readers in the order of their tests: :data:`READERS`, then those of other packages.
 
     Raises
     ------
     TraceError
-        A package names a flavour that cannot be loaded.
+        A reader of another package cannot be loaded.
     """
     for _, reader in plugins.READERS.every(TraceError):
         yield reader
 
 
 def is_recording(path: Path) -> bool:
-    """Return whether a file in a folder is a recording, by its name; of an XML file by its beginning, too."""
+    """True if a file is a recording, by its suffix. XML files are also checked by their first bytes."""
     name = path.name.lower()
     xml = name.endswith((*_SCENARIO_ENDINGS, *_SUMO_ENDINGS))
     return name.endswith(ENDINGS) and (not xml or is_scenario(path) or is_fcd(path))
 
 
 def open_recording(path: str | Path) -> RecordingFile:
-    """A file of messages: MCAP by how it begins, a single-channel OSI file by how its name ends.
+    """Open a file of messages: an MCAP file, bag, OSI file, CommonRoad scenario or SUMO file.
 
-    A CommonRoad scenario or SUMO's floating-car data, each of which is one XML document, is told as messages.
+    OSI files are recognised by their suffix. A CommonRoad scenario or SUMO floating-car data is one XML
+    document; its contents are converted into messages.
 
     Raises
     ------
     TraceError
-        There is no such file, or it is neither.
+        The file does not exist or has another format.
     """
     path = Path(path)
     if is_scenario(path):
@@ -105,30 +106,32 @@ def open_recording(path: str | Path) -> RecordingFile:
 def open_trace(
     path: str | Path, *, ego: str = "", digest: str = "", mapping: str | Path = ""
 ) -> MessageTrace:
-    """A recording, opened by the first reader that recognises it.
+    """Open a recording with the first reader that recognises it.
 
     Parameters
     ----------
     path : str or Path
     ego : str
-        The simulator's id or name of the ego; empty: as the recording says.
+        The simulator's id or name of the ego; empty: the ego of the recording.
     digest : str
-        SHA-256 of the file, if it is known already.
+        SHA-256 of the file, if known.
     mapping : str or Path
-        How messages are to be understood that do not say it themselves (Foxglove): the name of a mapping that
-        is shipped, or the path of a TOML file; empty: the shipped one that fits. Other flavours need none.
+        Mapping for messages that do not describe themselves (Foxglove): the name of an included mapping, or the
+        path of a TOML file. Empty: the included mapping that fits. Other flavours do not use it.
 
     Raises
     ------
     TraceError
-        There is no such file, it is no recording, holds no ground truth that a reader knows, holds no frame,
-        or nothing in it bears the name given for the ego.
+        The file does not exist or is not a recording, has no known ground truth or no frame, or the given ego
+        does not exist.
     """
     path = Path(path)
     recording = open_recording(path)
     try:
         if not recording.channels:
-            for _ in recording.walk(TraceReport()):  # no summary: channels come with their messages
+            for _ in recording.walk(
+                TraceReport()
+            ):  # Without a summary, channels are known only after a walk.
                 pass
         for reader in readers():
             if reader.recognises(recording):
@@ -147,9 +150,9 @@ def open_trace(
 
 
 def on_map(trace: MessageTrace, road_map: RoadMap | None) -> None:
-    """Tell a trace which road map it is read with, if that matters to its flavour.
+    """Pass the road map to a trace whose flavour needs it.
 
-    Then the flavour's class has a method ``on_map``; it is called before frames are read.
+    Such a flavour has a method ``on_map``, which is called before the frames are read.
     """
     tell = getattr(trace, "on_map", None)
     if tell is not None:
@@ -167,13 +170,15 @@ def _is_single_channel(path: Path) -> bool:
 
 
 def read_message(path: str | Path, *, chunk_offset: int, offset: int, length: int) -> bytes:
-    """The data of one message of a recording, by its place as :class:`~sgstore.world.MessageRefs` has it.
+    """Return the data of one message of a recording, by its position as in ``MessageRefs``.
+
+    See :class:`~sgstore.world.MessageRefs`.
 
     Raises
     ------
     TraceError
-        The file cannot be opened, the chunk is damaged, or there is no message of that length there: the
-        file was replaced.
+        The file cannot be opened, the chunk is damaged, or the message does not match, because the file was
+        replaced.
     """
     (data,) = read_messages(Path(path), [(chunk_offset, offset, length)])
     return bytes(data)
@@ -182,15 +187,15 @@ def read_message(path: str | Path, *, chunk_offset: int, offset: int, length: in
 def read_messages(
     path: Path, places: Iterable[tuple[int, int, int]]
 ) -> Iterator[bytes | memoryview]:
-    """The data of messages, in the order in which they are asked for.
+    """Yield the data of messages, in the order of ``places``.
 
     Parameters
     ----------
     path : Path
         A recording: a file, or the folder of a bag.
     places : iterable of (chunk_offset, offset, length)
-        As :class:`sgstore.world.MessageRefs` has them. Those of one chunk should come together: the last one
-        alone is kept.
+        As in :class:`sgstore.world.MessageRefs`. Group the messages of a chunk, because only the last chunk is
+        cached.
 
     Raises
     ------
@@ -218,7 +223,7 @@ _LOOKS: Final = (
     (re.compile(r"osi3\."), "OSI recording"),
     (re.compile(r"\w+/(msg/)?[A-Z]\w*$"), "ROS recording"),
 )
-"""How names of schemas begin → what a recording with one of them looks like; the first that fits."""
+"""Prefix of a schema name → probable format of the recording; the first match counts."""
 _TELLS_OBJECTS: Final = re.compile(
     r"object|track|detect|obstacle|truth|actor|entit|marker|scene", re.IGNORECASE
 )
@@ -226,9 +231,9 @@ _HELP: Final = "docs/flavours.md says how a flavour of your own reads them, in o
 
 
 def _no_reader(recording: Recording) -> str:
-    """The reason why nothing recognises a recording: what it looks like, and its channels.
+    """Return the error text for an unrecognised recording: its probable format, and its channels.
 
-    Those that may tell objects come first.
+    Channels that may contain objects come first.
     """
     listed: list[tuple[bool, str]] = []
     schemas: list[str] = []

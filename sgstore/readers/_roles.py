@@ -1,7 +1,7 @@
-"""The order of channels whose messages have one log time and one publish time.
+"""Order of channels for messages with equal log time and publish time.
 
-A frame must know the map, static things, transforms and signals of its own instant. What belongs to a frame but
-refers to it, such as the controls of the ego, comes behind it.
+A frame needs the map, static entities, transforms and signals of its instant first. Messages that refer to a
+frame, such as the controls of the ego, come after it.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from sgstore.mcap import Recording
 
 LOOSE, MAP, STATIC, TRANSFORMS, LIGHTS, STATES, EGO, CONTROLS = range(-1, 7)
-"""Ranks of channels. ``LOOSE``: the place among other channels does not matter: of payloads, which frames find
-by time, and of road maps, which are read before all frames."""
+"""Ranks of channels. ``LOOSE``: the order does not matter. This applies to payloads, which frames find by time,
+and to road maps, which are read before all frames."""
 
 _SCHEMAS: Final = {
     "osi3.MapAsamOpenDrive": LOOSE,
@@ -59,17 +59,17 @@ _SCHEMAS: Final = {
         }.items()
     },
 }
-"""Schema → rank of a channel."""
+"""Schema → rank of its channels."""
 _ROLES: Final = {"map": MAP, "ground_truth": STATES}
-"""Role that a flavour of another package gives a channel → its rank."""
+"""Role of a channel in a reader of another package → its rank."""
 
 
 def channel_rank(
     recording: Recording, roles: Mapping[int, str] | None = None
 ) -> Callable[[int], int]:
-    """Return the function from the id of a channel to its rank.
+    """Return a function that maps a channel id to its rank.
 
-    ``roles``: id of a channel → its role, for channels whose schema has no rank.
+    ``roles``: role by channel id, for channels whose schema has no rank.
     """
     known = roles or {}
 

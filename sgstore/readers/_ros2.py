@@ -1,13 +1,11 @@
-"""ROS 2 messages: definitions, and CDR decoding into columns.
+"""ROS 2 messages: parser of their definitions, and CDR decoder into records or columns.
 
-Definitions of ROS 2 messages: the ``.msg`` texts that a recording carries → the structure of its messages.
+A schema with the encoding ``ros2msg`` is the text of the message definition, followed by the texts of all types
+in it, each after a line of ``=`` and a line ``MSG: package/Type``. A layout is always built from the text in
+the recording: the fields of a type change between versions (``shape_msgs/SolidPrimitive`` gained one in
+Humble), and a wrong layout would give wrong numbers without an error.
 
-A schema of encoding ``ros2msg`` is the text of a message's own definition, and behind it, each after a line of
-``=`` and a line ``MSG: package/Type``, the texts of all types that it is made of. A layout is always made
-from the recording's own text: the same type has other fields in another year (``shape_msgs/SolidPrimitive``
-gained one in Humble), and messages that are read by the wrong layout give numbers all the same.
-
-Texts come from strangers: their size, the number of their types and fields, and their depth are bounded.
+Texts are untrusted: their size, depth and number of types and fields are limited.
 
 Source: ROS 2 documentation, "Interfaces"; MCAP registry of schema encodings, ``ros2msg``.
 """
@@ -31,26 +29,26 @@ if TYPE_CHECKING:
 
 
 MAX_TEXT: Final = 1 << 20
-"""Greatest size of a schema; bytes. That of ``sensor_msgs/CameraInfo`` takes 8 kB."""
+"""Maximum size of a schema; bytes. ``sensor_msgs/CameraInfo`` has 8 kB."""
 MAX_TYPES: Final = 512
-"""Most types in a schema."""
+"""Maximum number of types in a schema."""
 MAX_DEPTH: Final = 32
-"""How deep types may be nested."""
+"""Maximum nesting depth of types."""
 MAX_MEMBERS: Final = 4096
-"""Most values of a message without its sequences, all levels taken together."""
+"""Maximum number of values in a message on all levels, without its sequences."""
 MAX_ARRAY: Final = 1 << 20
-"""Most elements of an array of fixed length."""
+"""Maximum length of a fixed-size array."""
 
 MAX_IDENT: Final = 1 << 53
-"""Ids are below it, as far as a double is exact."""
+"""Upper limit of ids, up to which a double is exact."""
 
 LENGTH: Final = 4
-"""Bytes of a length in front of a string or a sequence."""
+"""Size of the length before a string or sequence; bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A number or truth value of ``size`` bytes; ``code`` as :mod:`struct` and numpy have it."""
+    """Number or boolean of ``size`` bytes. ``code`` is the type code of :mod:`struct` and numpy."""
 
     code: str
     size: int
@@ -58,16 +56,16 @@ class Number:
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """A string; ``bound``: most bytes, -1: any."""
+    """String type. ``bound`` is the maximum number of bytes; -1 means unlimited."""
 
     bound: int
 
 
 @dataclass(frozen=True, slots=True)
 class Sequence:
-    """Elements of one type: ``count`` of them, or as many as the message says if that is -1.
+    """Array type with ``count`` elements; -1 means that the message contains the length.
 
-    ``bound``: most that a message may say, -1: any.
+    ``bound``: maximum length in a message; -1 means unlimited.
     """
 
     element: Type
@@ -77,7 +75,7 @@ class Sequence:
 
 @dataclass(frozen=True, slots=True)
 class Struct:
-    """Fields in the order in which they stand in a message.
+    """Structure type, with its fields in message order.
 
     Attributes
     ----------
@@ -86,13 +84,13 @@ class Struct:
     fields : tuple of (str, Type)
         At least one.
     least : int
-        Fewest bytes that it can take, padding left out.
+        Minimum size without padding; bytes.
     members : int
-        Values in it, all levels taken together; a sequence counts as one.
+        Number of values on all levels; a sequence counts as one.
     depth : int
-        Levels of structures in it, its own among them.
+        Levels of nested structures, including itself.
     align : int
-        What the places of its parts depend on: the largest alignment in it.
+        Largest alignment of its parts, which determines their positions.
     """
 
     name: str
@@ -120,15 +118,15 @@ NUMBERS: Final[Mapping[str, Number]] = {
     "float32": Number("f", 4),
     "float64": Number("d", 8),
 }
-"""Built-in types; of ``char`` the documentation says uint8."""
+"""Built-in types; ``char`` is uint8 according to the documentation."""
 
 _EMPTY: Final = (("structure_needs_at_least_one_member", NUMBERS["uint8"]),)
-"""What ROS 2 puts into a message without fields, because IDL has no empty structures."""
+"""Field that ROS 2 adds to an empty message, because IDL does not allow empty structures."""
 _BUILT_IN: Final = {
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
     "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec",
 }
-"""Definitions that some writers leave out."""
+"""Definitions that some writers omit."""
 _SEPARATOR: Final = re.compile(r"={3,}")
 _NAMED: Final = re.compile(r"MSG:\s*([\w/]{1,200})")
 _LINE: Final = re.compile(
@@ -139,7 +137,7 @@ _LINE: Final = re.compile(
 
 
 def parse_definition(name: str, text: bytes) -> Struct:
-    """The structure of the messages of a schema.
+    """Return the structure of the messages of a schema.
 
     Parameters
     ----------
@@ -151,8 +149,8 @@ def parse_definition(name: str, text: bytes) -> Struct:
     Raises
     ------
     TraceError
-        The text is empty, too large, malformed, lacks a type, nests without end, or has a type that is not
-        read (``wstring``).
+        The text is empty, too large or malformed, lacks a type, nests too deeply, or contains an unsupported
+        type (``wstring``).
     """
     if not text.strip():
         reason = f"schema {name}: the file does not hold its definition; record it with one"
@@ -169,13 +167,13 @@ def parse_definition(name: str, text: bytes) -> Struct:
 
 
 def short_name(name: str) -> str:
-    """``package/Type`` of ``package/msg/Type``."""
+    """Return ``package/Type`` for ``package/msg/Type``."""
     package, _, rest = name.partition("/")
     return f"{package}/{rest.removeprefix('msg/')}" if rest else name
 
 
 def _texts(name: str, text: str) -> dict[str, list[str]]:
-    """Name of each type → the lines of its definition; the first definition of a name counts."""
+    """Return the lines of each type's definition by type name. The first definition of a name counts."""
     texts: dict[str, list[str]] = {name: []}
     lines = texts[name]
     separated = False
@@ -202,7 +200,7 @@ def _texts(name: str, text: str) -> dict[str, list[str]]:
 
 @dataclass(slots=True)
 class _Parser:
-    """Makes structures of texts, each once; ``open``: the types that are being made."""
+    """Parser of type definitions. Each type is parsed once; ``open`` contains the types in progress."""
 
     texts: dict[str, list[str]]
     made: dict[str, Struct] = field(default_factory=dict[str, Struct])
@@ -239,7 +237,7 @@ class _Parser:
         return struct
 
     def _fields(self, owner: str, line: str) -> tuple[tuple[str, Type], ...]:
-        """The field that a line defines: none if it is a constant. Defaults are of no concern here."""
+        """Return the field of a line; empty for a constant. Default values are ignored."""
         found = _LINE.fullmatch(line)
         if found is None:
             raise TraceError(f"{owner}: a line that defines no field: {line[:80]!r}")
@@ -271,7 +269,7 @@ def _array(owner: str, found: re.Match[str], element: Type) -> Sequence:
 
 
 def least(kind: Type) -> int:
-    """Fewest bytes that a value of a type can take, padding left out."""
+    """Return the minimum size of a value of a type, without padding; bytes."""
     match kind:
         case Number(size=size) | Struct(least=size):
             return size
@@ -282,7 +280,7 @@ def least(kind: Type) -> int:
 
 
 def members(kind: Type) -> int:
-    """Values of a type, all levels taken together; a sequence counts as one."""
+    """Return the number of values of a type on all levels. A sequence counts as one."""
     return kind.members if isinstance(kind, Struct) else 1
 
 
@@ -308,16 +306,15 @@ def _alignment(kind: Type) -> int:
             return max(_alignment(element), LENGTH if count < 0 else 1)
 
 
-# Messages in CDR, read by their structure: one as a record, or a sequence of many as columns ----
-# CDR writes values one after another, each aligned to its own size, counted from the first byte behind a head
-# of four. So where a value stands depends on every string and sequence before it. A message that comes now
-# and then is read value by value (:func:`decode`). For long sequences of structures there is
-# :class:`ColumnReader`: the layout of one element is learned, value by value; an element that begins at the
-# same alignment and in which every length says the same has the same layout, and there are mostly many of
-# these in a row, so that their numbers are columns of a matrix.
+# Decoding of CDR messages by their structure, into a record, or from a long sequence into columns. CDR stores
+# values one after another. Each value is aligned to its size, counted from the first byte after a head of four
+# bytes. The position of a value therefore depends on all strings and sequences before it. A rare message is
+# decoded value by value (:func:`decode`). :class:`ColumnReader` is for long sequences of structures. It learns
+# the layout of one element, value by value. An element with the same alignment and the same lengths has the
+# same layout. Usually, many such elements are consecutive, so that their numbers are columns of a matrix.
 #
-# Messages come from strangers: a length is held against the bytes that are left before anything is made of
-# it, and what a message may become is bounded. What fails is a :class:`TraceError` for this message.
+# Messages are untrusted: a length is checked against the remaining bytes first, and the size of the result is
+# limited. A failure is a :class:`TraceError` for this message.
 #
 # Source: OMG DDS Interoperability Wire Protocol 2.5, section 10 (plain CDR); rosidl, "legacy interface
 # definition".
@@ -325,52 +322,52 @@ def _alignment(kind: Type) -> int:
 Data = bytes | bytearray | memoryview
 
 HEAD: Final = 4
-"""Bytes before the values: how these are encoded, and options that plain CDR has none of."""
+"""Size of the head: the encoding, and options that plain CDR does not use; bytes."""
 MAX_VALUES: Final = 1_000_000
-"""Most values of a message that is read one by one, without numbers in arrays."""
+"""Maximum number of values decoded one by one in a message, without numbers in arrays."""
 MAX_ROWS: Final = 100_000
-"""Most elements of a sequence that is read as columns."""
+"""Maximum number of elements in a sequence decoded as columns."""
 
 _ORDERS: Final = {0: ">", 1: "<"}
-"""First two bytes of a message → order of the bytes of its numbers."""
+"""First two bytes of a message → byte order of its numbers."""
 _MAX_LAYOUTS: Final = 16
-"""Layouts that are remembered for each alignment; the oldest is forgotten."""
+"""Maximum number of stored layouts per alignment; the oldest is dropped."""
 _MAX_PREFIXES: Final = 64
-"""Lengths in an element whose layout is worth remembering."""
+"""Maximum number of lengths in an element with a stored layout."""
 
 
 def decode(kind: Struct, data: Data) -> dict[str, Any]:
-    """A message as a record: numbers, texts, arrays of numbers, lists and records in it.
+    """Decode a message into a record of numbers, texts, arrays, lists and nested records.
 
     Raises
     ------
     TraceError
-        The message is cut, lies about a length, exceeds a bound of its definition or :data:`MAX_VALUES`,
-        or is in another encoding than plain CDR.
+        The message is truncated, has a wrong length, exceeds a limit of its definition or :data:`MAX_VALUES`,
+        or does not use plain CDR.
     """
     return _MessageReader.of(data).struct(kind)
 
 
 def number(record: dict[str, Any], path: str) -> float:
-    """The number at a path (``pose.position.x``) of a record; NaN if there is none."""
+    """Return the number at a path of a record, such as ``pose.position.x``; NaN if it is missing."""
     value = _at(record, path)
     return float(value) if isinstance(value, (int, float)) else float("nan")
 
 
 def text(record: dict[str, Any], path: str) -> str:
-    """The text at a path of a record; empty if there is none."""
+    """Return the text at a path of a record; empty if it is missing."""
     value = _at(record, path)
     return value if isinstance(value, str) else ""
 
 
 def records(record: dict[str, Any], path: str) -> list[dict[str, Any]]:
-    """The records in the list at a path of a record; none if there is no such list."""
+    """Return the list of records at a path of a record; empty if it is missing."""
     value = _at(record, path)
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 
 def ident_of(record: dict[str, Any], path: str) -> int | None:
-    """The id at a path of a record; ``None`` if there is none."""
+    """Return the id at a path of a record. ``None`` means that it is missing or too large."""
     value = number(record, path)
     return int(value) if abs(value) < MAX_IDENT else None
 
@@ -390,10 +387,10 @@ def _unpacker(code: str) -> Callable[..., tuple[Any, ...]]:
 
 @dataclass(slots=True)
 class _MessageReader:
-    """A message and how far it has been read.
+    """Cursor over the bytes of a message.
 
-    ``values``: what follows the head; ``order``: of the bytes of numbers; ``place``: the next byte;
-    ``left``: how many more values may be made of it.
+    ``values``: bytes after the head; ``order``: byte order of numbers; ``place``: position of the next byte;
+    ``left``: number of further values allowed.
     """
 
     values: memoryview
@@ -414,7 +411,7 @@ class _MessageReader:
         return cls(memoryview(data)[HEAD:], _ORDERS[kind])
 
     def take(self, size: int, align: int) -> int:
-        """The place of the next ``size`` bytes, which begin at a multiple of ``align``."""
+        """Skip ``size`` bytes after alignment, and return their start."""
         start = self.place + -self.place % align
         if start + size > len(self.values):
             raise TraceError(
@@ -428,7 +425,7 @@ class _MessageReader:
         return _unpacker(self.order + kind.code)(self.values, start)[0]
 
     def length(self, least_size: int, bound: int, what: str) -> int:
-        """The length of what follows, of at least ``least_size`` bytes each."""
+        """Read and check a length. Each element has at least ``least_size`` bytes."""
         count = _unpacker(self.order + "I")(self.values, self.take(LENGTH, LENGTH))[0]
         left = len(self.values) - self.place
         if count * least_size > left:
@@ -438,7 +435,7 @@ class _MessageReader:
         return count
 
     def text(self, kind: Text) -> str:
-        """A string; bytes that are no UTF-8 become U+FFFD."""
+        """Read a string. Invalid UTF-8 bytes become U+FFFD."""
         count = self.length(1, kind.bound + 1 if kind.bound >= 0 else -1, "string")
         start = self.take(count, 1)
         return (
@@ -460,7 +457,7 @@ class _MessageReader:
         return {name: self.value(inner) for name, inner in kind.fields}
 
     def count(self, kind: Sequence) -> int:
-        """Number of the elements that follow."""
+        """Return the number of the following elements."""
         smallest = least(kind.element)
         if kind.count < 0:
             return self.length(smallest, kind.bound, "sequence")
@@ -471,14 +468,14 @@ class _MessageReader:
     def sequence(self, kind: Sequence) -> Any:
         count, element = self.count(kind), kind.element
         if isinstance(element, Number):
-            # An empty sequence has no first element that would be aligned.
+            # An empty sequence has no alignment for its first element.
             start = self.take(count * element.size, element.size if count else 1)
             return np.frombuffer(self.values, _dtype(self.order, element), count, start)
         self.spend(count * members(element))
         return [self.value(element) for _ in range(count)]
 
     def spend(self, values: int) -> None:
-        """Keep account of the values that are made of a message."""
+        """Count the values of a message, and raise above the limit."""
         self.left -= values
         if self.left < 0:
             raise TraceError(f"a message of more than {MAX_VALUES} values")
@@ -490,10 +487,10 @@ def _dtype(order: str, kind: Number) -> np.dtype[Any]:
 
 @dataclass(slots=True)
 class _StructLayout:
-    """Places of the numbers in an element that begins at a given alignment.
+    """Positions of the numbers in an element, for one alignment of its start.
 
-    ``size``: bytes from its begin to that of the next; ``prefixes``: place and value of each length in it;
-    ``runs``: first column, place, number and type of numbers that stand side by side.
+    ``size``: bytes from its start to the next element; ``prefixes``: position and value of each length in it;
+    ``runs``: first column, position, number and type of adjacent numbers.
     """
 
     size: int
@@ -501,7 +498,7 @@ class _StructLayout:
     runs: list[tuple[int, int, int, np.dtype[Any]]]
 
     def agreeing(self, values: memoryview, order: str, place: int, most: int) -> int:
-        """Number of the elements from a place on that have this layout, one after another."""
+        """Return the number of consecutive elements with this layout, from a position on."""
         for offset, expected in self.prefixes:
             if most < 1:
                 break
@@ -512,7 +509,7 @@ class _StructLayout:
         return most
 
     def copy(self, values: memoryview, place: int, to: Floats) -> None:
-        """Copy the numbers of as many elements as there are rows in ``to``."""
+        """Copy the numbers of consecutive elements into ``to``, one element per row."""
         for column, offset, count, dtype in self.runs:
             numbers: Any = np.ndarray(
                 (len(to), count), dtype, values, place + offset, (self.size, dtype.itemsize)
@@ -521,22 +518,22 @@ class _StructLayout:
 
 
 class ColumnReader:
-    """Reads numbers of messages of one kind as columns, and passes over the rest of them.
+    """Reader of selected numbers of messages of one type, as columns. Other fields are skipped.
 
     Parameters
     ----------
     kind : Struct
-        Of the messages.
+        Type of the messages.
     columns : tuple of str
         Paths of the numbers: ``header.stamp.sec``, ``pose.covariance[0]``.
     sequence : str
-        The field that is a sequence of structures, each of which is a row with these numbers; empty: the
-        message is the only row.
+        Field with a sequence of structures; each structure is a row with these numbers. Empty: the message is
+        the only row.
 
     Raises
     ------
     TraceError
-        There is no such sequence.
+        The sequence does not exist.
     """
 
     def __init__(self, kind: Struct, columns: tuple[str, ...], sequence: str = "") -> None:
@@ -555,7 +552,7 @@ class ColumnReader:
         self._layouts: dict[tuple[str, int], list[_StructLayout]] = {}
 
     def head(self, data: Data) -> dict[str, Any]:
-        """The fields before the sequence.
+        """Return the fields before the sequence.
 
         Raises
         ------
@@ -566,15 +563,14 @@ class ColumnReader:
         return {name: reader.value(kind) for name, kind in self._head}
 
     def read(self, data: Data) -> tuple[dict[str, Any], Floats]:
-        """The fields before the sequence, and the numbers.
+        """Return the fields before the sequence, and the numbers.
 
         Returns
         -------
         head : dict
-            As :func:`decode` gives them.
+            As returned by :func:`decode`.
         numbers : (n, columns) float64
-            NaN where a row lacks a number: its structure has none of that path, or a sequence in it is
-            too short.
+            NaN for a missing number: the structure lacks the path, or a sequence in it is too short.
 
         Raises
         ------
@@ -593,19 +589,19 @@ class ColumnReader:
         return head, numbers
 
     def _some(self, reader: _MessageReader, to: Floats) -> int:
-        """Read the next element, and those behind it that are alike; how many these are."""
+        """Read the next element and those after it with the same layout. Return their number."""
         values, order, place = reader.values, reader.order, reader.place
         layouts = self._layouts.setdefault((order, place % self._align), [])
         for layout in layouts:
             most = min(len(to), (len(values) - place) // layout.size)
-            # Of a size that is no multiple of the alignment, the next element is aligned differently.
+            # If the size is not a multiple of the alignment, the next element has another alignment.
             most = min(most, 1) if layout.size % self._align else most
             alike = layout.agreeing(values, order, place, most)
             if alike:
                 break
         else:
             layout, alike = _learned(reader, self._element, self._columns), 1
-            # Keep a layout, as the first that is tried, unless too much would have to agree.
+            # Store the layout as the first one to try, unless it contains too many lengths.
             if len(layout.prefixes) <= _MAX_PREFIXES:
                 layouts.insert(0, layout)
                 del layouts[_MAX_LAYOUTS:]
@@ -615,14 +611,14 @@ class ColumnReader:
 
 
 def _learned(reader: _MessageReader, kind: Struct, columns: dict[str, int]) -> _StructLayout:
-    """The layout of the value that a reader stands before; it stands behind it then."""
+    """Read the next value, and return its layout."""
     walk = _ElementWalk(reader, columns, reader.place)
     walk.step(kind, "")
     return _StructLayout(reader.place - walk.start, walk.prefixes, _side_by_side(walk.found))
 
 
 class _ElementWalk:
-    """A walk through one element, which takes note of where things stand."""
+    """Walk through one element that records the positions of its values."""
 
     def __init__(self, reader: _MessageReader, columns: dict[str, int], start: int) -> None:
         self.start = start
@@ -677,7 +673,7 @@ class _ElementWalk:
 def _side_by_side(
     found: dict[int, tuple[int, np.dtype[Any]]],
 ) -> list[tuple[int, int, int, np.dtype[Any]]]:
-    """Numbers that follow one another in columns and bytes, as runs."""
+    """Return numbers as runs that are adjacent both in columns and in bytes."""
     runs: list[tuple[int, int, int, np.dtype[Any]]] = []
     for column, (place, dtype) in sorted(found.items()):
         if runs:

@@ -1,15 +1,15 @@
-"""The times of frames: stamps of messages, and what stands for a stamp that is missing.
+"""Times of frames: the stamps of messages, and replacements for missing stamps.
 
-One law for all flavours, so that two clocks never mix in a trace:
+All readers use the same rules, so that a trace never mixes two clocks:
 
-* The clock of a trace is that of the stamps of its leading channel. If none of its messages has a stamp, it is
-  the log time, of all channels.
-* A missing stamp is the log time less the offset (log time − stamp) of the message before it, else of the one
-  behind it. Where this is not between the stamps around it, it is interpolated.
-* A stamp of 0 is a time if a stamp beside it is near 0. Formats that cannot say that a stamp is missing (ROS)
-  write 0 for it: there, a 0 between stamps that go on is missing, too.
-* A message of another channel without a stamp, or with that of another clock, is placed by the offset of the
-  leading channel.
+* The clock of a trace is that of the stamps of its leading channel. If all its messages lack a stamp, the log
+  time is the clock, for all channels.
+* A missing stamp is computed as log time minus the offset (log time − stamp) of the previous message, else of
+  the next one. If the result is not between the neighbouring stamps, it is interpolated.
+* A stamp of 0 is a time if a neighbouring stamp is near 0. Formats without a value for "missing" (ROS) write 0
+  instead. In these formats, a 0 between continuous stamps counts as missing, too.
+* A message of another channel without a stamp, or with the stamp of another clock, gets its time from the
+  offset of the leading channel.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from dataclasses import dataclass, field
 from typing import Final
 
 NEAR: Final = 1_000_000_000
-"""A stamp is near 0 up to here, or up to three periods of its channel; ns."""
+"""Limit for a stamp near 0, or three periods of its channel if that is more; ns."""
 AT_ZERO: Final = 100_000_000
-"""How far from 0 a message of another channel may be by its log time if its stamp of 0 is a time; ns."""
+"""Maximum distance from 0, by log time, for a stamp of 0 in another channel to be a time; ns."""
 OTHER_CLOCK: Final = 86_400_000_000_000
-"""Stamps of two channels that are as far apart are of two clocks; ns."""
+"""Minimum distance of stamps of two different clocks; ns."""
 MOST_RUNS: Final = 100_000
-"""Runs of messages without a stamp that are remembered; the messages of more are losses."""
+"""Maximum number of stored runs of messages without a stamp. Messages of further runs are losses."""
 NO_TIME: Final = "a message has no time, and none can be derived"
-"""What a loss says of it."""
+"""Reason of the loss of such a message."""
 _STEPS: Final = 99
-"""Steps of a clock whose median is its period."""
+"""Number of steps of a clock; their median is its period."""
 
 Known = tuple[int, int]
 """Log time and stamp of a message."""
@@ -36,7 +36,7 @@ Known = tuple[int, int]
 
 @dataclass(slots=True)
 class _Unstamped:
-    """Messages without a stamp, or with a stamp of 0, and the messages with stamps around them."""
+    """Run of messages without a stamp or with a stamp of 0, and the stamped messages around it."""
 
     first: int
     last: int
@@ -46,19 +46,19 @@ class _Unstamped:
 
 @dataclass(slots=True)
 class Stamps:
-    """The stamps of a channel, as the first reading finds them.
+    """Stamps of a channel, collected by the first reading.
 
     Attributes
     ----------
     explicit : bool
-        Whether the format says that a stamp is missing.
+        True if the format distinguishes a missing stamp from 0.
     logged : bool
-        Whether the file has log times of its own. Without them a missing stamp is told by the place of its
+        True if the file has its own log times. Otherwise, a missing stamp follows from the position of its
         message between two others.
     first : tuple of int or None
-        Log time and stamp of the first message with a stamp that is not 0.
+        Log time and stamp of the first message with a stamp other than 0.
     steps : list of int
-        The first times between two stamps; ns.
+        First differences between stamps; ns.
     """
 
     explicit: bool = True
@@ -73,11 +73,11 @@ class Stamps:
     _more: bool = False
 
     def next(self) -> None:
-        """Count a message. It is called for each of the channel, whatever it holds."""
+        """Count a message. It must be called for every message of the channel."""
         self._number += 1
 
     def see(self, log_time_ns: int, stamp_ns: int | None) -> None:
-        """Take note of the stamp of the message that was counted last."""
+        """Record the stamp of the last counted message."""
         if stamp_ns == 0:
             self._zero = self._zero or (log_time_ns, 0)
         if stamp_ns:
@@ -95,35 +95,35 @@ class Stamps:
             self._runs.append(self._open)
 
     def is_near(self, known: Known | None) -> bool:
-        """Return whether a stamp is near 0."""
+        """True if a stamp is near 0."""
         steps = sorted(self.steps)
         period = steps[len(steps) // 2] if steps else 0
         return known is not None and abs(known[1]) <= max(NEAR, 3 * period)
 
     @property
     def clock(self) -> Known | None:
-        """Log time and stamp of one message; ``None`` if the log time is the clock."""
+        """Log time and stamp of one message. ``None`` means that the log time is the clock."""
         alone = self._number == 0
         return self.first or (self._zero if self.explicit or alone else None)
 
     def reading(self) -> StampReader:
-        """Return what tells the times of the messages when they are read again."""
+        """Return a reader of the message times for the second reading."""
         return StampReader(self, self._runs)
 
 
 class StampReader:
-    """The times of the messages of a channel, one after another.
+    """Reader of the times of a channel's messages, one after another.
 
     Parameters
     ----------
     stamps : Stamps
     runs : list
-        Its messages without a stamp, or with a stamp of 0.
+        Its runs of messages without a stamp or with a stamp of 0.
 
     Attributes
     ----------
     untimed : int
-        How many messages were given their log time, because no message of the channel has a stamp.
+        Number of messages that use the log time, because all messages of the channel lack a stamp.
     """
 
     def __init__(self, stamps: Stamps, runs: list[_Unstamped]) -> None:
@@ -133,11 +133,11 @@ class StampReader:
         self._offset = 0 if self._clock is None else self._clock[0] - self._clock[1]
 
     def next(self) -> None:
-        """Count a message. It is called for each of the channel, whatever it holds."""
+        """Count a message. It must be called for every message of the channel."""
         self._number += 1
 
     def time(self, log_time_ns: int, stamp_ns: int | None) -> int | None:
-        """The time of the message that was counted last; ``None`` if it cannot be known."""
+        """Return the time of the last counted message; ns. ``None`` means unknown."""
         if self._clock is None:
             self.untimed += 1
             return log_time_ns
@@ -147,7 +147,7 @@ class StampReader:
         return time_ns
 
     def beside(self, log_time_ns: int, stamp_ns: int | None) -> int:
-        """The time of a message of another channel, which comes now."""
+        """Return the time of the next message of another channel; ns."""
         expected = log_time_ns - self._offset
         if self._clock is None:
             return log_time_ns
@@ -157,12 +157,12 @@ class StampReader:
         return stamp_ns if stamp_ns is not None and same_clock else expected
 
     def _unstamped(self, log_time_ns: int, stamp_ns: int | None) -> int | None:
-        """The time of a message without a stamp, or with a stamp of 0."""
+        """Return the time of a message without a stamp or with a stamp of 0; ns."""
         while self._at < len(self._runs) and self._runs[self._at].last < self._number:
             self._at += 1
         run = self._runs[self._at] if self._at < len(self._runs) else None
         if run is None or run.first > self._number:
-            return None  # of too many
+            return None  # This run was not stored.
         before, behind = run.before, run.behind
         if stamp_ns == 0 and self._is_time(before, behind):
             return 0
@@ -173,20 +173,20 @@ class StampReader:
         return _between(log_time_ns, before, behind)
 
     def _placed(self, run: _Unstamped, log_time_ns: int) -> int | None:
-        """The time of a message in a file without log times: by its place between two stamps."""
+        """Return the time of a message in a file without log times, by its position between two stamps."""
         before, behind = run.before, run.behind
         if before is None:
             return None
         if behind is None or behind[1] < before[1]:
-            return log_time_ns  # that of the message before it
+            return log_time_ns  # The time of the previous message.
         share = self._number - run.first + 1, run.last - run.first + 2
         return before[1] + (behind[1] - before[1]) * share[0] // share[1]
 
     def _is_time(self, before: Known | None, behind: Known | None) -> bool:
-        """Return whether stamps of 0 between two others are a time."""
+        """True if stamps of 0 between two others are real times."""
         stamps = self._stamps
         if before is None and behind is None:
-            return True  # no other clock is known
+            return True  # Without another clock, 0 is a time.
         near = stamps.is_near(before) or stamps.is_near(behind)
         if stamps.explicit:
             return near
@@ -195,7 +195,7 @@ class StampReader:
 
 
 def _between(log_time_ns: int, before: Known | None, behind: Known | None) -> int:
-    """The time at a log time, by the offsets of the messages around it."""
+    """Return the time at a log time, from the offsets of the neighbouring messages; ns."""
     log, stamp = before or behind or (log_time_ns, log_time_ns)
     time_ns = log_time_ns - (log - stamp)
     if before is None or behind is None or before[1] <= time_ns <= behind[1]:
