@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections import Counter
 from dataclasses import replace
@@ -176,6 +177,14 @@ def without_size(number: int, other: Car) -> Car:
         ("FORALL (v:Car) ALWAYS NOT run_length(gap(ego, v) > 5) >= 8frames", "unknown"),
         ("FORALL (v:Car) ALWAYS NOT run_length(gap(ego, v) > 5) >= 4frames", "false"),
         ("FORALL (v:Car) ALWAYS v.length IS NOT NULL", "false"),
+        ("FORALL (v:Car) ALWAYS robustness(gap(ego, v) > 5) > 1", "unknown"),
+        ("FORALL (v:Car) ALWAYS robustness(gap(ego, v) > 5) < 4", "unknown"),
+        ("FORALL (v:Car) ALWAYS NOT robustness(gap(ego, v) > 5) <= 1", "unknown"),
+        ("FORALL (v:Car) ALWAYS robustness(gap(ego, v) > 5) > 4", "false"),
+        ("FORALL (v:Car) ALWAYS robustness(gap(ego, v) > 5 OR dist(ego, v) > 11) > 0", "true"),
+        ("FORSOME (v:Car) ALWAYS robustness(gap(ego, v) > 5) > 1", "unknown"),
+        ("FORSOME (v:Car) EVENTUALLY robustness(gap(ego, v) > 5) > 4", "unknown"),
+        ("FORALL (v:Car) ALWAYS robustness(run_length(gap(ego, v) > 5) < 20frames) > 5", "true"),
     ],
 )
 def test_what_is_unknown_decides_nothing(check: str, verdict: str) -> None:
@@ -266,6 +275,34 @@ def test_a_number_that_does_not_exist_is_not_unknown() -> None:
 
     for text in ("NOT ttc(ego, v) < 2", "ttc(ego, v) >= 2"):
         assert judged(f"CHECK c: FORALL (v:Car) ALWAYS {text}", scene).verdict == "true"
+
+
+@pytest.mark.parametrize(
+    ("check", "verdict", "value"),
+    [
+        ("FORALL (v:Car) ALWAYS robustness(ttc(ego, v) >= 2) > 0", "true", math.inf),
+        ("FORALL (v:Car) ALWAYS robustness(ttc(ego, v) >= 2) < 0", "true", math.inf),
+        ("FORALL (v:Car) ALWAYS NOT robustness(NOT ttc(ego, v) < 2) < 0", "true", math.inf),
+        ("FORALL (v:Car) ALWAYS robustness(ttc(ego, v) > 2 AND dist(ego, v) > 9) > 1", "true", 2.0),
+        (
+            "FORALL (v:Car) ALWAYS robustness(ttc(ego, v) > 2 AND dist(ego, v) > 9) > 4",
+            "false",
+            -1.0,
+        ),
+        ("FORSOME (v:Car) EVENTUALLY robustness(ttc(ego, v) > 2) > -1", "false", 0.0),
+        ("FORSOME (v:Car) EVENTUALLY robustness(ttc(ego, v) > 2) < 5", "false", 0.0),
+    ],
+)
+def test_a_margin_of_a_number_that_does_not_exist_decides_nothing(
+    check: str, verdict: str, value: float
+) -> None:
+    scene = following(10, lambda _, other: {**other, "vx": 20.0})
+
+    found = judged(f"CHECK c: {check} ROBUSTNESS", scene)
+
+    assert found.verdict == verdict
+    assert found.robustness is not None
+    assert found.robustness.value == pytest.approx(value)
 
 
 # Still due --------------------------------------------------------------------------------------------

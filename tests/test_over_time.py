@@ -219,6 +219,43 @@ def test_checks_are_what_their_definition_says(asked: tuple[World, Store]) -> No
     assert 0 < sum(violated) < 36
 
 
+@pytest.mark.parametrize("seed", range(1200, 1500) if LONG else (1217, 1218))
+def test_random_checks_of_other_worlds_are_what_their_definition_says(
+    tmp_path: Path, seed: int
+) -> None:
+    """With ``CASE`` over time, and with margins within checks."""
+    rng = random.Random(seed)
+    asked = worlds(seed, tmp_path)
+    checks = [random_check(rng) for _ in range(48 if LONG else 60)]
+    if not LONG:
+        checks = [one for one in checks if "CASE" in one or "robustness(" in one][:8]
+
+    violated = compare_check(*asked, *checks)
+
+    assert violated > 0
+
+
+MARGINS_OF_OTHER_FRAMES = (
+    "robustness(ALWAYS dist(ego, v) < 6) > -5",
+    "robustness(EVENTUALLY[0s, 0.3s] dist(ego, v) > 6) < 5",
+    "robustness(ONCE v.speed > 2) >= robustness(NEXT v.speed > 1)",
+    "ALWAYS (robustness(dist(ego, v) < 8 UNTIL v.speed < 1) = 0.5 OR exists_now(v))",
+    "EVENTUALLY robustness(NOT PREVIOUS dist(ego, v) < 3) <> 1",
+    "NOT EVENTUALLY robustness(WEAKNEXT dist(ego, v) < 6) < -2",
+    "ALWAYS CASE WHEN NOT EVENTUALLY v.speed > 2 THEN 0 ELSE dist(ego, v) END < 9",
+    "ALWAYS CASE WHEN NEXT robustness(dist(ego, v) < 6) > 0 THEN 1 END = 1",
+)
+"""A monitor does not know these."""
+
+
+@pytest.mark.parametrize("formula", MARGINS_OF_OTHER_FRAMES)
+@pytest.mark.parametrize("word", ["FORALL", "FORSOME"])
+def test_a_margin_over_time_within_a_check_knows_what_is_absent(
+    asked: tuple[World, Store], word: str, formula: str
+) -> None:
+    compare_check(*asked, f"CHECK c: {word} (v:Entity) {formula}", online=False)
+
+
 def test_all_and_some_range_over_entities_of_the_trace_and_signs_of_the_map(
     asked: tuple[World, Store],
 ) -> None:

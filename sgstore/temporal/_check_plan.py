@@ -54,6 +54,9 @@ STATE: Final = "state"
 POSSIBLY: Final = "possibly"
 """An operation of no query: a condition, unknown parts of it counting as true."""
 
+IN_FAVOUR: Final = "in favour"
+"""An operation of no query: a condition that counts absence as true."""
+
 FAVOURABLE: Final = "+"
 UNFAVOURABLE: Final = "-"
 """Ends of the names of unknown propositions that count in the first and in the second evaluation."""
@@ -301,13 +304,14 @@ class CheckPlan(Plan):
         counted = self._counted(things, reading)
         state = self._state(expression)
         known = b.Operation("=", (state, _number(0)), Type.boolean)
-        ways = [expression]
-        if self._open_runs(expression):
-            ways.append(_with_possible_runs(expression))
+        told = _absence_tried(expression, counted=counted is True)
+        ways = [told]
+        if self._open_courses(expression):
+            ways.append(_with_possible(told))
         ways = [_contrary(one) for one in ways] if counted else ways
         found = self._tested(_boolean("AND", known, *ways), expression)
         sign = _CONTRARY[reading.unknown] if counted else reading.unknown
-        doubt = self._doubtful(expression, state) if sign else None
+        doubt = self._doubtful(told, state) if sign else None
         whole: f.Formula = f.Proposition(found)
         if doubt is not None:
             name = self._tested(doubt, expression)
@@ -327,21 +331,22 @@ class CheckPlan(Plan):
         ways: list[b.Bound] = []
         if any(self._may_be_unknown(part) for part in b.walk(state)):
             ways.append(b.Operation(">", (state, _number(0)), Type.boolean))
-        if self._open_runs(expression):
+        if self._open_courses(expression):
             there = b.Operation(">=", (state, _number(0)), Type.boolean)
-            other = _with_possible_runs(expression)
+            other = _with_possible(expression)
             differ = _case(expression, _case(other, FALSE, TRUE), _case(other, TRUE, FALSE))
             ways.append(_boolean("AND", there, differ))
         if len(ways) > 1:
             return _case(ways[0], TRUE, ways[1])
         return ways[0] if ways else None
 
-    def _open_runs(self, expression: b.Bound) -> bool:
-        runs = [p for p in b.walk(expression) if isinstance(p, b.SignalCall) and p.word in _RUNS]
-        return any(self._open(run.operand) for run in runs)
+    def _open_courses(self, expression: b.Bound) -> bool:
+        """True if a condition inside a course may be unknown."""
+        parts = (part for part in b.walk(expression) if isinstance(part, b.SignalCall))
+        return any(self._open(p.operand) for p in parts if p.word in _OF_CONDITIONS)
 
     def _open(self, condition: b.Bound) -> bool:
-        """True if a condition inside ``run_length`` may be unknown."""
+        """True if a part of a condition may be unknown."""
         return any(
             self._unknown(part) is not None
             for part in b.walk(condition)
@@ -442,6 +447,15 @@ class CheckPlan(Plan):
 
     # Margins
 
+    def quantity(self, expression: b.Bound) -> f.Formula:
+        """Return the formula over margins of a condition inside ``robustness``."""
+        reading = CERTAIN
+        while isinstance(expression, b.Operation) and expression.word in {POSSIBLY, IN_FAVOUR}:
+            change = {"unknown": "*"} if expression.word == POSSIBLY else {"absent": True}
+            reading = replace(reading, **change)
+            (expression,) = expression.operands
+        return self.margin(expression, reading)
+
     def margin(  # noqa: PLR0911 - a case each
         self, expression: b.Bound, reading: Reading
     ) -> f.Formula:
@@ -468,44 +482,88 @@ class CheckPlan(Plan):
     def _margin(self, expression: b.Operation, reading: Reading) -> f.Formula:
         """Return the margin of a comparison, with a default for absent and unknown values."""
         difference = MARGINS[expression.word](*expression.operands)
-        test = self.test(difference)
-        self.margins.setdefault(test.name, expression)
         things, state = self._things(expression), self._state(expression)
+        counted = self._counted(things, reading)
         known = [b.Operation("=", (state, _number(0)), Type.boolean)]
         if has_pairs(expression):
             known.append(_boolean("IS NOT NULL", difference))
         whole = f.Proposition(
             self._tested(_boolean("AND", *known) if len(known) > 1 else known[0], expression)
         )
-        counted = self._counted(things, reading)
-        found: f.Formula = f.And((f.Proposition(test.name), whole))
-        doubt = self._doubtful(expression, state) if reading.unknown else None
-        name = None if doubt is None else self._tested(doubt, expression)
-        if name is not None:
+        found: f.Formula = f.And((self._differences(difference, expression, reading), whole))
+        sign = _CONTRARY[reading.unknown] if counted else reading.unknown
+        doubt = self._doubtful(expression, state) if sign else None
+        also: tuple[f.Formula, ...] = ()
+        if doubt is not None:
+            name = self._tested(doubt, expression)
             self.doubts.setdefault(name, expression)
-        if not counted:
-            if name is not None:
-                found = f.Or((found, f.Proposition(name + reading.unknown.strip("*"))))
-            return self._by_levels(found, things, reading) if counted is None else found
-        sign = _CONTRARY[reading.unknown].strip("*")
-        also = () if name is None else (f.Proposition(name + sign),)
-        return f.Or((found, f.Not(f.Or((whole, *also)))))
+            also = (f.Proposition(name + sign.strip("*")),)
+        if counted:
+            return f.Or((found, f.Not(f.Or((whole, *also)))))
+        found = f.Or((found, *also)) if also else found
+        return self._by_levels(found, things, reading) if counted is None else found
+
+    def _differences(
+        self, difference: b.Bound, meaning: b.Operation, reading: Reading
+    ) -> f.Formula:
+        """Return the difference by which a comparison holds, in all readings of its courses."""
+        counted = self._counted(self._things(meaning), reading)
+
+        def told(ways: Iterable[b.Bound], *, either: bool) -> f.Formula:
+            names = [self.test(one).name for one in ways]
+            for name in names:
+                self.margins.setdefault(name, meaning)
+            if len(names) == 1:
+                return f.Proposition(names[0])
+            return (f.Or if either else f.And)(tuple(map(f.Proposition, names)))
+
+        ways = [*dict.fromkeys((difference, _in_favour(difference)))]
+        found = told(ways, either=counted is True)
+        if not self._open_courses(difference):
+            return found
+        found = f.And((found, told(map(_with_possible, ways), either=counted is True)))
+        if not reading.unknown:
+            return found
+        differ = _boolean("<>", difference, _with_possible(difference))
+        name = self._tested(differ, meaning)
+        self.doubts.setdefault(name, meaning)
+        return f.Or((found, f.Proposition(name + reading.unknown.strip("*"))))
 
 
 def _has_state(expression: b.Bound) -> bool:
     return any(isinstance(part, b.Operation) and part.word == STATE for part in b.walk(expression))
 
 
-_RUNS: Final = frozenset({"run_length", "since_true"})
+_OF_CONDITIONS: Final = frozenset({"run_length", "since_true", "robustness"})
+"""Courses of conditions."""
 
 
-def _with_possible_runs(expression: b.Bound) -> b.Bound:
-    """Return the expression with run conditions that count unknown as true."""
+def _with_possible(expression: b.Bound) -> b.Bound:
+    """Return the expression with course conditions that count unknown as true."""
     match expression:
-        case b.SignalCall(word=word, operand=operand) if word in _RUNS:
-            return replace(expression, operand=b.Operation(POSSIBLY, (operand,), Type.boolean))
+        case b.SignalCall(word=word, operand=operand) if word in _OF_CONDITIONS:
+            return replace(expression, operand=_boolean(POSSIBLY, operand))
         case _:
-            return b.with_operands(expression, _with_possible_runs)
+            return b.with_operands(expression, _with_possible)
+
+
+def _in_favour(expression: b.Bound) -> b.Bound:
+    """Return the expression with ``robustness`` conditions that count absence as true."""
+    match expression:
+        case b.SignalCall(word="robustness", operand=operand):
+            return replace(expression, operand=_boolean(IN_FAVOUR, operand))
+        case _ if isinstance(expression, b.SignalCall) or b.is_formula(expression):
+            return expression
+        case _:
+            return b.with_operands(expression, _in_favour)
+
+
+def _absence_tried(expression: b.Bound, *, counted: bool) -> b.Bound:
+    """Return the condition that either reading of absence is true, or both if not counted."""
+    other = _in_favour(expression)
+    if other == expression:
+        return expression
+    return _case(expression, TRUE, other) if counted else _boolean("AND", expression, other)
 
 
 def _number(value: float) -> b.Value:
