@@ -1,12 +1,11 @@
-"""Coverage: what a data set holds, what it lacks, and how much one says of another.
+"""Coverage: contents and gaps of a data set, and comparison with another one.
 
-``frames`` says which frames are meant · ``classed`` gives each its class, or that of a window · ``compare``
-counts: classes, coverage, novelty, what sets share, growth · ``estimates`` says how much was not seen ·
-``features`` and ``slots`` combine what scenes are made of, and list what is missing as queries that ``asking``
-writes · ``cells`` takes a query as a specification · ``explain`` tells two selections apart · ``failures``
-looks at where a system failed.
+``_frames`` defines selections of frames and result tables. ``_classes`` assigns a class to each
+frame or window. ``_compare`` counts classes, coverage, novelty, common classes and growth,
+estimates the number of unseen classes, and evaluates failures of a system. ``_features``,
+``_slots`` and ``_sequences`` count combinations and list missing ones as queries.
 
-Every answer is a table that says what its shares are of.
+Every result is a table that names the denominators of its shares.
 """
 
 import lazy_loader

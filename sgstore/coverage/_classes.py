@@ -1,6 +1,6 @@
-"""Frames and their classes as numbers, of one selection or of several that share them.
+"""Frames of one or several selections, with their classes as numbers.
 
-What is a class is a choice: that of a frame's graph in an abstraction, or that of the last t frames together.
+A class is that of a frame's graph in an abstraction, or that of a window of the last t frames.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ if TYPE_CHECKING:
 
 
 UNKNOWN: Final = -1
-"""Code of a frame whose class nobody can tell."""
+"""Code of a frame with an unknown class."""
 LONGEST_WINDOW: Final = 10_000
-"""Most frames of a window: minutes of a recording, so that windows end in memory and time."""
+"""Greatest number of frames of a window: minutes of a recording, to bound memory and time."""
 
 
 Missing = Literal["equal", "distinct", "drop"]
-"""Treatment of windows in which frames are missing: before a trace, at a gap, or without a class.
+"""Treatment of windows with missing frames: before the start of a trace, at a gap, or without a class.
 
-``equal``: what is missing is a class of its own, the same wherever it is missing (S3C); ``distinct``: it is
-equal to nothing, so every such window is a class of its own; ``drop``: such windows do not count.
+``equal``: a missing frame is its own class, the same everywhere (S3C); ``distinct``: it equals
+nothing, so every such window is its own class; ``drop``: such windows do not count.
 """
 
 CountedUnit = Literal["frame", "run", "trace"]
-"""Unit that is counted: frames, runs of consecutive frames of one class, or traces that have the class."""
+"""Counted unit: frames, runs of consecutive frames of one class, or traces with the class."""
 
 
 @dataclass(frozen=True)
@@ -62,25 +62,25 @@ class Classed:
 
     @property
     def known(self) -> Bools:
-        """(N,): whether the class of a frame is known."""
+        """Return a mask (N,) of frames with a known class."""
         return self.code != UNKNOWN
 
     @property
     def unknown(self) -> int:
-        """Number of frames whose class is not known."""
+        """Return the number of frames with an unknown class."""
         return int((self.code == UNKNOWN).sum())
 
     def sizes(self, unit: CountedUnit = "frame") -> Ints:
-        """(len(names),) int64: how many units of each class there are."""
+        """Return the number of units of each class, (len(names),)."""
         code = self.code[self._units(unit)]
         return np.bincount(code, minlength=len(self.names)).astype(np.int64)
 
     def samples(self, unit: CountedUnit) -> int:
-        """Number of traces, if these are counted; else 0: each unit is a sample of its own."""
+        """Return the number of traces if traces are counted, else 0: each unit is its own sample."""
         return len(np.unique(trace_of(self.frame_id))) if unit == "trace" else 0
 
     def _units(self, unit: CountedUnit) -> Ints:
-        """Rows that stand for units."""
+        """Return the rows that represent units."""
         rows = np.flatnonzero(self.known)
         if unit == "frame" or not len(rows):
             return rows
@@ -90,24 +90,24 @@ class Classed:
         return rows[self.run_begins()[rows]]
 
     def run_begins(self) -> Bools:
-        """(N,): which frames begin a run of frames of one class."""
+        """Return a mask (N,) of frames that begin a run of one class."""
         found = begins(self.frame_id)
         found[1:] |= self.code[1:] != self.code[:-1]
         return found
 
     def present(self) -> Ints:
-        """Codes of the classes that occur, ascending."""
+        """Return the codes of the occurring classes, ascending."""
         return np.flatnonzero(self.sizes())
 
     def first(self) -> Ints:
-        """(len(names),) int64: id of the first frame of each class, -1 where there is none."""
+        """Return the id of the first frame of each class, or -1, (len(names),)."""
         found = np.full(len(self.names), -1)
         rows = np.flatnonzero(self.known)[::-1]
         found[self.code[rows]] = self.frame_id[rows]
         return found
 
     def in_order(self) -> Ints:
-        """(N,) int64: rows in the order in which traces came into the store, frame after frame."""
+        """Return the rows in ingest order of traces, frame after frame, (N,)."""
         rank = {trace.trace_id: i for i, trace in enumerate(traces_of(self.chosen.store))}
         traces, number = np.unique(trace_of(self.frame_id), return_inverse=True)
         ranks = np.array([rank.get(trace, len(rank)) for trace in traces.tolist()], np.int64)
@@ -121,28 +121,28 @@ def classed(
     missing: Missing = "equal",
     slots: Specification | None = None,
 ) -> Classed:
-    """The frames of a selection with their classes.
+    """Return the frames of a selection with their classes.
 
     Parameters
     ----------
     chosen : ChosenFrames
     abstraction : str
-        Whose classes.
+        Abstraction of the classes.
     window : int
-        Frames that are seen together: a frame and those recorded before it in its trace; at most
+        Length of windows in frames: a frame and the previous ones of its trace; at most
         :data:`LONGEST_WINDOW`.
     missing : Missing
-        How a window counts in which frames are missing.
+        Treatment of windows with missing frames.
     slots : Specification, optional
-        Instead of an abstraction: a class is what a frame has of all declared slots. Frames that do not count
-        are missing.
+        Used instead of an abstraction: a class is the combination of a frame's values of all
+        declared slots. Frames that do not count are missing.
 
     Raises
     ------
     AbstractionError
-        There is no such abstraction, or no such window.
+        The abstraction is unknown, or the window length is out of range.
     QueryError
-        A pattern of a slot is none.
+        A pattern of a slot is invalid.
     """
     if not 1 <= window <= LONGEST_WINDOW:
         raise AbstractionError(f"a window has 1 to {LONGEST_WINDOW:,} frames")
@@ -159,13 +159,13 @@ def classed(
 
 
 def _windows(whole: Classed, window: int, missing: Missing) -> Classed:
-    """Each frame with the class of its window."""
+    """Return each frame with the class of its window."""
     frame_id, code = whole.frame_id, whole.code
     ids, time_ns = whole.chosen.abstracted.times()
     time_ns = time_ns[np.searchsorted(ids, frame_id)]
     fresh = run_begins(whole.chosen.store, frame_id, time_ns)
     within = np.arange(len(code)) - np.maximum.accumulate(np.where(fresh, np.arange(len(code)), 0))
-    state = code + 1  # 0: missing
+    state = code + 1  # 0 means missing
     parts = [state]
     complete = code != UNKNOWN
     furthest = int(within.max(initial=0))
@@ -193,7 +193,7 @@ def _windows(whole: Classed, window: int, missing: Missing) -> Classed:
 
 
 def _numbered(parts: Sequence[Ints]) -> tuple[Ints, Ints]:
-    """Equal tuples get equal numbers; and a row of each number."""
+    """Number tuples so that equal tuples have equal numbers; return also one row per number."""
     key = parts[0]
     for part in parts[1:]:
         key = np.unique(key * (int(part.max(initial=0)) + 1) + part, return_inverse=True)[1]
@@ -202,13 +202,13 @@ def _numbered(parts: Sequence[Ints]) -> tuple[Ints, Ints]:
 
 
 def _window_name(classes: Sequence[str]) -> str:
-    """32 hexadecimal digits of what a window is made of: the same in every store."""
+    """Return a hash of a window's classes, 32 hexadecimal digits, the same in every store."""
     text = "\n".join(classes).encode()
     return blake2b(text, digest_size=16, person=b"sgstore window").hexdigest()
 
 
 def shared(*of: Classed) -> tuple[tuple[str, ...], list[Classed]]:
-    """The same with one numbering of all their classes."""
+    """Renumber several selections with common class numbers."""
     if all(one.names == of[0].names for one in of):  # parts of one store
         return of[0].names, list(of)
     number: dict[str, int] = {}

@@ -1,14 +1,14 @@
-"""Comparison of selections: shared, new and missing classes, estimates of what is unseen, and failures.
+"""Comparison of selections: common, new and missing classes, estimates of unseen classes, and failures.
 
-How much has not been seen, from how often what was seen was seen.
+The estimates of unseen classes use the frequencies of the seen classes.
 
 Sources. Good–Turing: Good, "The population frequencies of species", Biometrika 40 (1953). Chao1, its variance
 and interval: Chao, "Nonparametric estimation of the number of classes in a population" (1984), bias-corrected
 as in Chao and Chiu, "Species richness: estimation and comparison" (2016), eq. 4, 7 and 8. Rarefaction:
 Hurlbert, "The nonconcept of species diversity", Ecology 52 (1971).
 
-All of them hold for samples that are drawn independently. Frames one after another are not: count runs or
-traces.
+All estimates assume independently drawn samples. Consecutive frames are not independent: count runs
+or traces.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Estimate of the classes that were not seen.
+    """Estimate of the number of unseen classes.
 
     Attributes
     ----------
     units : int
-        How many units were counted.
+        Number of counted units.
     seen : int
-        How many classes they have.
+        Number of their classes.
     once, twice : int
-        How many classes were seen in one unit, and in two.
+        Number of classes seen in exactly one unit, and in two.
     unseen_mass : float
-        Good–Turing: the share of further units whose class is new; NaN without units.
+        Good–Turing: the expected share of further units with a new class; NaN without units.
     chao1 : float
-        How many classes there are at least, seen and unseen; a lower bound in expectation.
+        Estimated number of classes, seen and unseen; a lower bound in expectation.
     low, high : float
         Its 95 % interval.
     """
@@ -66,15 +66,15 @@ class Estimate:
 
 
 def estimate(sizes: Ints, samples: int = 0) -> Estimate:
-    """Estimate the classes that were not seen.
+    """Estimate the number of unseen classes.
 
     Parameters
     ----------
     sizes : (S,) int64
-        How often each class was seen; those that are 0 do not count.
+        Number of units per class; zeros are ignored.
     samples : int
-        How many samples there were, if a sample has many classes, each of which counts once in it: traces.
-        ``chao1`` is then Chao2 of these incidences. 0: each unit is a sample of its own.
+        Number of samples with several classes each (traces), where a class counts once per sample.
+        ``chao1`` is then Chao2 of these incidences. 0: each unit is its own sample.
     """
     sizes = sizes[sizes > 0]
     units, seen = int(sizes.sum()), len(sizes)
@@ -99,7 +99,7 @@ def estimate(sizes: Ints, samples: int = 0) -> Estimate:
 
 
 def _interval(seen: int, unseen: float, variance: float) -> tuple[float, float]:
-    """The 95 % interval of a number of classes that cannot be less than what was seen: log-normal."""
+    """Return the 95 % interval of the number of classes, log-normal above the seen number."""
     if unseen <= 0:
         return float(seen), float(seen)
     width = math.exp(1.96 * math.sqrt(math.log(1 + variance / unseen**2)))
@@ -109,20 +109,21 @@ def _interval(seen: int, unseen: float, variance: float) -> tuple[float, float]:
 def expected_classes(
     sizes: Ints, drawn: Ints, units: int = 0, weight: Ints | None = None
 ) -> Floats:
-    """Mean number of classes in a random part: rarefaction, exact.
+    """Return the mean number of classes in a random subset: exact rarefaction.
 
-    A class that is in m of N units is missed by n of them in C(N - m, n) of C(N, n) cases (hypergeometric).
+    A class in m of N units is missed by a subset of n in C(N - m, n) of C(N, n) cases
+    (hypergeometric).
 
     Parameters
     ----------
     sizes : (S,) int64
-        In how many units each class is.
+        Number of units with each class.
     drawn : (K,) int64
-        How many units are drawn without putting them back; at most all.
+        Sizes of subsets, drawn without replacement; at most all units.
     units : int
-        How many there are. 0: the sum of ``sizes``, each unit being of one class.
+        Number of units. 0: the sum of ``sizes``, for units with one class each.
     weight : (S,) int64, optional
-        How many classes each stands for.
+        Number of classes that each entry represents.
     """
     seen = sizes > 0
     units = units or int(sizes.sum())
@@ -133,35 +134,34 @@ def expected_classes(
     expected = np.full(len(drawn), float(often.sum()))
     for size in np.flatnonzero(often).tolist():
         rest = units - size - drawn
-        # C(units - size, drawn) / C(units, drawn), in logarithms
+        # C(units - size, drawn) / C(units, drawn), as logarithms
         missed = logs[units - size] - logs[np.maximum(rest, 0)] - logs[units] + logs[units - drawn]
         expected -= often[size] * np.where(rest >= 0, np.exp(missed), 0.0)
     return expected
 
 
-# One selection of frames against another: what is covered, what is new, what they share; and how one grew
-# ------------------------------------------------------------------------------------------------
+# Comparison of two selections: covered, new and common classes; and growth of one selection.
 
 POINTS = 40
-"""Rows of a curve of growth."""
+"""Number of rows of a growth curve."""
 
 
 def classes(a: Classed, unit: CountedUnit = "frame") -> ReportTable:
-    """The classes of a selection, the most frequent first.
+    """Return the classes of a selection, the most frequent first.
 
     Returns
     -------
     ReportTable
-        ``rank``, ``class``, ``units``, ``share``, ``cumulative`` (shares of the units whose class is known),
-        and ``frame``, the first one that has it. What is said names the denominators, and estimates what is
-        unseen.
+        ``rank``, ``class``, ``units``, ``share``, ``cumulative`` (shares of the units with a known
+        class), and ``frame``, the first one with the class. The notes name the denominators, and
+        estimate the unseen classes.
     """
     sizes, first = a.sizes(unit), a.first()
     present = np.flatnonzero(sizes)
     order = present[np.lexsort((first[present], -sizes[present]))]
     total = a.samples(unit) or int(sizes.sum())
     cumulative: list[float | None] = (np.cumsum(sizes[order]) / max(total, 1)).tolist()
-    if unit == "trace":  # a trace has many classes: these shares add up to nothing
+    if unit == "trace":  # a trace has several classes: cumulative shares have no meaning
         cumulative = [None] * len(order)
     rows = zip(
         range(1, len(order) + 1),
@@ -196,7 +196,7 @@ def _said(a: Classed, unit: CountedUnit) -> list[str]:
 
 
 def unseen(found: Estimate, unit: CountedUnit) -> str:
-    """Estimate of the classes that were not seen, as a sentence."""
+    """Return the estimate of unseen classes as a sentence."""
     return (
         f"unseen: {found.unseen_mass:.2%} of further {unit}s would be of a new class (Good-Turing);"
         f" at least {found.chao1:.0f} classes in all (Chao1, 95 %: {found.low:.0f} to {found.high:.0f}),"
@@ -205,7 +205,7 @@ def unseen(found: Estimate, unit: CountedUnit) -> str:
 
 
 def covered(of: Classed, by: Classed) -> ReportTable:
-    """Share of the classes of one selection that occur in another: by class and by frame.
+    """Return the share of the classes of one selection that occur in another, by class and by frame.
 
     Returns
     -------
@@ -226,18 +226,18 @@ def covered(of: Classed, by: Classed) -> ReportTable:
 
 
 def is_novel(a: Classed, than: Classed) -> Bools:
-    """(N,): which frames have a class that does not occur in another selection; both in one numbering."""
-    there = np.append(than.sizes() > 0, True)  # the last one is that of unknown classes
+    """Return a mask (N,) of frames with a class that another selection lacks; common numbering required."""
+    there = np.append(than.sizes() > 0, True)  # the last entry is for unknown classes
     return ~there[a.code]
 
 
 def novel(a: Classed, than: Classed) -> ReportTable:
-    """The classes of one selection that do not occur in another, the rarest first.
+    """Return the classes of one selection that another lacks, the rarest first.
 
     Returns
     -------
     ReportTable
-        ``class``, ``frames``, ``frame`` (the first that has it).
+        ``class``, ``frames``, ``frame`` (the first with the class).
     """
     _, (a, than) = shared(a, than)
     sizes, first = a.sizes(), a.first()
@@ -256,7 +256,7 @@ def novel(a: Classed, than: Classed) -> ReportTable:
 
 
 def novel_frames(a: Classed, than: Classed) -> ReportTable:
-    """The frames with such classes, those of the rarest classes first.
+    """Return the frames with novel classes, rarest classes first.
 
     Returns
     -------
@@ -275,7 +275,7 @@ def novel_frames(a: Classed, than: Classed) -> ReportTable:
 
 
 def novel_clips(a: Classed, than: Classed) -> ReportTable:
-    """Runs of consecutive frames with such classes, the longest first.
+    """Return runs of consecutive frames with novel classes, the longest first.
 
     Returns
     -------
@@ -302,7 +302,7 @@ def novel_clips(a: Classed, than: Classed) -> ReportTable:
 
 
 def venn(a: Classed, b: Classed) -> ReportTable:
-    """Common part of two selections, by class and by frame.
+    """Return the intersection of two selections, by class and by frame.
 
     Returns
     -------
@@ -326,13 +326,13 @@ def venn(a: Classed, b: Classed) -> ReportTable:
 
 
 def growth(a: Classed, unit: CountedUnit = "frame", points: int = POINTS) -> ReportTable:
-    """Number of classes in the first n units, in the order in which traces came into the store.
+    """Return the number of classes in the first n units, in ingest order of traces.
 
     Returns
     -------
     ReportTable
-        ``n``, ``classes``, ``new_per_1000`` since the row before, and ``at_random``: how many classes n
-        units drawn at random have in the mean.
+        ``n``, ``classes``, ``new_per_1000`` since the previous row, and ``at_random``: the mean
+        number of classes in n random units.
     """
     sizes, found = curve(a, unit)
     total = len(found)
@@ -352,9 +352,9 @@ def growth(a: Classed, unit: CountedUnit = "frame", points: int = POINTS) -> Rep
 
 
 def curve(a: Classed, unit: CountedUnit = "frame") -> tuple[Ints, Ints]:
-    """Sizes of the classes, and how many of them there are after each unit.
+    """Return the sizes of the classes, and the number of classes after each unit.
 
-    A trace is a unit that brings all its classes at once.
+    A trace is a unit that adds all its classes at once.
     """
     order = a.in_order()
     order = order[a.code[order] != UNKNOWN]
@@ -371,26 +371,26 @@ def curve(a: Classed, unit: CountedUnit = "frame") -> tuple[Ints, Ints]:
 
 
 def rank_sizes(a: Classed, unit: CountedUnit = "frame") -> tuple[Ints, Floats]:
-    """Sizes of the classes, the largest first, and the share of all units that so many classes have."""
+    """Return the sizes of the classes, largest first, and their cumulative shares of all units."""
     sizes = np.sort(a.sizes(unit))[::-1]
     sizes = sizes[sizes > 0]
     return sizes, np.cumsum(sizes) / max(int(sizes.sum()), 1)
 
 
 # Failures of a system under test by the classes of its inputs: S3C's novel failures --------------
-# Woodlief et al., "S3C: Spatial Semantic Scene Coverage for Autonomous Vehicles" (ICSE 2024), section 4.2. A
-# *novel failure* is a failing test input whose class has no failing training input. PNFNC is the share of novel
-# failures whose class has no training input at all: failures that coverage would have foretold.
+# Woodlief et al., "S3C: Spatial Semantic Scene Coverage for Autonomous Vehicles" (ICSE 2024),
+# section 4.2. A *novel failure* is a failing test input whose class has no failing training input.
+# PNFNC is the share of novel failures whose class has no training input at all: failures that
+# coverage could predict.
 
 S3C_THRESHOLD: Final = 5 / 140
-"""The error beyond which S3C's code counts a steering angle, -1 … 1 for ±70°, as a failure: 2.5°, though its
-paper says 5°."""
+"""Error threshold of S3C's code for a steering angle, -1 … 1 for ±70°: 2.5°, although its paper states 5°."""
 
 _ID: Final = re.compile(r"[0-9]{1,19}")
 
 
 def read_outcomes(path: str | Path, threshold: float = S3C_THRESHOLD) -> dict[str, bool]:
-    """The outcomes in a CSV file: which inputs of a system failed.
+    """Read the outcomes of a system's inputs from a CSV file.
 
     Parameters
     ----------
@@ -398,18 +398,18 @@ def read_outcomes(path: str | Path, threshold: float = S3C_THRESHOLD) -> dict[st
         Columns ``frame`` (or S3C's ``town`` and ``filename``) and ``failed``, or ``error``, or ``label`` and
         ``pred``.
     threshold : float
-        An error above it is a failure; of ``label`` and ``pred`` their difference.
+        A greater error is a failure; for ``label`` and ``pred`` the error is their difference.
 
     Returns
     -------
     dict
-        Name → whether it failed. A name is ``TRACE#SEQ``, a ``frame_id``, or what an imported file calls a
-        graph.
+        Name → True for a failure. A name is ``TRACE#SEQ``, a ``frame_id``, or the name of a graph
+        in an imported file.
 
     Raises
     ------
     ConfigError
-        It cannot be read, a column is missing, or a row is not what it must be.
+        The file is unreadable, a column is missing, or a row is invalid.
     """
     path = Path(path)
     try:
@@ -424,7 +424,7 @@ def read_outcomes(path: str | Path, threshold: float = S3C_THRESHOLD) -> dict[st
 def told_outcomes(
     outcomes: Mapping[str, bool], chosen: ChosenFrames, frame_id: Ints
 ) -> tuple[Bools, Bools]:
-    """(N,): which frames failed, and of which an outcome is known; names are those of :func:`read_outcomes`."""
+    """Return masks (N,) of failed frames, and of frames with a known outcome."""
     failed, known = (np.zeros(len(frame_id), np.bool_) for _ in range(2))
     place = {int(frame): row for row, frame in enumerate(frame_id.tolist())}
     ids = chosen.abstracted.times()[0]
@@ -489,19 +489,20 @@ def failures(
     ----------
     train, test : Classed
     outcomes : mapping
-        Name of a frame → whether the system failed; see :func:`read_outcomes`.
+        Name of a frame → True for a failure; see :func:`read_outcomes`.
 
     Returns
     -------
     shares : ReportTable
         ``measure``, ``part``, ``of``, ``share``, ``denominator``.
     novel : ReportTable
-        The novel failures: ``frame``, ``class``, ``in_training`` (how many training inputs are of its class).
+        The novel failures: ``frame``, ``class``, ``in_training`` (number of training inputs of the
+        class).
 
     Raises
     ------
     ConfigError
-        No outcome is about a frame of either.
+        The outcomes match no frame of either selection.
     """
     _, (train, test) = shared(train, test)
     failed_train, known_train = told_outcomes(outcomes, train.chosen, train.frame_id)
@@ -512,7 +513,7 @@ def failures(
         )
     failed &= test.known
     failed_train &= train.known
-    # Training inputs of the class of each test input.
+    # Number of training inputs of each test input's class.
     inputs = np.append(train.sizes(), 0)[test.code]
     fails = np.bincount(train.code[failed_train], minlength=len(train.names) + 1)
     novel = failed & (fails[test.code] == 0)
@@ -526,7 +527,7 @@ def failures(
         ("failures", failed, known & test.known, told[0]),
         ("failures in training", failed_train, known_train & train.known, told[1]),
         ("novel failures", novel, failed, new),
-        # What follows says how many of them coverage would have foretold.
+        # The next rows show how many of them coverage could predict.
         ("PNFNC", uncovered, novel, f"novel failures: their class does not occur in {theirs}"),
         (
             "classes of novel failures that are not covered",

@@ -1,6 +1,6 @@
-"""Features of frames in an abstraction, such as (car, near, ego), and combinations of k of them.
+"""Features of frames in an abstraction, such as (car, near, ego), and combinations of k features.
 
-Equal classes have equal features, so one frame of each class is looked at, however many there are.
+Equal classes have equal features; therefore one frame per class is read.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
 
 
 Feature = tuple[str, ...]
-"""Labels of an edge's source, of itself and of its destination; or of a node, in abstractions without edges."""
+"""Labels of an edge's source, edge and destination; or of a node, in abstractions without edges."""
 
 MOST: Final = 5_000_000
-"""Most combinations that are gone through: more are an error, not a part of the answer."""
+"""Greatest number of combinations; more are an error, never a partial result."""
 
 LARGEST: Final = 4_000_000_000
-"""Most bytes that features of classes may take."""
+"""Greatest size of the features of classes; bytes."""
 
 _ROWS: Final = 8_192
 """Classes that are multiplied at once."""
@@ -56,9 +56,9 @@ class ClassFeatures:
     codes : (C,) int64
         The classes, ascending.
     counts : (C, F) unsigned
-        How often each class has each feature.
+        Number of occurrences of each feature in each class.
     frames : (C,) int64
-        How many frames each class has.
+        Number of frames of each class.
     """
 
     names: tuple[Feature, ...]
@@ -68,17 +68,17 @@ class ClassFeatures:
 
     @property
     def there(self) -> Bools:
-        """(C, F): whether a class has a feature."""
+        """Return a mask (C, F) of the features of each class."""
         return self.counts > 0
 
 
 def features(a: Classed, abstraction: str, *, of_ego: bool = False) -> ClassFeatures:
-    """Features of the classes of a selection.
+    """Return the features of the classes of a selection.
 
     Parameters
     ----------
     a : Classed
-        Its classes are those of this very abstraction.
+        Its classes must belong to this abstraction.
     abstraction : str
     of_ego : bool
         True: only features of the ego, and of lanes by their role for it.
@@ -86,7 +86,7 @@ def features(a: Classed, abstraction: str, *, of_ego: bool = False) -> ClassFeat
     Raises
     ------
     ConfigError
-        There are more than can be held.
+        They exceed the memory limit.
     """
     codes, first = a.present(), a.first()
     order = np.argsort(first[codes], kind="stable")
@@ -112,12 +112,12 @@ def features(a: Classed, abstraction: str, *, of_ego: bool = False) -> ClassFeat
 
 
 def zeros(shape: tuple[int, int], kind: np.dtype[Any]) -> NDArray[np.unsignedinteger[Any]]:
-    """Room for features of classes.
+    """Allocate an array for features of classes.
 
     Raises
     ------
     ConfigError
-        There is too little.
+        It exceeds the memory limit.
     """
     if shape[0] * shape[1] * kind.itemsize > LARGEST:
         raise ConfigError(
@@ -128,9 +128,9 @@ def zeros(shape: tuple[int, int], kind: np.dtype[Any]) -> NDArray[np.unsignedint
 
 
 def weighted(counts: NDArray[np.integer[Any]], weights: Floats, more_than: int = 0) -> Floats:
-    """(K, F): the weights, (K, C), of the classes that have each feature more often than so, together."""
+    """Return total weights (K, F) of the classes with more than ``more_than`` of each feature."""
     total = np.zeros((len(weights), counts.shape[1]))
-    # Whole numbers are exact in 32 bits below 2²⁴.
+    # Integers below 2²⁴ are exact in 32 bits.
     small = np.abs(weights).sum() < 1 << 24 and (weights == np.round(weights)).all()
     kind = np.float32 if small else np.float64
     for first in range(0, len(counts), _ROWS):
@@ -141,16 +141,16 @@ def weighted(counts: NDArray[np.integer[Any]], weights: Floats, more_than: int =
 
 @dataclass(frozen=True)
 class Combinations:
-    """Combinations of k features that occur.
+    """Occurring combinations of k features.
 
     Attributes
     ----------
     features : ClassFeatures
     k : int
     members : (M, k) int64
-        All combinations: indices of features, ascending.
+        All combinations: ascending indices of features.
     frames : (M,) int64
-        Frames in which each occurs.
+        Number of frames with each combination.
     """
 
     features: ClassFeatures
@@ -159,18 +159,18 @@ class Combinations:
     frames: Ints
 
     def texts(self, rows: Sequence[int] | Ints) -> list[str]:
-        """Combinations for people."""
+        """Return combinations as readable texts."""
         names = [" ".join(name) for name in self.features.names]
         return [" & ".join(names[i] for i in one) for one in self.members[rows].tolist()]
 
 
 def combined(found: ClassFeatures, k: int) -> Combinations:
-    """All combinations of k features, and in how many frames each occurs.
+    """Return all combinations of k features, with the number of frames of each.
 
     Raises
     ------
     ConfigError
-        k is not positive, or there are more combinations than can be gone through.
+        k is not positive, or there are too many combinations.
     """
     many = len(found.names)
     if k < 1 or comb(many, k) > MOST:
@@ -178,7 +178,7 @@ def combined(found: ClassFeatures, k: int) -> Combinations:
             f"{comb(many, max(k, 0)):,} combinations of {k} of {many} features; {MOST:,} can be gone through:"
             " ask for a smaller k, or for an abstraction with fewer labels"
         )
-    size = min(k, many + 1)  # of more there are none either
+    size = min(k, many + 1)  # larger sizes have no combinations either
     listed = chain.from_iterable(combinations(range(many), size))
     members = np.fromiter(listed, np.int64, comb(many, size) * size).reshape(-1, size)
     if k == 2:
@@ -189,7 +189,7 @@ def combined(found: ClassFeatures, k: int) -> Combinations:
 
 
 def _counted(found: ClassFeatures, members: Ints) -> Iterator[int]:
-    """Frames of combinations, one after another; bits of eight classes a byte."""
+    """Yield the number of frames of each combination; eight classes per byte."""
     packed = np.packbits(found.there, axis=0).T.copy()
     for row in members.tolist():
         both = np.bitwise_and.reduce(packed[row], axis=0)
@@ -205,13 +205,13 @@ class Combos:
     ----------
     shares : ReportTable
     found : Combinations
-        Of the selection, over the features of both.
+        Combinations of the selection, over the features of both.
     gaps : int64
-        Those of all combinations that are missing, the most frequent in the reference first.
+        Indices of missing combinations, the most frequent in the reference first.
     reference : ClassFeatures or None
-        Of the reference, over the features of both.
+        Features of the reference, over the features of both.
     there : int64 or None
-        In how many frames of the reference each combination occurs.
+        Number of frames of the reference with each combination.
     """
 
     shares: ReportTable
@@ -222,7 +222,10 @@ class Combos:
 
     @property
     def missing(self) -> ReportTable:
-        """``combination``, ``frames_in_reference`` (``None`` without one), ``query``: what would find it."""
+        """Return the missing combinations:
+
+        ``combination``, ``frames_in_reference`` (or ``None``), ``query`` that finds it.
+        """
         names, members = self.found.features.names, self.found.members[self.gaps]
         often = [None] * len(members) if self.there is None else self.there[self.gaps].tolist()
         queries = [query_of_features([names[i] for i in one]) for one in members.tolist()]
@@ -230,7 +233,7 @@ class Combos:
         return ReportTable(("combination", "frames_in_reference", "query"), list(rows))
 
     def covered(self) -> ReportTable:
-        """The combinations that occur, the most frequent first: ``combination``, ``frames``."""
+        """Return the occurring combinations, most frequent first: ``combination``, ``frames``."""
         found = self.found
         rows = np.flatnonzero(found.frames)
         rows = rows[np.argsort(-found.frames[rows], kind="stable")]
@@ -255,7 +258,7 @@ def combos(
     *,
     of_ego: bool = False,
 ) -> Combos:
-    """Count the combinations of k features that a selection has, and list those that it lacks.
+    """Count the combinations of k features in a selection, and list the missing ones.
 
     Parameters
     ----------
@@ -263,14 +266,15 @@ def combos(
     abstraction : str
     k : int
     reference : Classed, optional
-        What it is measured by: combinations that occur there. By default all combinations of features of ``a``.
+        Selection whose combinations are the reference. By default all combinations of features of
+        ``a``.
     of_ego : bool
         As in :func:`features`.
 
     Raises
     ------
     ConfigError
-        There are more combinations than can be gone through.
+        There are too many combinations.
     """
     own = features(a, abstraction, of_ego=of_ego)
     other = None if reference is None else features(reference, abstraction, of_ego=of_ego)
@@ -302,7 +306,7 @@ def combos(
 
 
 def over(own: ClassFeatures, names: tuple[Feature, ...]) -> ClassFeatures:
-    """The same over other features."""
+    """Map class features to another list of features."""
     place = {name: i for i, name in enumerate(names)}
     counts = zeros((len(own.codes), len(names)), own.counts.dtype)
     for column, name in enumerate(own.names):
@@ -312,9 +316,9 @@ def over(own: ClassFeatures, names: tuple[Feature, ...]) -> ClassFeatures:
 
 
 def _together(found: ClassFeatures) -> Ints:
-    """(F, F): frames in which two features occur."""
+    """Return the number of frames with both features of each pair, (F, F)."""
     total = np.zeros((len(found.names), len(found.names)))
-    kind = np.float32 if found.frames.sum() < 1 << 24 else np.float64  # whole numbers, exact
+    kind = np.float32 if found.frames.sum() < 1 << 24 else np.float64  # exact for integers
     for first in range(0, len(found.codes), _ROWS):
         there = (found.counts[first : first + _ROWS] > 0).astype(kind)
         total += (there * found.frames[first : first + _ROWS, None].astype(kind)).T @ there
@@ -322,16 +326,17 @@ def _together(found: ClassFeatures) -> Ints:
 
 
 # Differences between two selections of frames: features, and a decision tree ----------------------
-# S3C asked so what failing test inputs have that training inputs have not. (Woodlief et al., ICSE 2024, RQ2.)
+# S3C uses this to find features of failing test inputs that training inputs lack. (Woodlief et al.,
+# ICSE 2024, RQ2.)
 
 DEPTH: Final = 4
-"""Questions, one after another, in the tree."""
+"""Greatest depth of the tree."""
 
 SMALLEST: Final = 5
-"""Least weight of a side of a question: of classes, or of frames."""
+"""Least weight of each branch: in classes, or in frames."""
 
 _THRESHOLDS: Final = (0, 1, 2, 3)
-"""How often a feature must occur at least, less one, for the answer yes."""
+"""Thresholds for the number of occurrences; a greater number means yes."""
 
 
 def tree(
@@ -341,12 +346,12 @@ def tree(
     weight: Floats,
     depth: int = DEPTH,
 ) -> list[tuple[tuple[str, ...], float, float]]:
-    """A decision tree by Gini's impurity (Breiman et al., "Classification and regression trees", 1984).
+    """Build a decision tree by Gini's impurity (Breiman et al., "Classification and regression trees", 1984).
 
     Parameters
     ----------
     counts : (C, F) int
-        How often each feature occurs in each case.
+        Number of occurrences of each feature in each case.
     names : tuple of Feature
     ours : (C,) bool
     weight : (C,) float64
@@ -355,8 +360,8 @@ def tree(
     Returns
     -------
     list of tuple
-        Of each leaf the answers that lead to it, and its weight of ours and of the others; those with the most
-        of ours for what they have of the others first.
+        For each leaf the answers that lead to it, and its weights of ours and of the others; the
+        highest share of ours first.
     """
     leaves: list[tuple[tuple[str, ...], float, float]] = []
 
@@ -378,7 +383,7 @@ def tree(
 
 
 def _best(counts: NDArray[np.integer[Any]], ours: Bools, weight: Floats) -> tuple[int, int] | None:
-    """The question that makes both sides purest: a feature, and how often it occurs at most without it."""
+    """Return the best question: a feature, and the threshold of its number of occurrences."""
     good = np.where(ours, weight, 0.0)
     total, positive = float(weight.sum()), float(good.sum())
     if min(positive, total - positive) < 1e-9:
@@ -403,7 +408,7 @@ def _best(counts: NDArray[np.integer[Any]], ours: Bools, weight: Floats) -> tupl
 
 
 def _impurity(positive: Floats | float, total: Floats | float) -> Floats:
-    """Gini's impurity times the weight."""
+    """Return Gini's impurity times the weight."""
     share = positive / np.maximum(total, 1e-12)
     return 2 * share * (1 - share) * total
 
@@ -416,25 +421,25 @@ def explain(
     by_frame: bool = False,
     depth: int = DEPTH,
 ) -> tuple[ReportTable, ReportTable]:
-    """Explain how ``b`` differs from ``a``: classes count once each, or as often as they have frames.
+    """Explain the differences of ``b`` from ``a``; classes count once, or by their frames.
 
     Parameters
     ----------
     b, a : Classed
-        A frame of the same store that is in both counts for ``b`` only.
+        A common frame of both counts for ``b`` only.
     abstraction : str
-        That of their classes.
+        Abstraction of their classes.
     by_frame : bool
     depth : int
-        Questions, one after another.
+        Greatest depth of the tree.
 
     Returns
     -------
     differing : ReportTable
-        ``feature``, ``share_of_b``, ``share_of_a``, ``difference``, and the ``query`` that finds it; the
-        largest difference first.
+        ``feature``, ``share_of_b``, ``share_of_a``, ``difference``, and a ``query`` for the
+        feature; the largest difference first.
     leaves : ReportTable
-        ``questions``, ``of_b``, ``of_a``, ``share_of_b`` among what comes there.
+        ``questions``, ``of_b``, ``of_a``, ``share_of_b`` in the leaf.
     """
     a, twice = _without(a, b)
     _, (b, a) = shared(b, a)
@@ -482,7 +487,7 @@ def explain(
 
 
 def _without(a: Classed, b: Classed) -> tuple[Classed, int]:
-    """``a`` without the frames that ``b`` has, too; and how many these are."""
+    """Return ``a`` without the frames of ``b``, and the number of removed frames."""
     if a.chosen.place != b.chosen.place:
         return a, 0
     rows = np.flatnonzero(~np.isin(a.frame_id, b.frame_id))

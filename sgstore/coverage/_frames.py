@@ -1,6 +1,6 @@
-"""Selections of frames to measure, missing values as queries, and result tables.
+"""Selections of frames, missing values as queries, and result tables.
 
-Features and values of slots as queries: what is missing is asked for by text that a person can run.
+Missing features and slot values are returned as queries that users can run.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ _PARTS: Final = {
 
 
 def query_of_features(features: Sequence[tuple[str, ...]]) -> str | None:
-    """A query that finds the frames with all of some features; ``None`` if one of them cannot be asked for.
+    """Return a query for frames with all of these features; ``None`` if a feature has no pattern.
 
     Parameters
     ----------
     features : sequence
-        Labels of an edge's source, of itself and of its destination; or of a node.
+        Labels of an edge's source, edge and destination; or of a node.
     """
     patterns = [_pattern(feature) for feature in features]
     known = [pattern for pattern in patterns if pattern is not None]
@@ -59,7 +59,7 @@ def query_of_features(features: Sequence[tuple[str, ...]]) -> str | None:
 
 
 def is_of_ego(feature: Sequence[str]) -> bool:
-    """Return True for a feature of the ego, or of a lane by its role for the ego."""
+    """True for a feature of the ego, or of a lane by its role relative to the ego."""
     return any(label in _EGOS or _ROLE.fullmatch(label) for label in feature[::2])
 
 
@@ -71,7 +71,7 @@ def _pattern(feature: Sequence[str]) -> str | None:
 
 
 def _node(label: str) -> str | None:
-    """A node of a label of an abstraction, as a pattern."""
+    """Return the pattern of a node with a label of an abstraction."""
     if label in _EGOS:
         return "(:Ego)"
     if label in _PARTS:
@@ -100,28 +100,28 @@ def block_of(pattern: str) -> str | None:
 
 
 def query_of_blocks(there: Sequence[str], absent: Sequence[str]) -> str:
-    """A query for the frames in which some blocks can be found and others cannot."""
+    """Return a query for frames with some blocks and without others."""
     parts = [f"EXISTS {{{block}}}" for block in there]
     parts += [f"NOT EXISTS {{{block}}}" for block in absent]
     where = f" WHERE {' AND '.join(parts)}" if parts else ""
     return f"MATCH (){where} RETURN FRAMES"
 
 
-# What the verbs of coverage answer with: a table, and sentences that say what its numbers are of ----
+# Results of the commands of coverage: a table, and notes about its denominators.
 
 Row = tuple[Any, ...]
 
 
 @dataclass(frozen=True)
 class ReportTable:
-    """Rows with the names of their columns.
+    """Table with column names.
 
     Attributes
     ----------
     columns : tuple of str
     rows : list of tuple
     said : list of str
-        What a person must know to read them.
+        Notes that are needed to read the table.
     """
 
     columns: tuple[str, ...]
@@ -129,32 +129,32 @@ class ReportTable:
     said: list[str] = field(default_factory=list[str])
 
     def without(self, *names: str) -> ReportTable:
-        """The same without some columns."""
+        """Return the table without some columns."""
         kept = [place for place, name in enumerate(self.columns) if name not in names]
         rows = [tuple(row[place] for place in kept) for row in self.rows]
         return ReportTable(tuple(self.columns[place] for place in kept), rows, self.said)
 
     def column(self, name: str) -> list[Any]:
-        """The values of a column."""
+        """Return the values of a column."""
         place = self.columns.index(name)
         return [row[place] for row in self.rows]
 
     def dicts(self) -> list[dict[str, Any]]:
-        """The rows, each as a dict from column to value."""
+        """Return the rows as dicts from column to value."""
         return [dict(zip(self.columns, row, strict=True)) for row in self.rows]
 
 
 SHARES = ("measure", "part", "of", "share", "denominator")
-"""Columns of a table of shares: the share, and what it is a share of."""
+"""Columns of a table of shares, with the denominator of each share."""
 
 
 def share(measure: str, part: float, of: float, denominator: str) -> Row:
-    """A row of such a table; no share of nothing."""
+    """Return a row of a table of shares; the share is ``None`` for an empty denominator."""
     return measure, part, of, part / of if of else None, denominator
 
 
 def of_unknown(unknown: int, text: str) -> list[str]:
-    """The sentence about frames that have no class, if there are any."""
+    """Return the note about frames without a class, or an empty list."""
     if not unknown:
         return []
     return [
@@ -172,12 +172,12 @@ class ChosenFrames:
     Attributes
     ----------
     text : str
-        What they were called.
+        Text that selected them.
     store : Store or Collection
     frame_id : int64 or None
-        Ascending; ``None``: all.
+        Ascending; ``None`` means all frames.
     reasons : mapping of str to str
-        Why traces are left out that cannot answer the query, by name.
+        Traces that cannot answer the query, with the reason.
     """
 
     text: str
@@ -187,11 +187,11 @@ class ChosenFrames:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Traces that cannot answer the query."""
+        """Return the traces that cannot answer the query."""
         return tuple(self.reasons)
 
     def scope(self, *, world: bool) -> dict[str, Any]:
-        """States that settings cut, as :func:`sgstore.store.scope_of` has them."""
+        """Return the omissions by settings, as :func:`sgstore.store.scope_of`."""
         chosen = None
         if self.frame_id is not None:
             chosen = set(np.unique(trace_of(self.frame_id)).tolist())
@@ -202,19 +202,19 @@ class ChosenFrames:
 
     @property
     def one_store(self) -> Store:
-        """The store that they are of.
+        """Return the store of the frames.
 
         Raises
         ------
         StoreError
-            They are of a collection.
+            The frames belong to a collection.
         """
         if isinstance(self.store, Store):
             return self.store
         raise one_store_needed(self.store.place.url)
 
     def joined(self, tables: Mapping[str, Path]) -> ChosenFrames:
-        """The same frames, with tables of one's own that patterns can ask; see :class:`sgstore.query.Store`."""
+        """Return the same frames with user tables for patterns; see :class:`sgstore.query.Store`."""
         if not tables:
             return self
         if isinstance(self.store, Store):
@@ -223,22 +223,22 @@ class ChosenFrames:
 
     @property
     def abstracted(self) -> Abstracted | CollectionFrames:
-        """The frames of its store as abstractions have them."""
+        """Return the interface of its store for abstractions."""
         return self.store.file.abstracted
 
     @property
     def place(self) -> str:
-        """Where its store lies."""
+        """Return the path or URL of its store."""
         if isinstance(self.store, Store):
             return str(self.store.file.path.resolve())
         return self.store.place.url
 
     def snapshot(self) -> AbstractContextManager[object]:
-        """Keep a store open for several questions; a collection does not change while it is asked."""
+        """Keep a store open for several queries; a collection never changes."""
         return self.store.file.snapshot()
 
     def rows_of(self, frame_id: Ints) -> Ints:
-        """Rows of the chosen ones among frames with ascending ids."""
+        """Return the rows of the chosen frames among frames with ascending ids."""
         if self.frame_id is None:
             return np.arange(len(frame_id))
         at = np.searchsorted(frame_id, self.frame_id)
@@ -250,25 +250,26 @@ class ChosenFrames:
 def selection_of(
     text: str, *, max_spill: int = 0, engine: str = "local", partial: bool = False
 ) -> ChosenFrames:
-    """The frames that a text means: a store, those of it in which a query holds, or those of a lock.
+    """Parse a selection: a store, frames of it by a query, or frames of a lock.
 
     Parameters
     ----------
     text : str
-        ``STORE``, ``STORE:QUERY``, ``STORE:LOCK``; or ``LOCK``, if one store beside it has all its traces. A
-        lock is a file that is called ``….lock``. For ``STORE`` may stand a collection: a folder, or a URL.
+        ``STORE``, ``STORE:QUERY``, ``STORE:LOCK``; or ``LOCK``, if exactly one store in its folder
+        has all its traces. A lock is a file with the ending ``.lock``. ``STORE`` can be a
+        collection: a folder, or a URL.
     max_spill : int
-        As of :class:`sgstore.query.Store`; bytes.
+        As in :class:`sgstore.query.Store`; bytes.
     engine, partial : str, bool
-        Who asks the bundles of a collection, and whether some may lack; as of
+        Engine of a collection, and True if bundles may be missing; as in
         :class:`sgstore.collection.Collection`.
 
     Raises
     ------
     StoreError
-        There is no such store, the lock cannot be read, or the store lacks what it names.
+        The store is missing, the lock is unreadable, or the store lacks its contents.
     QueryError
-        The query is none.
+        The query is invalid.
     """
     whole = Path(text)
     if whole.suffix == LOCK and whole.is_file():
@@ -285,7 +286,7 @@ def selection_of(
 
 
 def _place_and_query(text: str) -> tuple[str, str]:
-    """Split a text into the place of a store or a collection, and the query behind it."""
+    """Split a text into the place of a store or collection, and the query after it."""
     if url_named(text) is not None:
         colon = _BEFORE_QUERY.search(text)
         return (text, "") if colon is None else (text[: colon.start()], text[colon.end() :])
@@ -312,13 +313,13 @@ def _is_collection(place: str) -> bool:
 
 
 _BEFORE_QUERY: Final = re.compile(r":(?![/\d])")
-"""The colon before a query, behind a URL, which has colons of its own."""
+"""Colon before a query, but not one inside a URL."""
 
 
 def _opened(
     place: str, *, max_spill: int = 0, engine: str = "local", partial: bool = False
 ) -> Store | Collection:
-    """A store, or a collection; options as :func:`selection_of` takes them."""
+    """Open a store or a collection; options as in :func:`selection_of`."""
     if not _is_collection(place):
         return Store(place, max_spill=max_spill)
     from sgstore.collection import Collection
@@ -327,8 +328,8 @@ def _opened(
 
 
 def frames_of(store: Store | Collection, query: str, /, **parameters: object) -> Ints:
-    """Ids of the frames in which a query holds, ascending. ``**parameters``: values of ``$name`` in it."""
-    if block_of(query) is not None:  # in columns
+    """Return the ids of the frames that match a query, ascending; ``**parameters`` are its ``$name`` values."""
+    if block_of(query) is not None:  # read as columns
         found = store.find(f"{query} RETURN FRAMES", **parameters).numpy()["frame_id"]
         return np.unique(found.astype(np.int64))
     rows = (frame.frame_id for frame in store.find(query, **parameters).frames())
@@ -336,26 +337,26 @@ def frames_of(store: Store | Collection, query: str, /, **parameters: object) ->
 
 
 def traces_of(store: Store | Collection) -> Sequence[StoredTrace | TraceFacts]:
-    """The traces of a store, or of a collection, by name."""
+    """Return the traces of a store or collection, by name."""
     return store.info() if isinstance(store, Store) else store.catalog.traces
 
 
 def recordings_of(store: Store | Collection) -> dict[int, str]:
-    """The digest of the recording of each trace, by its id."""
+    """Return the digest of the recording of each trace, by trace id."""
     if isinstance(store, Store):
         return {one.trace_id: one.digest for one in store.info()}
     return {one["trace_id"]: one["digest"] for one in store.traces()}
 
 
 def periods_of(store: Store | Collection, frame_id: Ints) -> Floats:
-    """(N,): the median period of the trace of each frame; ns."""
+    """Return the median period of the trace of each frame, (N,); ns."""
     periods = {one.trace_id: one.period_ns for one in traces_of(store)}
     traces, number = np.unique(trace_of(frame_id), return_inverse=True)
     return np.array([periods.get(one, 0) for one in traces.tolist()], np.float64)[number]
 
 
 def run_begins(store: Store | Collection, frame_id: Ints, time_ns: Ints) -> Bools:
-    """(N,): which frames begin a run: the first of a trace, and the first where some are missing before it."""
+    """Return a mask (N,) of frames that begin a run: the first of a trace, or after a gap."""
     step = np.diff(time_ns, prepend=time_ns[:1])
     periods, place = np.unique(periods_of(store, frame_id), return_inverse=True)
     longest = np.array([longest_step_ns(int(period)) for period in periods.tolist()])
@@ -363,7 +364,7 @@ def run_begins(store: Store | Collection, frame_id: Ints, time_ns: Ints) -> Bool
 
 
 def names_of(store: Store | Collection, frame_id: Sequence[int] | Ints) -> list[str]:
-    """Frames as every command takes them: ``TRACE#SEQ``."""
+    """Return the names of frames in the usual notation, ``TRACE#SEQ``."""
     traces = {trace.trace_id: trace.name for trace in traces_of(store)}
     ids = np.asarray(frame_id, np.int64)
     return [

@@ -1,10 +1,11 @@
-"""Sequences of manoeuvres: who did what after what, and which sequences of k of them a data set has.
+"""Sequences of manoeuvres: their events, and the sequences of k manoeuvres in a data set.
 
-A *manoeuvre* is a pattern with a name, and a *happening* a match of it at its moment: where it is complete,
-or, of a pattern of one frame, where it begins to hold. It is told by the pattern and the kinds of those who
-take part: ``cut_in(ego, car)``. A sequence is k of these, each strictly after the one before, within a time,
-in one recording; others may happen in between. (Kuhn, Higdon, Lawrence, Kacker, Lei, "Combinatorial methods
-for event sequence testing", ICST 2012, where no event comes twice; here it may.)
+A *manoeuvre* is a named pattern. An *event* is a match of it at its moment: where it is complete,
+or, for a pattern of one frame, where it begins to hold. Its name contains the pattern and the kinds
+of the participants: ``cut_in(ego, car)``. A sequence is k of these in one recording, each strictly
+after the previous one, within a time; others may happen in between. (Kuhn, Higdon, Lawrence,
+Kacker, Lei, "Combinatorial methods for event sequence testing", ICST 2012. There no event occurs
+twice; here it may.)
 """
 
 from __future__ import annotations
@@ -39,16 +40,16 @@ if TYPE_CHECKING:
     from sgstore.world import Ints
 
 WITHIN_S: Final = 10.0
-"""Longest time, by default, from the first manoeuvre of a sequence to the last; s."""
+"""Default for the greatest time from the first manoeuvre of a sequence to the last; s."""
 
 
 def manoeuvres_named(names: Sequence[str] = ()) -> dict[str, str]:
-    """Texts of patterns by name: ``NAME`` of the library, or ``NAME=QUERY``; by default its manoeuvres.
+    """Return patterns by name: ``NAME`` of the library, or ``NAME=QUERY``; default: all its manoeuvres.
 
     Raises
     ------
     ConfigError
-        A name is given twice, or a pattern is no query.
+        A name is repeated, or a pattern is not a query.
     QueryNameError
         The library has no such pattern.
     """
@@ -73,20 +74,20 @@ def manoeuvres_named(names: Sequence[str] = ()) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class ManoeuvreEvents:
-    """What happened in some frames, in order of traces and times.
+    """Manoeuvre events in some frames, ordered by trace and time.
 
     Attributes
     ----------
     chosen : ChosenFrames
     names : tuple of str
-        All that happened, and who took part, in alphabetical order: ``cut_in(ego, car)``.
+        All distinct events with participants, alphabetical: ``cut_in(ego, car)``.
     code : (H,) int64
-        Which of the names each is.
+        Index into ``names`` for each event.
     frame_id : (H,) int64
     time_ns : (H,) int64
-        Behind a jump back of the clock they are later by a day.
+        After a backward jump of the clock, times are shifted by a day.
     said : list of str
-        What could not be told of which traces, and why.
+        Notes about traces that could not answer, with reasons.
     """
 
     chosen: ChosenFrames
@@ -97,21 +98,21 @@ class ManoeuvreEvents:
     said: list[str]
 
     def over(self, names: tuple[str, ...]) -> ManoeuvreEvents:
-        """The same with codes that are places in other names, which have all of these."""
+        """Return the events with codes for a superset of names."""
         place = {name: i for i, name in enumerate(names)}
         moved = np.array([place[name] for name in self.names] or [0], np.int64)
         return replace(self, names=names, code=moved[self.code])
 
     @cached_property
     def traces(self) -> list[tuple[int, slice]]:
-        """Traces, and which of the happenings are theirs."""
+        """Return the traces, and the slice of events of each."""
         traces, first = np.unique(trace_of(self.frame_id), return_index=True)
         ends = np.append(first[1:], len(self.code))
         return list(zip(traces.tolist(), map(slice, first.tolist(), ends.tolist()), strict=True))
 
 
 def happenings(chosen: ChosenFrames, manoeuvres: Mapping[str, str]) -> ManoeuvreEvents:
-    """What happened in some frames.
+    """Find the manoeuvre events in some frames.
 
     Parameters
     ----------
@@ -122,7 +123,7 @@ def happenings(chosen: ChosenFrames, manoeuvres: Mapping[str, str]) -> Manoeuvre
     Raises
     ------
     QueryError
-        A pattern is none.
+        A pattern is invalid.
     """
     store = chosen.store
     cast = _Cast(store)
@@ -144,7 +145,7 @@ def happenings(chosen: ChosenFrames, manoeuvres: Mapping[str, str]) -> Manoeuvre
 
 
 def _ascending(store: Store | Collection, frame_id: Ints, time_ns: Ints) -> Ints:
-    """Times of frames, later by a day behind each jump back of the clock of their trace."""
+    """Return the times of frames, shifted by a day after each backward jump of the trace's clock."""
     found = store.file.rows(
         "SELECT frame_id FROM (SELECT frame_id,"
         " time_ns < lag(time_ns) OVER (PARTITION BY trace_id ORDER BY frame_id) AS back FROM frames)"
@@ -156,13 +157,13 @@ def _ascending(store: Store | Collection, frame_id: Ints, time_ns: Ints) -> Ints
 
 
 def _steps(text: str) -> int:
-    """How many steps a query has; of a union, of its last part."""
+    """Return the number of steps of a query; for a union, of its last part."""
     found = [one for one in parse(text) if isinstance(one, MatchClause)]
     return len(found[-1].sequence.steps) if found else 1
 
 
 class _Cast:
-    """Who takes part in matches of a store."""
+    """Names and kinds of the participants in matches of a store."""
 
     def __init__(self, store: Store | Collection) -> None:
         self._ids = {trace.name: trace.trace_id for trace in traces_of(store)}
@@ -174,7 +175,7 @@ class _Cast:
         self._kinds |= dict.fromkeys(rows, "ego")
 
     def happening(self, name: str, interval: Interval, *, stepped: bool) -> tuple[int, int, str]:
-        """Frame, time, and what happened with whom."""
+        """Return frame, time and name with participants of an event."""
         trace = self._ids[interval.trace]
         nodes = [node for node in interval.values.values() if isinstance(node, int)]
         kinds = [self._kinds[trace, node] for node in nodes if (trace, node) in self._kinds]
@@ -187,24 +188,24 @@ class _Cast:
 
 
 def sequences_in(code: Ints, time_ns: Ints, names: int, k: int, within_ns: int) -> dict[int, int]:
-    """The sequences of k happenings in one recording, each with the place at which it first begins.
+    """Return the sequences of k events in one recording, each with its first starting event.
 
     Parameters
     ----------
     code : (H,) int64
-        What happened, below ``names``; in order of time.
+        Index of each event's name; in order of time.
     time_ns : (H,) int64
     names : int
     k : int
     within_ns : int
-        Longest time from the first to the last; ns.
+        Greatest time from the first to the last; ns.
 
     Returns
     -------
     dict of int to int
-        A sequence a, b, c is the number ``(a · names + b) · names + c``.
+        A sequence a, b, c has the number ``(a · names + b) · names + c``.
     """
-    time_ns = np.maximum.accumulate(time_ns)  # clocks that go back stand still
+    time_ns = np.maximum.accumulate(time_ns)  # clocks that run backwards stay constant
     following = _following(code, time_ns, names)
     latest = time_ns + np.minimum(within_ns, np.iinfo(np.int64).max - time_ns)
     first = np.arange(len(code))
@@ -229,7 +230,7 @@ def sequences_in(code: Ints, time_ns: Ints, names: int, k: int, within_ns: int) 
 
 
 def _following(code: Ints, time_ns: Ints, names: int) -> list[Ints]:
-    """For each name, the first happening of it that comes strictly after each happening; none: their number."""
+    """Return for each name the first event strictly after each event; the number of events if none."""
     found: list[Ints] = []
     for name in range(names):
         places = np.flatnonzero(code == name)
@@ -246,10 +247,10 @@ class SequenceCoverage:
     ----------
     shares : ReportTable
     covered : ReportTable
-        ``sequence``, ``traces`` (in how many it comes), ``frame`` (where it begins first); the most frequent
-        first.
+        ``sequence``, ``traces`` (number of traces with it), ``frame`` (its first start); the most
+        frequent first.
     missing : ReportTable
-        ``sequence``, ``traces_in_reference`` (``None`` without one).
+        ``sequence``, ``traces_in_reference`` (``None`` without a reference).
     """
 
     shares: ReportTable
@@ -264,25 +265,26 @@ def sequences(
     manoeuvres: Mapping[str, str] | None = None,
     within_s: float = WITHIN_S,
 ) -> SequenceCoverage:
-    """Count the sequences of k manoeuvres that a selection has, and list those that it lacks.
+    """Count the sequences of k manoeuvres in a selection, and list the missing ones.
 
     Parameters
     ----------
     a : ChosenFrames
     k : int
     reference : ChosenFrames, optional
-        What it is measured by: sequences that occur there. By default all sequences of what happens in ``a``.
+        Selection whose sequences are the reference. By default all sequences of the events in
+        ``a``.
     manoeuvres : mapping of str to str, optional
         Patterns by name; by default those of the library.
     within_s : float
-        Longest time from the first to the last; s.
+        Greatest time from the first to the last; s.
 
     Raises
     ------
     ConfigError
-        There are more sequences than can be gone through.
+        There are too many sequences.
     QueryError
-        A pattern is none.
+        A pattern is invalid.
     """
     named = manoeuvres_named() if manoeuvres is None else manoeuvres
     ours = happenings(a, named)
@@ -315,7 +317,7 @@ def sequences(
 
 
 def check_sequences(names: int, k: int) -> None:
-    """Refuse more sequences than can be gone through.
+    """Reject too many sequences.
 
     Raises
     ------
@@ -329,7 +331,7 @@ def check_sequences(names: int, k: int) -> None:
 
 
 def _in_traces(of: ManoeuvreEvents, k: int, within_ns: int) -> dict[int, tuple[int, int]]:
-    """Sequences, in how many traces each is, and the frame of the first happening of the first."""
+    """Map sequences to their number of traces, and the first frame of the first occurrence."""
     found: dict[int, tuple[int, int]] = {}
     for _, rows in of.traces:
         here = sequences_in(of.code[rows], of.time_ns[rows], len(of.names), k, within_ns)
@@ -341,7 +343,7 @@ def _in_traces(of: ManoeuvreEvents, k: int, within_ns: int) -> dict[int, tuple[i
 
 
 def _text(number: int, names: Sequence[str], k: int) -> str:
-    """A sequence for people: ``stops(car) then starts(car)``."""
+    """Return a sequence as readable text: ``stops(car) then starts(car)``."""
     found: list[str] = []
     for _ in range(k):
         number, place = divmod(number, len(names))

@@ -1,6 +1,6 @@
-"""Coverage over declared slots: parameters of a scene, their values by patterns, and combinations of them.
+"""Coverage over declared slots: scene parameters with values defined by patterns, and their combinations.
 
-A file says it, in TOML::
+Slots are declared in a TOML file::
 
     name = "a truck ahead in the ego's lane"       # optional, as is where: only frames in which this holds
     count where = "MATCH (:Ego)"
@@ -12,11 +12,12 @@ A file says it, in TOML::
     [[impossible]]                                 # combinations that cannot be, and do not count
     near = "none"
 
-A slot has a value in a frame where its pattern holds, several if several hold, and ``none`` if none does; a
-frame with several has each combination of them. Or a file has several such, each a ``[[specification]]``.
-``tables = { tags = "tags.csv" }`` joins tables of one's own, which lie beside the file, for patterns to ask.
+A slot has a value in a frame where its pattern holds, several values if several hold, and ``none``
+if none holds; a frame with several values has each combination of them. A file can have several
+such parts, each a ``[[specification]]``. ``tables = { tags = "tags.csv" }`` joins user tables,
+relative to the file, for use in patterns.
 
-Or a specification is a query: each combination of what it returns is a cell.
+Alternatively a specification is a query: each combination of its returned values is a cell.
 """
 
 from __future__ import annotations
@@ -57,12 +58,12 @@ _RETURN: Final = re.compile(r"\bRETURN\b", re.IGNORECASE)
 
 
 def cells(chosen: ChosenFrames, query: str) -> tuple[tuple[str, ...], dict[tuple[Any, ...], int]]:
-    """Combinations of values that a query returns: its columns, and the number of frames of each.
+    """Return the columns of a query, and the number of frames of each combination of values.
 
     Raises
     ------
     QueryError
-        The query is none, or returns no values.
+        The query is invalid, or returns no values.
     """
     store = chosen.store
     matches = store.find(query)
@@ -84,9 +85,9 @@ def cells(chosen: ChosenFrames, query: str) -> tuple[tuple[str, ...], dict[tuple
 
 
 def _with_frames(query: str) -> str:
-    """Return a query that can be asked, with the frame of each match among what it returns."""
+    """Return a query extended by the frame of each match among its returned values."""
     found = [one for one in each_match(parse(query)) if isinstance(one, syntax.MatchClause)]
-    for part in reversed(found):  # what is put in moves what stands behind it
+    for part in reversed(found):  # insertions move the later text
         returns = part.returns
         if returns is None:
             return query
@@ -105,7 +106,7 @@ def _with_frames(query: str) -> str:
 def specification(
     chosen: ChosenFrames, query: str, declared: int = 0, reference: str | ChosenFrames = ""
 ) -> tuple[ReportTable, ReportTable, ReportTable]:
-    """Cells of a specification that occur, and those that are missing.
+    """Return the occurring and the missing cells of a specification.
 
     Parameters
     ----------
@@ -113,20 +114,20 @@ def specification(
     query : str
         ``MATCH … RETURN a, b``.
     declared : int
-        How many cells there are; 0: it is not said.
+        Number of cells, if known; else 0.
     reference : str or ChosenFrames
-        A selection of frames whose cells are those that there are; empty: each value of a column with each of
-        the others.
+        Selection of frames whose cells are the reference; empty: all combinations of the values of
+        each column.
 
     Returns
     -------
     shares, covered, missing : Table
-        Nothing is listed as missing of cells whose number only is declared.
+        With ``declared``, no missing cells are listed.
 
     Raises
     ------
     QueryError
-        The query is none, or returns no values.
+        The query is invalid, or returns no values.
     """
     columns, found = cells(chosen, query)
     if declared:
@@ -157,13 +158,13 @@ _LISTED: Final = 1_000_000
 # Declared slots ----------------------------------------------------------------------------------
 
 Bits = NDArray[np.uint8]
-"""Truth values of frames, eight a byte."""
+"""Truth values of frames, eight per byte."""
 
 NONE: Final = "none"
-"""Value of a slot in a frame in which none of its patterns holds."""
+"""Value of a slot in a frame without a matching pattern."""
 
 MOST: Final = 2_000_000
-"""Most combinations that are gone through: more are an error, not a part of the answer."""
+"""Greatest number of combinations; more are an error, never a partial result."""
 
 _MAX_FILE: Final = 8 << 20
 _MAX_SLOTS: Final = 200
@@ -172,13 +173,13 @@ _MAX_VALUES: Final = 1_000
 
 @dataclass(frozen=True)
 class Slot:
-    """A parameter of a scene.
+    """Parameter of a scene.
 
     Attributes
     ----------
     name : str
     values : mapping
-        Value → pattern; ``none`` is not among them.
+        Value → pattern; without ``none``.
     """
 
     name: str
@@ -186,27 +187,27 @@ class Slot:
 
     @property
     def domain(self) -> tuple[str, ...]:
-        """All its values, ``none`` first."""
+        """Return all its values, ``none`` first."""
         return (NONE, *self.values)
 
     def block(self, value: str) -> tuple[list[str], list[str]]:
-        """Patterns that must be found, and that must not, where the slot has a value."""
+        """Return the required and the excluded patterns of a value."""
         blocks = {name: block_of(pattern) or "" for name, pattern in self.values.items()}
         return ([], list(blocks.values())) if value == NONE else ([blocks[value]], [])
 
 
 @dataclass(frozen=True)
 class Specification:
-    """Slots, and which frames and combinations of them count.
+    """Slots, with the frames and combinations that count.
 
     Attributes
     ----------
     name : str
     where : str
-        A pattern; empty: all frames.
+        A pattern; empty means all frames.
     slots : tuple of Slot
     impossible : tuple of mapping
-        Slot → value: combinations that contain one of these do not count.
+        Slot → value: combinations with these values do not count.
     tables : mapping of str to Path
         Tables that are joined to the frames, by name.
     """
@@ -219,22 +220,22 @@ class Specification:
 
 
 DECLARED: Final = ("iso34503",)
-"""Files of slots that come along, by name."""
+"""Included slot files, by name."""
 
 
 def read_specifications(path: str | Path) -> list[Specification]:
-    """The specifications in a file.
+    """Read the specifications in a file.
 
     Parameters
     ----------
     path : str or Path
-        A file; or, where there is none, the name of one that comes along: ``iso34503``, attributes of an
-        operational design domain as far as recordings tell them.
+        A file, or the name of an included one: ``iso34503``, attributes of an operational design
+        domain that recordings contain.
 
     Raises
     ------
     ConfigError
-        It is no TOML, or something in it is not what it must be.
+        The file is not TOML, or has an invalid value.
     """
     path = Path(path)
     if str(path) in DECLARED and not path.exists():
@@ -280,7 +281,7 @@ def _specification(path: Path, given: Any, name: str) -> Specification:
 
 
 def _tables(path: Path, given: Mapping[str, Any]) -> dict[str, Path]:
-    """Files of tables, which lie where the file of the slots says, from its own folder."""
+    """Return the files of tables, relative to the folder of the slot file."""
     tables = given.get("tables", {})
     if not isinstance(tables, dict) or not all(isinstance(one, str) for one in tables.values()):
         raise ConfigError(
@@ -312,7 +313,7 @@ def _slot(path: Path, given: Any) -> Slot:
 
 
 class _Held:
-    """The frames of a selection in which patterns hold; each is asked for once."""
+    """Cache of the frames of a selection in which patterns hold."""
 
     def __init__(self, chosen: ChosenFrames, tables: Mapping[str, Path]) -> None:
         self._chosen = chosen = chosen.joined(tables)
@@ -321,7 +322,7 @@ class _Held:
         self._known: dict[str, Bools] = {}
 
     def of(self, pattern: str) -> Bools:
-        """(F,): whether a pattern holds; it does everywhere if it is empty."""
+        """Return a mask (F,) of the frames that match a pattern; an empty pattern matches all."""
         if pattern not in self._known:
             there = np.ones(len(self._ids), np.bool_)
             if pattern:
@@ -330,7 +331,7 @@ class _Held:
         return self._known[pattern]
 
     def values(self, specification: Specification) -> dict[tuple[str, str], Bits]:
-        """(slot, value) → in which frames, of those that count, it has this value."""
+        """Map (slot, value) to the counting frames with this value."""
         counts = self.of(specification.where)
         held: dict[tuple[str, str], Bits] = {}
         for slot in specification.slots:
@@ -343,7 +344,7 @@ class _Held:
         return held
 
     def sets(self, specification: Specification) -> tuple[Ints, list[str], Ints]:
-        """Frames that count, names of what they have of all slots, and the number of the name of each."""
+        """Return the frames that count, names of their slot values, and an index into the names."""
         rows = np.flatnonzero(self.of(specification.where))
         names, code = [""], np.zeros(len(rows), np.int64)
         for slot in specification.slots:
@@ -366,21 +367,21 @@ class _Held:
 
 
 def slot_sets(chosen: ChosenFrames, specification: Specification) -> tuple[Ints, list[str], Ints]:
-    """Class of each frame by the values of declared slots.
+    """Return the class of each frame by the values of declared slots.
 
     Returns
     -------
     frame_id : int64
         The frames of the selection that count, ascending.
     names : list of str
-        ``close=person+vehicle, light=none``: of a slot all values that hold.
+        ``close=person+vehicle, light=none``: all matching values of each slot.
     code : int64
-        Of each frame, an index into ``names``.
+        Index into ``names`` for each frame.
 
     Raises
     ------
     QueryError
-        A pattern is none.
+        A pattern is invalid.
     """
     with chosen.snapshot():
         return _Held(chosen, specification.tables).sets(specification)
@@ -389,7 +390,7 @@ def slot_sets(chosen: ChosenFrames, specification: Specification) -> tuple[Ints,
 def _combined(
     specification: Specification, k: int, held: _Held
 ) -> Iterator[tuple[tuple[Slot, ...], tuple[str, ...], int]]:
-    """All combinations of values of k slots that can be, and the number of frames that have each.
+    """Yield all possible combinations of values of k slots, with the number of frames of each.
 
     Raises
     ------
@@ -420,19 +421,19 @@ def _combined(
 def slot_coverage(
     chosen: ChosenFrames, specifications: Sequence[Specification], k: int = 0
 ) -> tuple[ReportTable, ReportTable, ReportTable]:
-    """Combinations of the values of slots that occur, and those that are missing.
+    """Return the occurring and the missing combinations of slot values.
 
     Parameters
     ----------
     chosen : ChosenFrames
     specifications : sequence of Specification
     k : int
-        How many slots are combined; 0: all of them.
+        Number of combined slots; 0 means all.
 
     Returns
     -------
     shares, covered, missing : Table
-        ``missing`` has a ``query`` for each that would find it.
+        ``missing`` has a ``query`` for each combination.
     """
     shares: list[Row] = []
     covered: list[Row] = []
@@ -465,7 +466,7 @@ def slot_coverage(
 def slot_matrix(
     chosen: ChosenFrames, specification: Specification
 ) -> tuple[list[tuple[str, str]], NDArray[np.int64], Bools]:
-    """Pairs of values of declared slots: which occur together, and which should.
+    """Return pairs of slot values: their common frames, and the wanted pairs.
 
     Returns
     -------
@@ -474,14 +475,14 @@ def slot_matrix(
     frames : (F, F) int64
         Frames with both, symmetric; on the diagonal, with the value.
     wanted : (F, F) bool
-        Pairs of values of two slots that can be.
+        Mask of possible pairs of values of two slots.
 
     Raises
     ------
     QueryError
-        A pattern is none.
+        A pattern is invalid.
     ConfigError
-        There are more pairs than can be gone through.
+        There are too many pairs.
     """
     items = [(slot.name, value) for slot in specification.slots for value in slot.domain]
     if len(items) ** 2 > MOST:
@@ -495,7 +496,7 @@ def slot_matrix(
     names = np.array([name for name, _ in items])
     wanted = names[:, None] != names[None, :]
     for one in specification.impossible:
-        if len(one) <= 2:  # of three values each two may be together
+        if len(one) <= 2:  # with three values, each pair can be possible
             ends = [items.index(item) for item in one.items()]
             wanted[ends[0], ends[-1]] = wanted[ends[-1], ends[0]] = False
             if len(ends) == 1:

@@ -1,7 +1,7 @@
-"""Locks: test sets as text that says what was in every case.
+"""Locks: test sets as text with digests of the content of every case.
 
-``_text`` is the text, written and read · ``_cases`` makes cases of what a store or a collection holds, and
-finds them there again · ``_sets`` unites, intersects, subtracts · ``_verify`` tells what is not as it was.
+``_text`` reads and writes the text. ``_cases`` makes cases of a store or collection, and finds them
+again. ``_sets`` has union, intersection and difference. ``_verify`` finds changes.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""Cases of a store or a collection with the digests of what is in them, and the cases of a lock found there."""
+"""Cases of a store or collection with content digests, and look-up of a lock's cases."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ if TYPE_CHECKING:
 
 
 CasePart = tuple["Ints", "Ints", str]
-"""Frames that are to be a case: their ids, ascending, of one trace; their log times (ns); their split."""
+"""Frames of a future case: their ids, ascending, of one trace; their log times (ns); their split."""
 
 
 def locked(trace: StoredTrace, mark: Mark) -> LockedTrace:
-    """A trace as a lock has it."""
+    """Return a trace in the form for a lock."""
     source = trace.name, trace.digest, trace.ego, trace.flavour
     part = trace.frames, trace.since, trace.until
     return LockedTrace(*source, *part, mark.config, mark.map, trace.version)
@@ -55,23 +55,23 @@ def lock_of(
     payloads: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Lock:
-    """The lock of some parts of a store, or of a collection, whose bundles make what is theirs.
+    """Return the lock of some parts of a store or collection; each bundle makes its own part.
 
     Parameters
     ----------
     store : Store or Collection
     parts : sequence of CasePart
     selection : mapping
-        How they were chosen; plain values.
+        Parameters of the selection; plain values.
     payloads : bool
-        Whether the messages that belong to the frames are read and count, too.
+        True to include the messages of the frames.
     progress : callable, optional
-        Called with the number of cases done and of all.
+        Called with the number of finished cases and the total.
 
     Raises
     ------
     TraceError
-        A recording is gone, was replaced, or is damaged.
+        A recording is missing, was replaced, or is damaged.
     """
     if not isinstance(store, Store):
         return _lock_of_bundles(store, parts, selection, payloads=payloads, progress=progress)
@@ -126,7 +126,7 @@ def _lock_of_bundles(
 def lock_in(
     store: Store, parts: Sequence[tuple[list[int], list[int], str]], *, payloads: bool
 ) -> str:
-    """The text of the lock of some parts of a bundle."""
+    """Return the text of the lock of some parts of a bundle."""
     own = [(np.array(ids, np.int64), np.array(times, np.int64), of) for ids, times, of in parts]
     return lock_of(store, own, {}, payloads=payloads).text()
 
@@ -149,14 +149,15 @@ def _case(part: CasePart, trace: str, graph: str, payload: Payload | None) -> Lo
 
 
 def payload_digests(store: Store, groups: Sequence[Ints]) -> Iterator[Payload]:
-    """Digests of the messages that belong to groups of frames, by channel; a recording is read in its order.
+    """Yield digests of the messages of groups of frames, by channel, in recording order.
 
-    A channel counts by its messages in the order of their log times, each once, whatever stands between them.
+    The digest of a channel covers its messages in the order of their log times, each once,
+    independent of other messages between them.
 
     Raises
     ------
     TraceError
-        A recording is gone, was replaced, or is damaged.
+        A recording is missing, was replaced, or is damaged.
     """
     of = [int(trace_of(group[:1])[0]) for group in groups]
     low = 0
@@ -174,12 +175,12 @@ def payload_digests(store: Store, groups: Sequence[Ints]) -> Iterator[Payload]:
 
 
 def recording_of(store: Store, trace_id: int) -> Path:
-    """The recording of a trace, which is the file that was ingested.
+    """Return the path of a trace's recording, verified as the ingested file.
 
     Raises
     ------
     TraceError
-        It is not there, or another.
+        The file is missing, or has changed.
     """
     trace = store.file.trace(trace_id)
     try:
@@ -192,7 +193,7 @@ def recording_of(store: Store, trace_id: int) -> Path:
 
 
 def _digests(store: Store, path: Path, groups: Sequence[Ints]) -> Iterator[Payload]:
-    """Of groups of frames of one recording."""
+    """Yield the digests for groups of frames of one recording."""
     found = messages_of(store.file, np.unique(np.concatenate(groups)))
     places = list(
         zip(found.chunk_offset.tolist(), found.offset.tolist(), found.length.tolist(), strict=True)
@@ -231,7 +232,7 @@ def _payload(found: MessagePlaces, rows: Sequence[int], digests: Sequence[bytes]
 
 
 def cases_of(lock: str | Path | Lock, store: Store) -> list[tuple[str, int, int, str]]:
-    """The clips that a lock names, as a store has them.
+    """Return the clips of a lock in a store.
 
     Parameters
     ----------
@@ -247,8 +248,8 @@ def cases_of(lock: str | Path | Lock, store: Store) -> list[tuple[str, int, int,
     Raises
     ------
     StoreError
-        The lock cannot be read; or the store lacks a trace of it, or has it read in another way. Whether graphs
-        and payloads are the same is not looked at: :func:`sgstore.locks` does that.
+        The lock is unreadable; or the store lacks one of its traces, or has it with other settings.
+        Graphs and payloads are not compared: :func:`sgstore.locks.verify` does that.
     """
     known = read_lock(lock) if isinstance(lock, str | Path) else lock
     names = {one.name: _same(one, store).name for one in known.traces}
@@ -256,7 +257,7 @@ def cases_of(lock: str | Path | Lock, store: Store) -> list[tuple[str, int, int,
 
 
 def _same(trace: LockedTrace, store: Store) -> StoredTrace:
-    """The trace of a store that is one of a lock, read in the same way."""
+    """Return the store's trace that corresponds to a lock's trace, with the same settings."""
     trace_id = trace_id_of(trace.recording, trace.ego)
     found = next((one for one in store.info() if one.trace_id == trace_id), None)
     if found is None:
@@ -282,7 +283,7 @@ def _not_there(trace: LockedTrace, place: str | Path) -> StoreError:
 
 
 def rows_of(case: LockedCase, trace_id: int, frame_id: Ints) -> slice:
-    """Rows of the frames of a case among those of a store, which are by ascending id."""
+    """Return the slice of a case's frames among a store's frames with ascending ids."""
     first, last = frame_ids(trace_id, np.array([case.first, case.last]))
     return slice(
         int(np.searchsorted(frame_id, first)), int(np.searchsorted(frame_id, last, side="right"))
@@ -290,12 +291,12 @@ def rows_of(case: LockedCase, trace_id: int, frame_id: Ints) -> slice:
 
 
 def frames_of_lock(lock: Lock, store: Store | Collection) -> Ints:
-    """Ids of the frames of a lock's cases in a store or in a collection, ascending.
+    """Return the ids of the frames of a lock's cases in a store or collection, ascending.
 
     Raises
     ------
     StoreError
-        The store lacks a trace of the lock, or has it read in another way.
+        The store lacks a trace of the lock, or has it with other settings.
     """
     if not isinstance(store, Store):
         own, lacking = by_bundle(lock, store)
@@ -313,14 +314,14 @@ def frames_of_lock(lock: Lock, store: Store | Collection) -> Ints:
 
 
 def frames_in(store: Store, lock: str) -> list[int]:
-    """Ids of the frames of a lock's cases in a bundle, ascending."""
+    """Return the ids of the frames of a lock's cases in a bundle, ascending."""
     return frames_of_lock(lock_from(lock), store).tolist()
 
 
 def by_bundle(
     lock: Lock, whole: Collection, *, by_name: bool = False
 ) -> tuple[dict[str, Lock], list[LockedTrace]]:
-    """The part of a lock that each bundle has; and the traces that none has, by recording or by name."""
+    """Split a lock by bundle; return also the traces without a bundle."""
     names = {row["name"]: row["bundle"] for row in whole.traces()} if by_name else {}
     home: dict[str, str] = {}
     for one in lock.traces:
@@ -336,12 +337,12 @@ def by_bundle(
 
 
 def store_beside(path: str | Path, lock: Lock) -> Path:
-    """The one store in a lock's folder, or where the program runs, that has all traces of the lock.
+    """Find the only store in the lock's folder, or the working folder, with all its traces.
 
     Raises
     ------
     StoreError
-        There is none, or there are several.
+        There is no such store, or several.
     """
     folders = Path(path).parent, Path()
     beside = {one.resolve(): one for f in folders for one in sorted(f.glob("*.sgstore"))}
@@ -351,7 +352,7 @@ def store_beside(path: str | Path, lock: Lock) -> Path:
         try:
             if wanted <= {trace.trace_id for trace in Store(one).info()}:
                 having.append(one)
-        except StoreError:  # of another version, or no store: not what is looked for
+        except StoreError:  # another version, or not a store: skip it
             continue
     if len(having) == 1:
         return having[0]

@@ -1,4 +1,4 @@
-"""Locks as sets of cases. Two cases are the same if they are the same frames of the same trace."""
+"""Set operations on locks; equal cases have the same frames of the same trace."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ Source = tuple[str, str]
 
 
 def union(a: Lock, b: Lock) -> Lock:
-    """The cases of both, those of ``a`` first where they are the same.
+    """Return the cases of both locks; ``a`` has priority for equal cases.
 
     Raises
     ------
     StoreError
-        They speak of one trace that was read in two ways, or of one case whose content differs.
+        The locks have one trace with different settings, or one case with different content.
     """
     ours = _placed(a)
     _check(a, b)
@@ -34,7 +34,7 @@ def union(a: Lock, b: Lock) -> Lock:
 
 
 def intersect(a: Lock, b: Lock) -> Lock:
-    """The cases of ``a`` that are in ``b``, too.
+    """Return the cases of ``a`` that are also in ``b``.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def intersect(a: Lock, b: Lock) -> Lock:
 
 
 def minus(a: Lock, b: Lock) -> Lock:
-    """The cases of ``a`` that share no frame with a case of ``b``.
+    """Return the cases of ``a`` that share no frame with a case of ``b``.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def minus(a: Lock, b: Lock) -> Lock:
 
 
 def meets(a: Lock, b: Lock) -> Callable[[LockedCase], bool]:
-    """A function that says whether a case of ``a`` shares a frame with a case of ``b``."""
+    """Return a function that is True for a case of ``a`` with a common frame in ``b``."""
     sources = _sources(a)
     firsts: dict[Source, list[int]] = {}
     ends: dict[Source, list[int]] = {}
@@ -87,7 +87,7 @@ def _placed(lock: Lock) -> dict[tuple[Source, int, int], LockedCase]:
 
 
 def _check(a: Lock, b: Lock) -> None:
-    """Refuse locks that disagree about a trace or a case."""
+    """Reject locks that disagree about a trace or a case."""
     theirs = {(trace.recording, trace.ego): trace for trace in b.traces}
     for trace in a.traces:
         other = theirs.get((trace.recording, trace.ego))
@@ -107,7 +107,7 @@ def _check(a: Lock, b: Lock) -> None:
 
 
 def _made(how: str, a: Lock, b: Lock, ours: list[LockedCase], theirs: list[LockedCase]) -> Lock:
-    """A lock of cases of both; a trace of ``b`` takes the name that ``a`` has for it, or one that is free."""
+    """Build a lock from cases of both; a trace of ``b`` gets its name in ``a``, or a free name."""
     traces = {(trace.recording, trace.ego): trace for trace in a.traces}
     taken = {trace.name for trace in a.traces}
     names: dict[str, str] = {}

@@ -1,7 +1,7 @@
-"""The text of a lock: JSON, a trace and a case a line, the same bytes for the same content.
+"""Text format of locks: JSON, one trace or case per line, equal bytes for equal content.
 
-There is no path and no time of day in it, so it is the same wherever the same set is chosen from the same
-recordings, and two of them can be compared line by line.
+The text has no path and no time of day. Therefore it is the same on every machine for the same
+selection of the same recordings, and two locks can be compared line by line.
 """
 
 from __future__ import annotations
@@ -23,33 +23,33 @@ FORMAT: Final = 1
 """Version of the text."""
 
 LARGEST: Final = 1 << 30
-"""Largest lock that is read; bytes."""
+"""Largest lock file; bytes."""
 
 KEY: Final = "sgstore_lock"
 
 ENDING: Final = ".lock"
-"""How the names of locks end: by this they are told from stores."""
+"""Ending of lock files, which distinguishes them from stores."""
 
 
 @dataclass(frozen=True, slots=True)
 class LockedTrace:
-    """A trace that cases are taken from.
+    """Trace of the cases of a lock.
 
     Attributes
     ----------
     name : str
     recording : str
-        SHA-256 of it.
+        SHA-256 of the recording.
     ego : str
         The simulator's id of the ego.
     flavour : str
     frames : int
     since, until : float or None
-        The part of the recording that was read; s.
+        Time range of the recording that was read; s.
     config, map : str
-        Digests of the settings and of the road map that its graphs were made with; no map: empty.
+        Digests of the settings and of the road map of its graphs; empty without a map.
     version : str
-        Of sgstore that made them.
+        Version of sgstore that made the graphs.
     """
 
     name: str
@@ -66,12 +66,12 @@ class LockedTrace:
 
 @dataclass(frozen=True, slots=True)
 class LockedCase:
-    """Consecutive frames of a trace: a test case.
+    """Test case: consecutive frames of a trace.
 
     Attributes
     ----------
     id : str
-        ``TRACE#FIRST-LAST``, or ``TRACE#SEQ`` of a single frame.
+        ``TRACE#FIRST-LAST``, or ``TRACE#SEQ`` for a single frame.
     trace : str
         Name of its trace in the lock.
     first, last : int
@@ -79,13 +79,14 @@ class LockedCase:
     start_ns, end_ns : int
         The earliest and the latest log time of its frames.
     frames : int
-        How many there are.
+        Number of frames.
     split : str
-        The part of the set that it belongs to: ``train``; empty: there are no parts.
+        Its split: ``train``; empty without splits.
     graph : str
         Digest of the scene graphs of the frames.
     payload : dict of str to str, or None
-        Channel → digest of its messages that belong to the frames. ``None``: they were not looked at.
+        Channel → digest of its messages of the frames. ``None`` means that payloads were not
+        included.
     """
 
     id: str
@@ -102,14 +103,14 @@ class LockedCase:
 
 @dataclass(frozen=True)
 class Lock:
-    """A test set.
+    """Test set.
 
     Attributes
     ----------
     made_with : dict
         Versions of ``sgstore`` and of the ``schema`` of its store.
     selection : dict
-        How the cases were chosen, and what is known of the choice.
+        Parameters of the selection, and facts about it.
     traces : tuple of LockedTrace
         By name, in natural order.
     cases : tuple of LockedCase
@@ -122,7 +123,7 @@ class Lock:
     cases: tuple[LockedCase, ...] = field(default=())
 
     def text(self) -> str:
-        """The lock as it stands in a file."""
+        """Return the content of the lock's file."""
         head = {KEY: FORMAT, "made_with": dict(self.made_with), "selection": dict(self.selection)}
         whole = json.dumps(head, ensure_ascii=False, indent=2, sort_keys=True)[:-2]
         for name, rows in (("traces", self.traces), ("cases", self.cases)):
@@ -132,14 +133,14 @@ class Lock:
 
     @property
     def ordered(self) -> tuple[LockedCase, ...]:
-        """The cases in the order that was made of them, if there is one; others behind, by trace and frame."""
+        """Return the cases in the recorded order, if there is one; others follow by trace and frame."""
         order = self.selection.get("order")
         names = [str(name) for name in order] if isinstance(order, list) else []
         places = {name: place for place, name in enumerate(names)}
         return tuple(sorted(self.cases, key=lambda case: places.get(case.id, len(places))))
 
     def write(self, path: str | Path) -> None:
-        """Write it to a file.
+        """Write the lock to a file.
 
         Raises
         ------
@@ -156,17 +157,17 @@ class Lock:
         write_bytes(path, data)
 
     def trace(self, name: str) -> LockedTrace:
-        """A trace by its name."""
+        """Return a trace by its name."""
         return next(one for one in self.traces if one.name == name)
 
 
 def read_lock(path: str | Path) -> Lock:
-    """A lock from its file.
+    """Read a lock from a file.
 
     Raises
     ------
     StoreError
-        There is no such file, or it is no lock; it says what is wrong, and where.
+        The file is missing, or is not a valid lock; the message shows the fault and its place.
     """
     path = Path(path)
     try:
@@ -184,7 +185,7 @@ def read_lock(path: str | Path) -> Lock:
 
 
 def lock_from(text: str) -> Lock:
-    """A lock from a text that a lock gave; see :meth:`Lock.text`."""
+    """Parse a lock from the text of :meth:`Lock.text`."""
     return _lock(json.loads(text))
 
 
@@ -220,7 +221,7 @@ def _check_names(traces: tuple[LockedTrace, ...], cases: tuple[LockedCase, ...])
 
 
 _LAST: Final = 60 * 2**18 - 1
-"""Greatest number of a frame in a store."""
+"""Greatest frame number in a store."""
 
 _Row = TypeVar("_Row", LockedTrace, LockedCase)
 _NULL: Final = type(None)
@@ -249,5 +250,5 @@ def _row(kind: type[_Row], values: Any, where: str) -> _Row:
 
 
 def made_with() -> dict[str, Any]:
-    """Versions of what makes a lock."""
+    """Return the versions of sgstore and of the schema."""
     return {"sgstore": version("sgstore"), "schema": SCHEMA_VERSION}

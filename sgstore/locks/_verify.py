@@ -1,4 +1,4 @@
-"""Whether a store or a collection still has what a lock says, case by case."""
+"""Comparison of a lock with a store or collection, case by case."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _COMPARED = ("recording", "ego", "since", "until", "frames", "config", "map", "f
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Something that is not as a lock says.
+    """Difference between a lock and a store.
 
     Attributes
     ----------
     where : str
         A case, a trace, or ``lock``.
     what : str
-        ``trace`` (it is missing), ``recording``, ``ego``, ``part``, ``frames``, ``time``, ``config``,
+        ``trace`` (missing), ``recording``, ``ego``, ``part``, ``frames``, ``time``, ``config``,
         ``map``, ``flavour``, ``version``, ``graph``, ``payload``.
     detail : str
     """
@@ -44,22 +44,22 @@ class Difference:
 
     @property
     def matters(self) -> bool:
-        """Return whether the set is another: versions alone do not make it one."""
+        """True if the test set differs; a version difference is not enough."""
         return self.what != "version"
 
 
 def verify(lock: Lock, store: Store | Collection, *, payloads: bool = True) -> Iterator[Difference]:
-    """Compare a lock with a store, or with a collection.
+    """Compare a lock with a store or collection.
 
-    A trace is found by its recording and its ego, else by its name: so a recording that was changed and
-    ingested again is looked through, and the cases that the change is in are named.
+    A trace is found by its recording and its ego, else by its name. Therefore a changed recording
+    that was ingested again is compared, and the affected cases are named.
 
     Parameters
     ----------
     lock : Lock
     store : Store or Collection
     payloads : bool
-        Whether the messages are read and compared, too.
+        True to read and compare the messages.
     """
     now = made_with()
     for name, value in lock.made_with.items():
@@ -86,7 +86,7 @@ def _missing(trace: LockedTrace) -> Difference:
 
 
 def _of_bundles(lock: Lock, whole: Collection, *, payloads: bool) -> Iterator[Difference]:
-    """What each bundle says of the traces that it has, in the order of the lock."""
+    """Yield the differences in each bundle for its traces, in the order of the lock."""
     own, lacking = by_bundle(lock, whole, by_name=True)
     asked = {bundle: {"lock": part.text(), "payloads": payloads} for bundle, part in own.items()}
     found = {one.name: [_missing(one)] for one in lacking}
@@ -97,7 +97,7 @@ def _of_bundles(lock: Lock, whole: Collection, *, payloads: bool) -> Iterator[Di
 
 
 def differences_in(store: Store, lock: str, *, payloads: bool) -> dict[str, list[Any]]:
-    """Compare a part of a lock with a bundle; differences by trace."""
+    """Compare a part of a lock with a bundle; return differences by trace."""
     whole = lock_from(lock)
     found: dict[str, list[Any]] = {}
     for trace in whole.traces:
@@ -110,16 +110,16 @@ def differences_in(store: Store, lock: str, *, payloads: bool) -> dict[str, list
 def verify_case(
     lock: Lock, case: LockedCase, store: Store, *, graphs: bool = True, payloads: bool = True
 ) -> Iterator[Difference]:
-    """Compare one case of a lock with a store, as :func:`verify` does.
+    """Compare one case of a lock with a store, as :func:`verify`.
 
     Parameters
     ----------
     lock : Lock
     case : LockedCase
-        One of its own.
+        A case of this lock.
     store : Store
     graphs, payloads : bool
-        Whether the scene graphs, and the messages, are read and compared.
+        True to read and compare the scene graphs, and the messages.
     """
     locked_trace = lock.trace(case.trace)
     with store.file.snapshot():
@@ -181,7 +181,7 @@ def _cases(
 
 
 def _frames(cases: Sequence[LockedCase], store: Store, trace: StoredTrace) -> tuple[Ints, Ints]:
-    """The frames of a trace, from the first to the last of some cases: their ids, ascending, and log times."""
+    """Return ids (ascending) and log times of a trace's frames, from the first to the last of some cases."""
     numbers = [min((c.first for c in cases), default=0), max((c.last for c in cases), default=0)]
     first, last = frame_ids(trace.trace_id, np.array(numbers)).tolist()
     found = store.file.arrays(
