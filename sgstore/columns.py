@@ -1,6 +1,7 @@
 """Tables as dataclasses with one field per column: row selection, concatenation and sorting.
 
-A column is an array or a tuple. What is neither is the same for all rows, and is that of the first table.
+A column is an array or a tuple. Any other field is constant for all rows; concatenation takes it from the first
+table.
 """
 
 from __future__ import annotations

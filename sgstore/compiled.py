@@ -1,10 +1,10 @@
 """Loops compiled by numba, if it is installed: the extra ``[fast]``.
 
-Without it numpy does the same, and the answers are equal: loops add, multiply, divide, take roots and compare,
-with the roundings of numpy, and leave to it whatever needs an angle. Numba takes 0.5 s to start, and loops save
-12 to 35 ns for each two bodies of a frame: they are used once a process has made so many graphs that they would
-have paid for the start, frames that come alone not counted. The first time on a machine they take about 15 s to
-compile; what is compiled is kept beside the source, or in the user's cache.
+Without numba, numpy computes the same results. Loops only add, multiply, divide, take roots and compare, with
+the same rounding as numpy; numpy computes all angles. Numba takes 0.5 s to start, and loops save 12 to 35 ns
+per pair of bodies. So a process uses loops only after enough graphs to repay the start; single frames do not
+count. The first compilation on a machine takes about 15 s. The result is cached next to the source, or in the
+user's cache.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Settings of the scene graph generator: defaults, presets, validation, and TOML input and output.
 
-Every setting carries its comment, which is what ``sgstore config`` and ``docs/parameters.md`` print.
+Every setting has a comment. ``sgstore config`` and ``docs/parameters.md`` print it.
 """
 
 from __future__ import annotations
@@ -311,8 +311,8 @@ class Signs:
 class Config:
     """All settings of a scene graph generator.
 
-    Two configs that are equal give equal graphs. What each setting means stands at its field, in
-    ``docs/parameters.md``, and in what ``sgstore config`` prints.
+    Equal configs give equal graphs. The comment of each field, ``docs/parameters.md`` and ``sgstore config``
+    explain the settings.
     """
 
     range: RangeSettings = field(default_factory=RangeSettings)
@@ -439,7 +439,7 @@ def check(holds: bool, name: str, value: object, right: str) -> None:  # noqa: F
     Raises
     ------
     ConfigError
-        With the setting, its value, and what would be right.
+        The message names the setting, its value, and the expected value.
     """
     if not holds:
         raise ConfigError(f"setting '{name}' is {value!r}; expected {right}")
@@ -463,7 +463,7 @@ def check_steps(
 ) -> None:
     """Reject relation names that are reserved or repeated, and bounds that do not ascend.
 
-    Names that are new become known in this process.
+    New names are registered in this process.
     """
     for relation in names:
         free = relation in known or relation not in OWN_RELATIONS
@@ -562,9 +562,9 @@ class Preset:
     Attributes
     ----------
     summary : str
-        What it is, in a line.
+        Description in one line.
     notes : str
-        What is to be known of it, as lines of Markdown.
+        Notes for users, as lines of Markdown.
     config : Config
     """
 
@@ -668,7 +668,7 @@ def preset(name: str) -> Config:
     Raises
     ------
     ConfigError
-        There is no such preset.
+        The preset does not exist.
     """
     if name not in PRESETS:
         like = suggestion(name, PRESETS)
@@ -688,7 +688,7 @@ def load(path: str | Path) -> Config:
     Raises
     ------
     ConfigError
-        The file cannot be read, is not TOML, or holds a setting that is unknown or out of range.
+        The file is not readable, is not TOML, or has an unknown or invalid setting.
     """
     path = Path(path)
     try:
@@ -711,8 +711,8 @@ def from_dict(values: Mapping[str, Any]) -> Config:
     Parameters
     ----------
     values : mapping
-        As in TOML and JSON. ``preset`` names the preset whose settings hold for what is not named; without it
-        the defaults hold.
+        Values as in TOML and JSON. ``preset`` names the preset for missing settings; without it, the defaults
+        apply.
 
     Raises
     ------
@@ -735,7 +735,7 @@ def configured(**settings: Any) -> Config:
     Raises
     ------
     ConfigError
-        As :func:`from_dict`.
+        See :func:`from_dict`.
     """
     return from_dict(settings)
 

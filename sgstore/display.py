@@ -1,6 +1,6 @@
 """Tables and pictures as HTML, for notebooks.
 
-Texts of recordings are escaped: none of them becomes a tag, a style or a script of the page.
+Texts from recordings are escaped, so they cannot add tags, styles or scripts to the page.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ def html_table(
     ----------
     columns : sequence of str
     rows : iterable of sequences
-        Plain values; numbers stand to the right.
+        Plain values. Numbers are right-aligned.
     caption, below : str
-        Plain texts; empty: none.
+        Plain texts. An empty text is omitted.
     """
     lines = [f"<p style='margin:0.3em 0'>{escape(caption)}</p>"] if caption else []
     if columns:
@@ -71,7 +71,7 @@ def html_media(data: bytes, kind: str, text: str = "") -> str:
     kind : str
         ``image/png``, ``video/mp4``, …
     text : str
-        Plain text; empty: none.
+        Plain text. An empty text is omitted.
     """
     source = f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
     shown = f"<img src='{source}' alt='{escape(text, quote=True)}'>"

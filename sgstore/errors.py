@@ -2,21 +2,21 @@
 
 ::
 
-    SgstoreError                 its message is complete and fit to be shown as it is
+    SgstoreError                 base class; the message is complete and readable
     ├── TraceError               a recording: file, channel, time, offset; what was expected
     ├── MapError                 a road map: road id and element
-    ├── ConfigError              a setting: its name, its value, what would be right
-    ├── StoreError               a store: cannot be opened, other schema version, no such trace or frame
-    │   └── SqlError             a statement of the user's that the database refuses
+    ├── ConfigError              a setting: its name, its value, the expected value
+    ├── StoreError               a store: not readable, other schema version, unknown trace or frame
+    │   └── SqlError             a user's statement that the database rejects
     ├── QueryError               a query text: span, reason, hint
-    │   ├── QuerySyntaxError     expected something else here
+    │   ├── QuerySyntaxError     unexpected text
     │   └── QueryNameError       unknown label, relation, attribute, variable; did you mean …?
-    ├── AbstractionError         an abstraction, or a derived set of relations: none of that name
-    ├── ExportError              a clip or file that cannot be written
+    ├── AbstractionError         an unknown abstraction or derived set of relations
+    ├── ExportError              a clip or file that is not writable
     └── MissingExtraError        an optional package that is not installed, and how to install it
 
-Errors of third-party packages are translated by the module that owns the package, ``from`` the original.
-A mistake in calling the library stays ``ValueError`` or ``TypeError``. Anything else that escapes is a bug.
+The module that owns a third-party package converts its errors, ``from`` the original. A wrong call of the
+library raises ``ValueError`` or ``TypeError``. Any other exception is a bug.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class TraceError(SgstoreError):
     Parameters
     ----------
     reason : str
-        What is wrong, and what would be right.
+        Fault and remedy.
     path : str or Path, optional
         The file.
     channel : str, optional
@@ -125,14 +125,14 @@ def failure(error: Exception, path: str | Path) -> SgstoreError:
     Parameters
     ----------
     error : Exception
-        Any exception that reading the recording raised; an :class:`SgstoreError` is returned as it is.
+        Exception raised while reading the recording. An :class:`SgstoreError` is returned unchanged.
     path : str or Path
         The recording.
 
     Raises
     ------
     KeyboardInterrupt
-        The error is due to the end of the run.
+        The error was caused by an interruption.
     """
     if is_interruption(error):
         raise KeyboardInterrupt from error
@@ -148,7 +148,7 @@ class MapError(SgstoreError):
     Parameters
     ----------
     reason : str
-        What is wrong, and what would be right.
+        Fault and remedy.
     road : str, optional
         Id of the road at fault.
     element : str, optional
@@ -204,18 +204,18 @@ class QueryError(SgstoreError):
     Parameters
     ----------
     reason : str
-        What is wrong, in one sentence, without position.
+        Fault in one sentence, without position.
     text : str, optional
         The whole query.
     span : TextSpan, optional
-        The part of it at fault.
+        Faulty part of the query.
     hint : str, optional
-        What would be right: ``did you mean 'near'?``.
+        Remedy: ``did you mean 'near'?``.
 
     Notes
     -----
-    The message shows the line with carets under the span, for a terminal. ``as_dict`` gives the
-    same as data, for a user interface.
+    The message shows the line with carets under the span, for a terminal. ``as_dict`` returns the same as data,
+    for a user interface.
     """
 
     def __init__(
@@ -263,9 +263,9 @@ class MissingExtraError(SgstoreError):
     Parameters
     ----------
     purpose : str
-        What needed it: ``drawing``.
+        Feature that needs the package: ``drawing``.
     extra : str
-        The extra that brings it: ``viz``.
+        Extra that installs the package: ``viz``.
     """
 
     def __init__(self, purpose: str, extra: str) -> None:

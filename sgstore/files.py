@@ -1,10 +1,10 @@
 """Atomic output: files and folders appear complete or not at all.
 
-Folders for what is on its way, which live no longer than their owner.
+Temporary folders that end with their owner process.
 
-Each is locked for as long as its process lives, and removed with it. What a killed process leaves is removed by
-the next one that needs such a folder at the same place: only if nobody holds its lock, so surely not under
-somebody's hands. Where a file system knows no locks, nothing is taken for left behind.
+Each folder is locked while its process lives, and is removed at exit. The next process that needs a folder in
+the same place removes the folders of killed processes. It removes a folder only if its lock is free. On a file
+system without locks, it removes nothing.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ class HeldFolder:
     ----------
     parent : Path
     prefix : str
-        How its name begins. Folders there that begin so and whose processes are gone are removed.
+        Prefix of the folder name. Folders with this prefix are removed if their process has exited.
     undo : callable, optional
-        Called with each of these before it is removed.
+        Called with each such folder before its removal.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class HeldFolder:
     Raises
     ------
     OSError
-        Nothing can be written there.
+        The place is not writable.
     """
 
     def __init__(
@@ -162,7 +162,7 @@ _mine: dict[tuple[int, Path], Path] = {}
 def temporary_folder() -> Path:
     """Return this process's folder for data that exceed memory. It is removed at exit.
 
-    If it cannot be made it does not exist: who writes there is told so then.
+    If the creation fails, the folder does not exist, and later writes raise an error.
     """
     root = _root()
     key = os.getpid(), root
@@ -188,7 +188,7 @@ def working_folder(name: str) -> Generator[Path]:
     Raises
     ------
     OSError
-        It cannot be made.
+        The folder cannot be created.
     """
     folder = new_place(name)
     folder.mkdir(mode=0o700, parents=True)
@@ -225,7 +225,7 @@ _CONTROLS: Final = {
 def without_controls(text: str) -> str:
     r"""Replace terminal control characters by escapes such as ``\x1b``.
 
-    Line feeds and tabs are no danger.
+    Line feeds and tabs stay.
     """
     return text if text.isprintable() else text.translate(_CONTROLS)
 
@@ -241,15 +241,15 @@ class Stream(io.RawIOBase):
     ----------
     descriptor : int
     name : str
-        For messages.
+        File name for messages.
     quiet : bool
-        Whether what cannot be written is dropped without a word.
+        True to drop unwritable data silently.
     owned : bool
-        Whether the descriptor is closed with it.
+        True if the stream closes the descriptor.
 
     Notes
     -----
-    After the first error everything is dropped: buffers that are emptied later find nothing to complain of.
+    After the first error, all data are dropped, so a later flush of buffers raises no error.
     """
 
     def __init__(
@@ -326,12 +326,12 @@ class OutputFile:
     Parameters
     ----------
     to : str or Path
-        Where it belongs. A file that is there is replaced, and keeps its rights; a link stays one.
+        Final path. An existing file is replaced, with the same permissions; a link stays a link.
 
     Raises
     ------
     ExportError
-        Nothing can be written there.
+        The place is not writable.
     """
 
     def __init__(self, to: str | Path) -> None:
@@ -377,7 +377,7 @@ class OutputFile:
         Raises
         ------
         ExportError
-            It cannot be written; what was there before is still there.
+            The file is not writable; the previous file does not change.
         """
         try:
             if self._stream is not None:
@@ -430,7 +430,7 @@ def written(to: str | Path) -> Generator[BinaryIO]:
     Raises
     ------
     ExportError
-        The file cannot be written; what was there before is still there.
+        The file is not writable; the previous file does not change.
     """
     with _complete(to) as output:
         yield output.stream()
@@ -452,7 +452,7 @@ def written_at(to: str | Path) -> Generator[Path]:
     Raises
     ------
     ExportError
-        The file cannot be written; what was there before is still there.
+        The file is not writable; the previous file does not change.
     """
     with _complete(to) as output, _told(Path(to)):
         yield output.path()
@@ -464,7 +464,7 @@ def write_bytes(to: str | Path, data: bytes) -> None:
     Raises
     ------
     ExportError
-        The file cannot be written; what was there before is still there.
+        The file is not writable; the previous file does not change.
     """
     with written(to) as stream:
         stream.write(data)

@@ -105,7 +105,7 @@ class LaneGaps:
     src, dst : int64
         Node ids: src follows dst.
     gap : float64
-        From bumper to bumper along the lanes; m. NaN where it is not known.
+        Bumper-to-bumper gap along the lanes; m. NaN means unknown.
     """
 
     frame: Ints
@@ -154,13 +154,13 @@ class LaneStates:
     heading_error : float64
         Heading of the entity less the lane's direction, in (-π, π]; rad.
     primary : bool
-        Whether it is the one lane that the entity is in above all: centre inside, then heading, then overlap.
+        True for the primary lane, chosen by: centre inside, then heading, then overlap.
     along : float64
-        Place of the box's centre along the lane's centre line, from the lane's start in its direction, beyond
-        its ends too; m.
+        Position of the box centre along the lane's centre line, from the lane's start; m. It can lie beyond
+        both ends.
     own : bool
-        Whether it is one of the lanes by which is told how far the entity is from others along the lanes: the
-        primary one and, in a junction, those beside it that its centre is in and, of a vehicle, run its way.
+        True for the lanes used for distances along the lanes: the primary lane and, in a junction, other lanes
+        that contain the centre and (for a vehicle) have its direction.
     """
 
     frame: Ints
@@ -184,16 +184,16 @@ class WorldBlock:
     Attributes
     ----------
     frames : FrameBlock
-        The frames, with these states only.
+        Frames with the states outside the graphs.
     presence : StaticPresence
-        Static entities, and parts of the map.
+        Static entities and map elements outside the graphs.
     edges : Edges
-        In which edges ``isIn``, ``controlsTrafficOf``, ``leads`` and ``follows`` all that is known differs
-        from the graphs: it has those that these have not, and not those that they have.
+        Differences of the edges ``isIn``, ``controlsTrafficOf``, ``leads`` and ``follows``: edges that exist
+        only with, or only without, the data outside the graphs.
     lanes : LaneStates
-        How entities lie in lanes.
+        Attributes of the additional ``isIn`` edges.
     gaps : LaneGaps
-        Along the lanes, of the edges that it has more.
+        Gaps of the additional ``leads`` and ``follows`` edges.
     """
 
     frames: FrameBlock
@@ -210,11 +210,11 @@ class LeftOut:
     Attributes
     ----------
     states : int
-        All states.
+        Number of all states.
     beyond_radius, beyond_world : int
-        Those that are out of range of the graphs; and those of them that are out of ``[range] world``, too.
+        Numbers of states out of the range of the graphs, and out of ``[range] world``.
     excluded : tuple of (int, int)
-        Codes of kinds, and states of what is not wanted of each.
+        Codes of the excluded kinds, and the number of states of each.
     """
 
     states: int = 0
@@ -242,9 +242,9 @@ class GraphBlock:
     Attributes
     ----------
     frames : FrameBlock
-        The frames, with only those states that are nodes of their graphs (in range).
+        Frames with the states that are nodes of their graphs (in range).
     presence : StaticPresence
-        The static nodes of each graph. A static edge of the map holds where both its ends are present.
+        Static nodes of each graph. A static map edge belongs to a graph if both its nodes are present.
     edges : Edges
         All other edges.
     lanes : LaneStates
@@ -252,14 +252,14 @@ class GraphBlock:
     gaps : LaneGaps
         Attributes of ``leads`` and ``follows`` edges.
     crowded : tuple of (str, int, int)
-        Frames, counted in the block, whose pairs are too many (:mod:`sgstore.relations._pairs`): what the pairs
-        are, the frame, and how many bodies it has.
+        Frames with too many pairs (:mod:`sgstore.relations._pairs`): kind of the pairs, frame index in the
+        block, and number of bodies.
     world : WorldBlock or None
-        What is known beyond the graphs; ``None`` where the settings want nothing of it.
+        Data outside the graphs. ``None`` means that the settings exclude such data.
     left_out : LeftOut
-        What settings leave out.
+        Counts of the excluded states.
     uneven : int
-        What there may be that is no pair of bodies: bits of :data:`sgstore.pair_numbers.UNEVEN`.
+        Special pairs of bodies in the block: bits of :data:`sgstore.pair_numbers.UNEVEN`.
     """
 
     frames: FrameBlock
@@ -286,7 +286,7 @@ def graph_of_records(
     nodes : iterable of mappings
         ``id`` and attributes.
     edges : iterable of mappings
-        ``source``, ``target``, ``relation``, which is the key too, and attributes.
+        ``source``, ``target``, ``relation`` (also the key), and attributes.
     **about
         Attributes of the graph.
     """
@@ -319,7 +319,7 @@ def named_graph(
     -------
     networkx.MultiDiGraph
         Names as nodes, with the attributes ``name`` and ``base_class``; edges with the attribute ``label``,
-        which is their key where two nodes have it once.
+        which is also the key if it occurs once between two nodes.
     """
     import networkx as nx  # half a second to import: only when asked for
 
@@ -339,15 +339,15 @@ class LaneDistances:
     Parameters
     ----------
     lane, other : (n,) int64
-        Node ids of lanes; two may come more than once, where several ways join them.
+        Node ids of lanes. A pair repeats if several routes connect its lanes.
     start : (n,) float64
-        Of ``other``, along the lanes from the start of ``lane``; negative where one drives from ``other`` to
-        ``lane``; m.
+        Start of ``other``, along the lanes from the start of ``lane``; m. Negative if the route leads from
+        ``other`` to ``lane``.
     parts : iterable of (int, str, int, float, float)
-        Parts of the map, what each is, lanes on which it lies, and from where to where along these; m.
+        Map elements: node id, kind, lane, and start and end along the lane; m.
     courses : iterable of (int, float, float, float)
-        Stretches of lanes, up to the next one: the lane, from where on along it, m, its curvature, 1/m, and its
-        slope, which is NaN or ``None`` where it is not known.
+        Stretches of lanes, each up to the next: lane, start (m), curvature (1/m) and slope. NaN or ``None``
+        means an unknown slope.
     """
 
     FARTHEST: Final = 200.0
@@ -465,7 +465,7 @@ class LaneDistances:
 class EdgeColumns(Sequence["EdgeRecord"]):
     """The edges of one graph, kept as columns: each record is made when it is asked for.
 
-    A record takes some 250 bytes, a row ten. It equals every sequence of the same records.
+    A record takes about 250 bytes, a row ten. The object equals any sequence of the same records.
 
     Parameters
     ----------
@@ -474,7 +474,7 @@ class EdgeColumns(Sequence["EdgeRecord"]):
     relation : (n,) int8
         Codes of :data:`sgstore.vocabulary.RELATIONS`.
     about : dict
-        Row → attributes, of those that have any.
+        Row → attributes, for rows with attributes.
     """
 
     AT_ONCE: Final = 4096
@@ -534,22 +534,23 @@ class SceneGraph:
     ego : int or None
         Node id of the ego.
     nodes : dict
-        Node id → attributes in outward units (m, s, m/s, degrees): ``kind``, ``name``, ``is_ego``, and
-        whatever is known (``x``, ``y``, ``heading``, ``speed``, ``light_state``, …). Missing ones are left out.
+        Node id → attributes in outward units (m, s, m/s, degrees): ``kind``, ``name``, ``is_ego``, and all
+        known attributes (``x``, ``y``, ``heading``, ``speed``, ``light_state``, …). Unknown attributes are
+        absent.
     edges : sequence of tuple
-        ``(src, relation, dst, attributes)``. A list; online, where there are more than 65,536 of them, an
+        ``(src, relation, dst, attributes)``. A list, or online with more than 65,536 edges an
         :class:`EdgeColumns`.
     reach : LaneDistances, optional
-        Of the map that it lies on. Without it nothing is known of ways along lanes.
+        Lane distances of the map. Without them, distances along lanes are unknown.
     events : mapping of str to sequence of pairs
-        What has happened in the frame: kind → to whom, and with whom. Of a kind that is missing the trace does
-        not say whether it has.
+        Events of the frame: kind → pairs of entity and other entity. A missing kind means that the trace does
+        not record it.
     around : callable, optional
-        Gives the same with all that is known beyond it; see :meth:`known`.
+        Function that returns the graph with all known data around it; see :meth:`known`.
     out_of_world : int
-        Online: how many entities of the frame are out of ``[range] world``, so that nothing is known of them.
+        Online: number of entities out of ``[range] world``, and so unknown.
     excluded : frozenset of str
-        Online: kinds of the entities of the frame that settings exclude.
+        Online: kinds in the frame that the settings exclude.
     """
 
     frame_id: int
@@ -572,7 +573,8 @@ class SceneGraph:
     def known(self) -> SceneGraph:
         """All that is known of the world around: this graph, and what lies beyond it, out to ``[range] world``.
 
-        Beyond it there are edges ``isIn``, ``controlsTrafficOf``, ``leads``, ``follows``, and those of the map.
+        Outside this graph, only the edges ``isIn``, ``controlsTrafficOf``, ``leads``, ``follows`` and map edges
+        exist.
         """
         if self.around is None:
             return self
@@ -594,7 +596,7 @@ class SceneGraph:
     def stretches(self) -> dict[int, Stretches]:
         """Lanes on which entities are, and from where to where along these: node id → (lane, start, end).
 
-        Lights and signs are where the lanes that they control are waited on: see
+        Traffic lights and signs are at the stop positions of the lanes they control; see
         :mod:`sgstore.roads._places`.
         """
         found: dict[int, list[tuple[int, float, float]]] = {}
@@ -620,11 +622,11 @@ class SceneGraph:
     def lane_dist(self, a: int, b: int) -> float | None:
         """Distance along the lanes from one entity, or part of the map, to another; m.
 
-        From centre to centre along the centre lines of their own lanes (:attr:`LaneStates.own`) and of those
-        that ``travelsTo`` leads through; positive where one drives from a to b, negative where one drives from
-        b to a; of several ways the shortest. A lane, a road, a junction, a crosswalk lies on lanes from one
-        place to another, so that it is 0 within; a light or a sign where one waits, on lanes of this graph
-        that it controls. ``None`` if there is no way of at most 200 m: lane changes are none.
+        Measured from centre to centre along the centre lines of their own lanes (:attr:`LaneStates.own`) and
+        the lanes connected by ``travelsTo``. Positive if the route leads from a to b, negative from b to a; the
+        shortest route counts. A lane, road, junction or crosswalk occupies an interval of lanes, so the
+        distance inside is 0. A light or sign is at the stop position of the lanes that it controls. ``None``
+        means no route of at most 200 m. Routes do not change lanes.
         """
         if self.reach is None:
             return None
@@ -636,23 +638,23 @@ class SceneGraph:
         """Return the distance along the lanes to the next map element of one kind, 0 on the element; m.
 
         ``what`` is ``junction``, ``roundabout``, ``crosswalk``, ``stop_line``, ``traffic_light``, …; ``None``
-        if there is none within 200 m.
+        means none within 200 m.
         """
         return None if self.reach is None else self.reach.next(self.stretches().get(node, ()), what)
 
     def curvature(self, node: int) -> float | None:
         """Curvature of the lane that an entity is in above all, where it is; 1/m.
 
-        A mean over about a metre of its centre line, positive where it turns to the left for its traffic.
-        ``None``: the entity is in no lane, or the map is not known.
+        Mean over about a metre of the centre line; positive in a left turn of the lane's traffic. ``None``
+        means no lane, or no map.
         """
         return self._course(node)[0]
 
     def slope(self, node: int) -> float | None:
         """Slope of the lane that an entity is in above all, where it is: rise over run, 0.05 for 5 %.
 
-        A mean over about a metre, positive where its own traffic drives uphill. ``None``: the entity is in no
-        lane, the map is not known, or has no heights.
+        Mean over about a metre; positive if the lane's traffic drives uphill. ``None`` means no lane, no map,
+        or a map without heights.
         """
         return self._course(node)[1]
 
@@ -674,10 +676,9 @@ class SceneGraph:
         Returns
         -------
         networkx.MultiDiGraph
-            Node ids as nodes with their attributes; an edge's key and its attribute ``relation`` are the
-            relation. An edge between entities has the attribute ``lane_dist``, where that is known
-            (:meth:`lane_dist`). The graph's attributes are ``frame_id``, ``trace``, ``seq``, ``time_ns`` and
-            ``ego``.
+            Node ids as nodes with their attributes; the key and the attribute ``relation`` of an edge are its
+            relation. An edge between entities has the attribute ``lane_dist`` if known (:meth:`lane_dist`). The
+            graph's attributes are ``frame_id``, ``trace``, ``seq``, ``time_ns`` and ``ego``.
         """
         import networkx as nx  # half a second to import: only when asked for
 
@@ -725,7 +726,7 @@ class MapRecords:
     about, reach
         As above.
     src, relation, dst
-        The edges, ordered by source, relation and destination; the parts of a map count downwards.
+        Edges, ordered by source, relation and destination. Ids of map elements descend.
     """
 
     def __init__(
@@ -760,13 +761,13 @@ class SceneColumns:
     frame_id, seq, time_ns : (F,) int64
     ego : sequence of int or None, F long
     moving : tuple of Ints, Ints and sequence of dict
-        Frame, counted from 0, node id and attributes of what moves; in any order.
+        Frame (from 0), node id and attributes of moving nodes, in any order.
     presence : StaticPresence
-        What stands, and parts of the map.
+        Static nodes and map elements of each frame.
     standing : mapping
-        Node id → attributes of what stands.
+        Node id → attributes of static nodes.
     edges : Edges
-        Edges with an end in the trace, in any order; one may come twice.
+        Edges with at least one entity of the trace, in any order. Duplicates are allowed.
     about : mapping
         Frame, relation, source and destination → attributes; see :func:`edge_attributes`.
     map : MapRecords or None
@@ -844,9 +845,9 @@ def edge_attributes(
     Parameters
     ----------
     lanes : iterable of (int, int, int, dict)
-        Frame, entity, lane, and how it lies in the lane: for ``isIn``.
+        Frame, entity, lane and attributes of an ``isIn`` edge.
     gaps : iterable of (int, int, int, dict)
-        Frame, who follows, whom, and the gap: for ``follows`` and ``leads``.
+        Frame, follower, leader and attributes of the ``follows`` and ``leads`` edges.
     """
     known = {(frame, _IS_IN, node, lane): about for frame, node, lane, about in lanes}
     for frame, one, other, about in gaps:

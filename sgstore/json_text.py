@@ -26,9 +26,9 @@ def finite(value: Any, word: Callable[[float], str | None] = lambda _: None) -> 
     Parameters
     ----------
     value : object
-        Mappings, lists and tuples are gone through; what JSON does not hold becomes its text.
+        Mappings, lists and tuples are converted recursively. Values without a JSON type become text.
     word : function
-        What stands for a number that is infinite or none, by default null.
+        Replacement for infinite numbers and NaN, by default null.
     """
     if isinstance(value, Mapping):
         return {str(key): finite(item, word) for key, item in value.items()}  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]

@@ -1,8 +1,8 @@
 """Loggers named ``sgstore.*`` for Python's logging. They cost nothing without a listener.
 
-A program listens as to any other library: ``logging.basicConfig(level="DEBUG")``, or a level and a handler for
-``logging.getLogger("sgstore")``, as ``--verbose`` of the command line has them. There is a handler that does
-nothing from the first word on, so that nothing is printed by itself.
+Use standard logging: ``logging.basicConfig(level="DEBUG")``, or a level and a handler for
+``logging.getLogger("sgstore")``. The option ``--verbose`` of the command line does the same. A null handler
+prevents output by default.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Safe parser of untrusted XML, element by element, with bounds on time and memory.
 
-The parser is the standard library's expat, without a tree. Document type declarations, and with them entities,
-are refused, so that nothing can expand; depth, and the numbers of elements and attributes, are bounded.
+The parser is expat of the standard library, without a tree. It rejects document type declarations and thus
+entities, so texts cannot expand. Depth and the numbers of elements and attributes are limited.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ class MarkupParser:
     Parameters
     ----------
     start : callable
-        Called with the tag and the attributes of each element that begins.
+        Called with tag and attributes at the start of each element.
     end : callable
-        Called with the tag of each that ends.
+        Called with the tag at the end of each element.
     text : callable, optional
-        Called with pieces of the text of elements, in order.
+        Called with pieces of element text, in order.
     most : int or None
-        Elements that there may be; ``None``: any number, as in a stream that is not kept.
+        Largest number of elements. ``None`` means no limit, for streams.
     whose : str
-        Who needs no document type declaration, for the message: ``maps``.
+        Document type in the error message: ``maps``.
     """
 
     def __init__(
@@ -67,8 +67,8 @@ class MarkupParser:
         Raises
         ------
         MarkupError
-            It is no XML, has a document type declaration, or passes a bound. What the callables raise
-            passes through.
+            The text is not XML, has a document type declaration, or exceeds a limit. Exceptions of the
+            callables propagate.
         """
         try:
             self._parser.Parse(data, last)

@@ -1,8 +1,8 @@
 """Matches of a query: rows, frames, intervals, clips.
 
-Results are streams: they come window by window over the buckets of the store, in windows that grow, so that the
-first rows come at once and memory does not grow with their number. Who wants all rows gets them in windows of a
-million frames: each window costs a statement, which looks into most of the tables.
+Results are streams: a search reads the buckets of the store window by window. Windows grow, so the first rows
+come at once, and memory does not grow with the number of rows. A call for all rows uses windows of a million
+frames, because each window costs a statement that reads most tables.
 """
 
 from __future__ import annotations
@@ -107,13 +107,13 @@ class Interval:
     start_seq, end_seq : int
         First and last frame.
     start_ns, end_ns : int
-        Their simulation times.
+        Simulation times of these frames; ns.
     start, end : float
-        The same since the trace began; s.
+        Times since the trace start; s.
     frames : int
-        How many there are.
+        Number of frames.
     values : dict
-        What stays the same: bindings, or the values after ``RETURN``.
+        Constant values of the interval: the binding, or the values after ``RETURN``.
     """
 
     trace: str
@@ -130,10 +130,10 @@ class Interval:
 class Matches(Tabular):
     """Matches of a query. Iterating gives rows; each way of asking searches anew.
 
-    ``count``, ``frames`` and ``clips`` speak of the frames in which the pattern holds, whatever ``RETURN``
-    says; of a query that lists a limited number of rows, of the frames of these rows.
+    ``count``, ``frames`` and ``clips`` cover all matching frames; ``RETURN`` has no effect on them. With
+    ``LIMIT``, they cover the frames of the listed rows.
 
-    Rows are named tuples: their fields are named as the columns, with ``_`` for what no name may have. The
+    Rows are named tuples with one field per column. Characters that a field name cannot have become ``_``. The
     column ``e.name`` is ``row.e_name``.
 
     Attributes
@@ -143,12 +143,13 @@ class Matches(Tabular):
         ``t`` (seconds since the trace began), then for each variable its node id, and its name under
         ``….name``.
     notes : tuple of str
-        What may be a mistake, such as a name that nothing in the store has. Asked of the store when it is read.
+        Notes on likely mistakes, such as a name that does not occur in the store. Reading this attribute
+        queries the store.
     graphs : bool
-        Whether each row ends in a graph, as ``RETURN SUBGRAPHS`` asks: its ``nodes`` and its ``edges``, lists
-        of dicts in node-link form.
+        True if each row ends in a graph (``RETURN SUBGRAPHS``): ``nodes`` and ``edges``, lists of dicts in
+        node-link form.
     of_match : bool
-        Whether one value is returned, and that is of each match as a whole: ``MIN(x) OVER match``.
+        True if the query returns one value that describes a whole match: ``MIN(x) OVER match``.
     """
 
     of_match = False
@@ -219,7 +220,7 @@ class Matches(Tabular):
         Raises
         ------
         ValueError
-            The number is below zero.
+            The number is negative.
         """
         if most < 0:
             raise ValueError(f"limit is {most}, expected 0 or more")
@@ -246,7 +247,7 @@ class Matches(Tabular):
     def _compiled(self) -> Generator[Compiled]:
         """The query compiled for the store as it is; the store stays so until this is left.
 
-        What a store holds decides which SQL is right, so a query is compiled anew when the file has changed.
+        The content of a store affects the SQL, so a change of the file requires a new compilation.
         """
         with self._file.snapshot():
             catalog = self._catalog()
@@ -342,10 +343,10 @@ class Matches(Tabular):
     def subgraphs(self) -> Iterator[nx.MultiDiGraph[int]]:
         """Each match as a graph of the nodes and edges that it binds, whatever ``RETURN`` says.
 
-        Nodes are node ids with all that is known of them, and ``variables``: their names in the pattern. Edges
-        have their relation as key and as attribute, beside what else is known of them; see
-        :mod:`sgstore.lang._compile`. The graph has the attributes ``frame_id``, ``trace``, ``seq``,
-        ``time_ns`` and ``t``, and what stands beside ``RETURN SUBGRAPHS``.
+        Nodes are node ids with all known attributes, and ``variables``: their names in the pattern. Edges have
+        their relation as key and as attribute, and all known attributes; see :mod:`sgstore.lang._compile`. The
+        graph has the attributes ``frame_id``, ``trace``, ``seq``, ``time_ns`` and ``t``, and the other values
+        of ``RETURN SUBGRAPHS``.
         """
         from sgstore.graph import graph_of_records
 
@@ -364,12 +365,13 @@ class Matches(Tabular):
     def intervals(self, *, bound: bool = False) -> Iterator[Interval]:
         """Maximal runs of consecutive frames of a trace in which the same binding holds.
 
-        With ``RETURN``, in which the same values are returned. A gap longer than 2.5 median periods ends a run.
+        With ``RETURN``, the returned values are constant in an interval. A gap longer than 2.5 median periods
+        ends an interval.
 
         Parameters
         ----------
         bound : bool
-            Give bindings, whatever ``RETURN`` says: node ids by variable, and their names.
+            Return bindings, regardless of ``RETURN``: node ids by variable, and their names.
         """
         ask = Compiled.bound_intervals if bound else Compiled.intervals
         with self._compiled() as compiled:
@@ -384,7 +386,7 @@ class Matches(Tabular):
         Parameters
         ----------
         before, after : float
-            What is added at both ends; s. The offsets of ``RETURN CLIPS(-3s, +5s)`` win over them.
+            Time added at each end; s. The offsets of ``RETURN CLIPS(-3s, +5s)`` override them.
         """
         start, end = round(before * 1e9), round(after * 1e9)
         with self._compiled() as compiled:
@@ -467,12 +469,12 @@ class Matches(Tabular):
     def as_table(self, name: str, *, apart: bool = False) -> list[Given]:
         """Maker of a table of all rows, for a statement that speaks of it by a name.
 
-        ``apart``: with columns that tell nodes of several traces apart which have the same number.
+        ``apart``: add columns that distinguish equal node ids of different traces.
 
         Raises
         ------
         QueryError
-            Its rows are graphs.
+            The rows are graphs.
         """
         if self.graphs:
             raise QueryError(
@@ -503,8 +505,8 @@ class Matches(Tabular):
     ) -> Iterator[tuple[Any, ...]]:
         """Rows of a statement, window by window; all windows see the same state of the store.
 
-        ``form`` is that of the statement: rows, intervals, clips or frames; ``None``: what the query asks
-        for. Only for that do its order and its limit hold. ``whole``: all rows will be read.
+        ``form`` is the form of the statement: rows, intervals, clips or frames. ``None`` means the form of the
+        query; order and limit apply only to this form. ``whole``: the caller reads all rows.
         """
         with self._compiled() as compiled:
             rows = self._rows_of(self._statements(compiled, statement, form, whole=whole))
@@ -543,7 +545,7 @@ class Matches(Tabular):
     def _asked(self, statement: SqlStatement) -> dict[str, Any]:
         """A statement as :class:`StoreFile` takes it: its last step, and the tables that it is given before.
 
-        These are external matches, and what its other steps make.
+        The tables are external matches, and results of earlier steps.
         """
         *before, (sql, values) = statement.steps()
         matches = [
@@ -564,17 +566,17 @@ class Matches(Tabular):
 class UnionMatches(Matches):
     """Matches of several queries as one: of a ``UNION``, or of ``UNION ALL``.
 
-    Rows that are of frames, intervals or clips come by trace and time, and where one part has an order of its
-    own, part after part; other rows of a ``UNION`` by their values, of ``UNION ALL`` part after part.
+    Rows of frames, intervals or clips are ordered by trace and time, or part by part if a part has ``ORDER
+    BY``. Other rows are ordered by value (``UNION``) or part by part (``UNION ALL``).
 
     Parameters
     ----------
     text : str
         The query.
     asked : UnionParts
-        Its parts as they are written.
+        Parsed parts of the query.
     parts : sequence of Matches
-        Their answers.
+        Matches of each part.
 
     Raises
     ------
@@ -770,22 +772,22 @@ def row_type(columns: tuple[str, ...]) -> Any:
 class Windows:
     """Ranges of buckets, trace after trace; ``None`` (all) for a small store.
 
-    Each is longer than the one before, unless that had so many rows that it would have too many. A range is a
-    part of one trace, or several whole ones: with others between them, unless all come by id, as is fastest.
+    Each range is longer than the previous one, unless that one had very many rows. A range is a part of one
+    trace, or several whole traces. Traces in order of their ids are fastest.
 
     Parameters
     ----------
     extents : iterable of (int, int)
-        First bucket and number of buckets of each trace, in the order in which they are to come.
+        First bucket and number of buckets of each trace, in search order.
     first : int, optional
         Buckets of the first range; by default :data:`FIRST_WINDOW`.
     whole_traces : bool
-        Whether no range may end within a trace.
+        True if a range must not end within a trace.
 
     Attributes
     ----------
     rows : int
-        Rows of the range that came last; who reads them counts them.
+        Number of rows of the last range; the caller counts them.
     """
 
     def __init__(
@@ -823,7 +825,7 @@ class Windows:
         Raises
         ------
         TooMuchError
-            It is too much even in one trace.
+            One trace alone exceeds the limit.
         """
         left = [window]
         while left:
@@ -863,7 +865,7 @@ def intervals_for_people(
     Returns
     -------
     columns : tuple of str
-        Empty if there is no interval: then nothing tells what they would hold.
+        Empty without intervals: their columns are then unknown.
     rows : iterator of tuple
     """
     some = iter(intervals)
@@ -901,7 +903,7 @@ def notes_in(
 def merged(clips: Iterable[Clip], slack: Mapping[str, int] | None = None) -> Iterator[Clip]:
     """Clips, ordered by trace and start, with those that overlap or touch made one.
 
-    ``slack`` is how far apart those of a trace may be and still touch; ns, by default nothing.
+    ``slack`` is the largest gap between touching clips of each trace; ns, default 0.
     """
     slack = slack or {}
     last: Clip | None = None

@@ -1,8 +1,8 @@
 """Commands for isolated Python child processes with the packages of this process.
 
-A child that is started as usual looks for modules in the current folder and wherever ``PYTHONPATH`` points:
-a ``duckdb.py`` beside somebody's recordings would be run. Here a child is isolated (``python -I``), and is told
-the folders that the packages of this process come from.
+A normal child process imports modules from the current folder and from ``PYTHONPATH``. It would run a
+``duckdb.py`` next to the recordings. These children are isolated (``python -I``) and get the package folders of
+this process.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def command(module: str) -> list[str]:
 def folders() -> list[str]:
     """Return the package folders of :data:`NEEDED`: of imported packages, or else found on ``sys.path``.
 
-    The current folder is one of them only if a package was imported from it.
+    The current folder is included only if a package was imported from it.
     """
     here = Path.cwd()
     found = [folder for package in NEEDED if (folder := _imported_from(package)) is not None]

@@ -46,7 +46,7 @@ class StoreFrame:
     Attributes
     ----------
     ref : FrameRef
-        Its ids, its trace and its times.
+        Ids, trace and times of the frame.
     """
 
     def __init__(self, store: Store, ref: FrameRef) -> None:
@@ -95,13 +95,13 @@ class ClipAnimation:
     Attributes
     ----------
     data : bytes
-        The content of its file.
+        Content of the animation file.
     form : str
         ``gif``, ``mp4`` or ``webm``.
     frames : tuple of str
         The first and the last frame: ``town@25s`` or ``town#250``.
     marked : int
-        Pictures in which the query matches.
+        Number of pictures in which the query matches.
     """
 
     data: bytes
@@ -124,7 +124,7 @@ class ClipAnimation:
         Raises
         ------
         ExportError
-            The file has another ending than the animation has a form, or cannot be written.
+            The file suffix does not match the form of the animation, or the file is not writable.
         """
         from sgstore.errors import ExportError
         from sgstore.files import write_bytes
@@ -137,30 +137,30 @@ class ClipAnimation:
 class Store:
     """A store of traces, by its path.
 
-    Its file stays open for a second after a question. It is given back at once when another process wants to
-    write to it, so that nothing has to be closed. To open it by other means in the same process, such as
-    ``duckdb.connect``, call :meth:`close` first, or use ``with``.
+    The file stays open for a second after a query. It closes at once when another process needs to write, so an
+    explicit close is not necessary. Before other code of the same process opens the file, for example with
+    ``duckdb.connect``, call :meth:`close`, or use ``with``.
 
     Parameters
     ----------
     path : str or Path
     create : bool
-        Make an empty store if nothing is there.
+        Create an empty store if the file is missing.
     memory : int
-        Most memory that one question may take; bytes. 0: 1 GiB, or a quarter of the machine's if that is less.
+        Memory limit of one query; bytes. 0: 1 GiB, or a quarter of the machine's memory if less.
     tables : mapping of str to path or data frame, optional
-        Tables of one's own that are joined to the frames, in SQL and in patterns: Parquet, CSV or JSON files,
-        or data frames of pandas, polars, pyarrow.
+        Your own tables to join to the frames, in SQL and in patterns: Parquet, CSV or JSON files, or data
+        frames of pandas, polars, pyarrow.
     max_spill : int
-        Most that a question may put on disk where memory does not suffice; bytes. 0: 10 GB.
+        Disk limit of one query beyond its memory; bytes. 0: 10 GB.
     root : str or Path, optional
-        Folder to which the data set was moved: recordings are looked for in it by the ends of their paths. By
-        default the variable ``SGSTORE_ROOT`` of the environment.
+        New folder of a moved data set; recordings are found by the ends of their paths. Default: the
+        environment variable ``SGSTORE_ROOT``.
 
     Raises
     ------
     StoreError
-        There is no such file, it is no store, or one of another version; or a table cannot be read.
+        The file does not exist, is not a store, or has another version; or a table is not readable.
 
     Attributes
     ----------
@@ -240,15 +240,15 @@ class Store:
         Returns
         -------
         list of TraceOutcome
-            One for each recording and ego: its ``status``, what was lost, and the ``error`` if it failed.
+            One outcome per recording and ego: ``status``, losses, and the ``error`` after a failure.
 
         Raises
         ------
         StoreError
-            A file does not exist, a folder holds no recording, nothing fits a pattern, or the store cannot
-            be written.
+            A file does not exist, a folder has no recording, no file matches a pattern, or the store is not
+            writable.
         MapError
-            The file given for the road map cannot be read.
+            The road map file is not readable.
         """
         from sgstore.ingest import ingest, recordings
 
@@ -269,15 +269,15 @@ class Store:
         Parameters
         ----------
         query : str, Pattern or networkx graph
-            ``MATCH … WHERE … RETURN …``, see the documentation of the language; or a pattern that was built
-            step by step, or drawn as a graph: see :class:`sgstore.Pattern`.
+            ``MATCH … WHERE … RETURN …``, see the documentation of the language; or a :class:`sgstore.Pattern`;
+            or a graph of networkx.
         **parameters
             Values of ``$name``: numbers, texts, truth values, or lists of these.
 
         Raises
         ------
         QueryError
-            The text is no query, or names what the store does not know; it says where, and what would be right.
+            The text is not a query, or has an unknown name. The message gives the place and a hint.
         """
         if not isinstance(query, str):
             from sgstore.lang import Pattern
@@ -302,16 +302,16 @@ class Store:
         text : str
             ``CHECK name: FORALL (…) formula RESET WHEN …; …``, see the documentation of the language.
         sgsm_compat : bool
-            Count a trace as violating a check if any of its beginnings would, as SGSM reports.
+            Report a violation if any prefix of a trace violates a check, as SGSM does.
         status : bool
-            Give the status at each frame, too.
+            Also return the status of each frame.
         **parameters
             Values of ``$name``.
 
         Raises
         ------
         QueryError
-            The text has no checks, or names what the store does not know; it says where.
+            The text has no checks, or has an unknown name. The message gives the place.
         """
         from sgstore.temporal import CheckRun  # with numpy: only for who asks
 
@@ -332,26 +332,26 @@ class Store:
     ) -> Rows:
         """The rows of a statement on the views of the store, which only reads and sees no files.
 
-        ``sgql('MATCH …')`` is a table of what a pattern returns, ``sgql('… $least …', least := 10)`` of one
-        with parameters.
+        ``sgql('MATCH …')`` is a table of the rows that a pattern returns; ``sgql('… $least …', least := 10)``
+        sets a parameter.
 
-        Of more than 10,000 rows the store is asked again when they are wanted, in the form in which they are:
-        as values, as a table of Arrow, as a file.
+        A result of more than 10,000 rows is loaded on demand, in the requested form: values, Arrow table, or
+        file.
 
         Parameters
         ----------
         text : str
         timeout_s : float, optional
-            When to stop it; s.
+            Time limit; s.
         max_rows : int, optional
-            How many rows to give; ``Rows.truncated`` tells whether there are more.
+            Largest number of rows to return; ``Rows.truncated`` is true if there are more.
 
         Raises
         ------
         SqlError
-            It is not one statement that only reads, the database refuses it, or it runs for too long.
+            The text is not a single read-only statement, the database rejects it, or it runs for too long.
         QueryError
-            A pattern in it is none.
+            A pattern in the statement is invalid.
         """
         with self.file.snapshot():
             asked = UserStatement(self.find, self.catalog().tables, text)
@@ -373,25 +373,25 @@ class Store:
         Parameters
         ----------
         frame : int, str or FrameRef
-            Its ``frame_id``, ``TRACE#SEQ``, ``TRACE@12.3s``, or what :meth:`Matches.frames` gives.
+            ``frame_id``, ``TRACE#SEQ``, ``TRACE@12.3s``, or a result of :meth:`Matches.frames`.
         abstraction : str, optional
-            ``E``, ``EL``, ``ER``, ``RSV``, ``junction``, ``SG``, ``roadscene2vec``, a registered one; or a set
-            of relations that was derived, which has all that is known of nodes and edges, too.
+            ``E``, ``EL``, ``ER``, ``RSV``, ``junction``, ``SG``, ``roadscene2vec``, a registered abstraction;
+            or a derived set of relations. A derived set keeps all attributes of nodes and edges.
 
         Returns
         -------
         networkx.MultiDiGraph
-            Without an abstraction: node ids with all that is known of them; see
-            :meth:`sgstore.graph.SceneGraph.to_networkx`. With one: names, as the literature has them
+            Without an abstraction: node ids with all known attributes; see
+            :meth:`sgstore.graph.SceneGraph.to_networkx`. With an abstraction: names as in the literature
             (``ego``, ``car_12``, ``Ego Lane``, ``Lane 5_-1``), with the attributes ``name`` and ``base_class``,
             and edges with the attribute ``label``.
 
         Raises
         ------
         StoreError
-            There is no such frame.
+            The frame does not exist.
         AbstractionError
-            There is no such abstraction.
+            The abstraction does not exist.
         """
         from sgstore.abstractions import abstractions
         from sgstore.graph import named_graph
@@ -417,23 +417,23 @@ class Store:
         Parameters
         ----------
         abstraction : str
-            As :meth:`graph` takes it, but for derived sets. Classes in ``E``, ``EL``, ``ER``, ``RSV`` and
-            ``junction`` are in the store from the start; others are computed when first asked for, then kept.
+            Abstraction, as for :meth:`graph`, but not a derived set. Classes in ``E``, ``EL``, ``ER``, ``RSV``
+            and ``junction`` are stored at ingest. Other classes are computed and stored at the first call.
         trace : int or str, optional
-            Only of this one.
+            Limit the result to this trace.
 
         Returns
         -------
         dict
-            ``frame_id``, ascending, and ``class``: 32 hexadecimal digits, empty where a graph is so symmetric
-            that it was given up.
+            ``frame_id``, ascending, and ``class``: 32 hexadecimal digits, empty for a graph that is too
+            symmetric.
 
         Raises
         ------
         AbstractionError
-            There is no such abstraction.
+            The abstraction does not exist.
         StoreError
-            There is no such trace, or others keep the store for too long.
+            The trace does not exist, or another process uses the store for too long.
         """
         return self.file.abstracted.classes(abstraction, trace)
 
@@ -449,27 +449,27 @@ class Store:
         """Return runs of frames similar to an example: first frames of its class, then the most similar.
 
         Two frames are compared by their graphs in an abstraction, as multisets of nodes by label and of edges
-        by the labels of edge and ends, with the weighted Jaccard index. Each answer says what is shared, and
-        what is not.
+        by the labels of edge and ends, with the weighted Jaccard index. Each result lists the shared and the
+        different features.
 
         Parameters
         ----------
         frame : int, str or FrameRef
-            As :meth:`graph` takes it. It is like itself, so the first answer holds it or is as good.
+            Frame, as for :meth:`graph`. The first result contains this frame, or is equally similar.
         abstraction : str
-            As :meth:`classes` takes it.
+            Abstraction, as for :meth:`classes`.
         ignore : sequence of str
-            Labels, kinds, words for several kinds, and relations that do not count.
+            Labels, kinds, super-kinds, and relations to ignore.
         limit, each_trace : int, bool
-            How many runs of consecutive frames to give; and whether only the best of each trace, with
-            frames less than 5 s from the example left out.
+            Largest number of runs; and True for only the best run of each trace, without frames less than 5 s
+            from the example.
 
         Raises
         ------
         StoreError
-            There is no such frame.
+            The frame does not exist.
         AbstractionError
-            There is no such abstraction, or nothing is called as what is to be ignored.
+            The abstraction does not exist, or no name matches ``ignore``.
         """
         from sgstore.store import example_of, frames_like
 
@@ -482,16 +482,16 @@ class Store:
         Parameters
         ----------
         frame : int, str or FrameRef
-            As :meth:`graph` takes it.
+            Frame, as for :meth:`graph`.
         ignore : sequence of str
-            Relations and kinds that it leaves out.
+            Relations and kinds to leave out.
 
         Raises
         ------
         StoreError
-            There is no such frame.
+            The frame does not exist.
         QueryError
-            It has no ego, or nothing is called as what is to be ignored.
+            The frame has no ego, or no name matches ``ignore``.
         """
         from sgstore.lang import pattern_of
 
@@ -505,9 +505,9 @@ class Store:
         Raises
         ------
         StoreError
-            There is no such frame or channel, or no message of the channel belongs to the frame.
+            The frame or channel does not exist, or the frame has no message of the channel.
         TraceError
-            The recording is gone, was replaced, or is damaged there.
+            The recording is missing, replaced, or damaged at this position.
         """
         return self.file.payload(_ref(frame), channel)
 
@@ -517,7 +517,7 @@ class Store:
         Parameters
         ----------
         frame : int, str or FrameRef
-            As :meth:`graph` takes it.
+            Frame, as for :meth:`graph`.
         channel : str
             Topic of the camera.
 
@@ -528,11 +528,11 @@ class Store:
         Raises
         ------
         StoreError
-            There is no such frame or channel, or no message of the channel belongs to the frame.
+            The frame or channel does not exist, or the frame has no message of the channel.
         TraceError
-            The recording is gone, was replaced, or is damaged there.
+            The recording is missing, replaced, or damaged at this position.
         ExportError
-            The message holds no picture.
+            The message contains no picture.
         MissingExtraError
             Pillow is not installed.
         """
@@ -551,24 +551,24 @@ class Store:
         Parameters
         ----------
         frame : int, str or FrameRef
-            As :meth:`graph` takes it.
+            Frame, as for :meth:`graph`.
         channel : str, optional
-            Topic of the sensor; by default the first that carries points.
+            Topic of the sensor; by default the first sensor with points.
 
         Returns
         -------
         (N,) structured array
-            Fields as the message calls them, such as ``x``, ``y``, ``z`` (m, in the axes of the sensor) and
+            Fields named as in the message, such as ``x``, ``y``, ``z`` (m, in the axes of the sensor) and
             ``intensity``.
 
         Raises
         ------
         StoreError
-            There is no such frame or channel, or no message of the channel belongs to the frame.
+            The frame or channel does not exist, or the frame has no message of the channel.
         TraceError
-            The recording is gone, was replaced, or is damaged there.
+            The recording is missing, replaced, or damaged at this position.
         ExportError
-            The message holds no points.
+            The message contains no points.
         """
         from sgstore.exporters import cloud_of
 
@@ -587,12 +587,12 @@ class Store:
         Parameters
         ----------
         frame : int, str or FrameRef
-            As :meth:`graph` takes it.
+            Frame, as for :meth:`graph`.
 
         Raises
         ------
         StoreError
-            There is no such frame.
+            The frame does not exist.
         """
         return StoreFrame(self, self.file.frame(_ref(frame)))
 
@@ -609,20 +609,21 @@ class Store:
         Parameters
         ----------
         clip : str, Clip or Interval
-            ``TRACE@12s..18s``, ``TRACE#120..180``, or what :meth:`Matches.clips` and
-            :meth:`Matches.intervals` give.
+            ``TRACE@12s..18s``, ``TRACE#120..180``, or a result of :meth:`Matches.clips` or
+            :meth:`Matches.intervals`.
         query : str, Pattern or networkx graph, optional
-            As :meth:`find` takes it; what it matches is marked.
+            Query, as for :meth:`find`; its matches are marked.
         form : {"gif", "mp4", "webm"}
-            The last two with the extra ``video``.
+            ``mp4`` and ``webm`` need the extra ``video``.
         **look
             ``camera``, ``relations``, ``radius``, ``north_up``, ``diagram``, ``names``, ``fps``: see
-            :func:`sgstore.draw.draw_clip`. ``fps`` is 10; a long GIF has less, 150 pictures: some 10 MB.
+            :func:`sgstore.draw.draw_clip`. ``fps`` is 10. A long GIF has a lower rate: at most 150 pictures,
+            about 10 MB.
 
         Raises
         ------
         StoreError, QueryError, ExportError, TraceError
-            There is no such clip or channel, the query is none, or the recording is gone.
+            The clip or channel does not exist, the query is invalid, or the recording is missing.
         MissingExtraError
             The packages for drawing are not installed.
         """
@@ -667,9 +668,9 @@ class Store:
         Parameters
         ----------
         frame : int, str or FrameRef
-            As :meth:`graph` takes it.
+            Frame, as for :meth:`graph`.
         query : str, Pattern or networkx graph, optional
-            As :meth:`find` takes it; what it matches in the frame is marked.
+            Query, as for :meth:`find`; its matches in the frame are marked.
         **look
             ``camera``, ``relations``, ``radius``, ``north_up``, ``diagram``, ``names``: see
             :func:`sgstore.draw.draw_stored`.
@@ -682,7 +683,7 @@ class Store:
         Raises
         ------
         StoreError, QueryError, ExportError, TraceError
-            There is no such frame or channel, the query is none, or the recording is gone.
+            The frame or channel does not exist, the query is invalid, or the recording is missing.
         MissingExtraError
             The packages for drawing are not installed.
         """
@@ -711,23 +712,23 @@ class Store:
         Parameters
         ----------
         frame : int, str or FrameRef
-            As :meth:`graph` takes it.
+            Frame, as for :meth:`graph`.
         text : str
-            A pattern, as :meth:`find` takes it.
+            Pattern, as for :meth:`find`.
         **parameters
             Values of ``$name``.
 
         Returns
         -------
         WhyNot or WhyNotSteps
-            Of a sequence, an answer for each of its steps.
+            For a sequence: one answer per step.
 
         Raises
         ------
         QueryError
-            The text is no query.
+            The text is not a query.
         StoreError
-            There is no such frame.
+            The frame does not exist.
         """
         from sgstore.lang import (
             WhyNot,
@@ -759,26 +760,25 @@ class Store:
     ) -> TruthLanes:
         """Intervals of each part of a pattern, over the trace of a frame, for the nodes of a match there.
 
-        The frames in which all parts hold are those that match with these nodes; of a sequence, step by step.
+        The binding matches in the frames in which all parts hold. For a sequence, this applies to each step.
 
         Parameters
         ----------
         text : str
-            A pattern, as :meth:`find` takes it.
+            Pattern, as for :meth:`find`.
         frame : int, str or FrameRef
-            As :meth:`graph` takes it.
+            Frame, as for :meth:`graph`.
         binding : mapping of str to int, optional
-            Node ids of variables; by default those of the first match in the frame, or, where there is none,
-            those with which it comes nearest.
+            Node ids of variables. Default: the first match in the frame, or else the nearest binding.
         **parameters
             Values of ``$name``.
 
         Raises
         ------
         QueryError
-            The text is no query, or has no variable of such a name.
+            The text is not a query, or lacks a variable of the binding.
         StoreError
-            There is no such frame.
+            The frame does not exist.
         """
         with self.file.snapshot():
             matches, ref = self.find(text, **parameters), self.file.frame(_ref(frame))
@@ -840,7 +840,7 @@ def matches_of(
     Raises
     ------
     QueryError
-        The text is no query, or names what the catalog does not know.
+        The text is not a query, or has an unknown name.
     """
     from sgstore.temporal import TemporalMatches
 
@@ -857,27 +857,27 @@ class UserStatement:
     Parameters
     ----------
     find : function
-        Given a query and values of its parameters, returns its matches.
+        Function from a query and its parameters to its matches.
     tables : collection of str
-        Names that are taken.
+        Reserved table names.
     text : str
-        It may have calls of ``sgql``.
+        SQL text, possibly with calls of ``sgql``.
 
     Raises
     ------
     QueryError
-        A pattern in it is none, or a call.
+        A pattern or a call in the statement is invalid.
 
     Attributes
     ----------
     sql : str
-        The statement that is asked.
+        SQL statement to run.
     given : function or None
-        Makes the tables of its patterns: see :meth:`sgstore.store.StoreFile.user_sql`.
+        Creates the tables of its patterns; see :meth:`sgstore.store.StoreFile.user_sql`.
     reasons : mapping of str to str
-        Why traces are left out by a pattern, by name.
+        Reasons why a pattern skips traces, by trace name.
     notes : tuple of str
-        What may be a mistake in a pattern.
+        Notes on likely mistakes in patterns.
     """
 
     def __init__(self, find: Callable[..., Matches], tables: Collection[str], text: str) -> None:

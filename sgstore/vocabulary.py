@@ -1,10 +1,9 @@
 """Catalogue of names: kinds, relations and light states.
 
-A *kind* is what an entity or a part of the map is; a *relation* is the name of an edge. Readers, settings,
-imports and stores add kinds of entities, relations and states of lights of their own (:func:`add_kind`,
-:func:`add_relation`, :func:`add_light_state`). The *code* of a name is its index, and stays. The file
-``vocabulary.toml`` maps the type names of simulators to kinds; a type that nothing maps becomes ``unknown``,
-never nothing.
+A *kind* is the type of an entity or a map element; a *relation* is the name of an edge. Readers, settings,
+imports and stores can add kinds of entities, relations and light states (:func:`add_kind`,
+:func:`add_relation`, :func:`add_light_state`). The *code* of a name is its index and does not change. The file
+``vocabulary.toml`` maps simulator type names to kinds. A type without a mapping becomes ``unknown``.
 
 Names are compared without regard to case and underscores (``TrafficLight`` is ``traffic_light``);
 the canonical spelling is stored and printed.
@@ -214,7 +213,8 @@ def learn(enum: str, name: str) -> int:
     Raises
     ------
     ValueError
-        It is no name, but for case and underscores it is one of this package, or there are too many.
+        The name is invalid, equals a built-in name except for case and underscores, or there are too many
+        names.
     """
     names, codes, most, what = _CODES[enum]
     with _growing:
@@ -239,8 +239,8 @@ def add_relation(name: str) -> int:
     Raises
     ------
     ValueError
-        It is no name, it is that of a label or, but for case and underscores, of another relation of this
-        package; or there are too many.
+        The name is invalid, is a label, or equals a built-in relation except for case and underscores; or there
+        are too many names.
     """
     return _made("relation", name)
 
@@ -251,13 +251,13 @@ def add_kind(name: str) -> int:
     Parameters
     ----------
     name : str
-        Small letters, digits and ``_``: a pattern writes ``wheel_chair`` as ``WheelChair``.
+        Lower-case letters, digits and ``_``. In a pattern, ``wheel_chair`` is written ``WheelChair``.
 
     Raises
     ------
     ValueError
-        It is no name, it is that of a relation or, but for case and underscores, of another label of this
-        package; or there are too many.
+        The name is invalid, is a relation, or equals a built-in label except for case and underscores; or there
+        are too many names.
     """
     return _made("kind", name)
 
@@ -268,8 +268,8 @@ def add_light_state(name: str) -> int:
     Raises
     ------
     ValueError
-        It is no name or, but for case and underscores, that of another state of this package; or there are
-        too many.
+        The name is invalid, or equals a built-in state except for case and underscores; or there are too many
+        names.
     """
     return _made("light_state", name)
 
@@ -301,8 +301,8 @@ def asking(names: Mapping[str, Sequence[str]] | None) -> Generator[None]:
     Parameters
     ----------
     names : mapping or None
-        Enumeration → values that the store has beside those of this package; ``None``: those of all stores
-        that the process has met.
+        Enumeration → values that the store adds to the built-in values. ``None`` means the values of all stores
+        opened in this process.
     """
     before = _asked.set(names)
     try:
@@ -381,7 +381,7 @@ def kinds_labelled(label: str) -> tuple[str, ...] | None:
 def kind_named(word: str) -> str | None:
     """Return the kind for a word or its synonym. ``None`` means no kind, or several kinds.
 
-    ``vehicle`` is the kind of that name here, although the label stands for every vehicle.
+    ``vehicle`` means the kind of that name here, although the label covers all vehicle kinds.
     """
     exact = _meant("kind", word)
     if exact is not None:
@@ -393,7 +393,7 @@ def kind_named(word: str) -> str | None:
 def vague_kind(type_name: str) -> str:
     """Return the fallback kind of an unknown type name: ``vehicle`` if the name contains it, else ``unknown``.
 
-    ``TYPE_VEHICLE`` is OSI's word for it; CARLA's and nuScenes' names begin with ``vehicle.``.
+    OSI uses ``TYPE_VEHICLE``; names of CARLA and nuScenes begin with ``vehicle.``.
     """
     word = type_name.lower()
     says_vehicle = word == "type_vehicle" or word.partition(".")[0] == "vehicle"
@@ -409,8 +409,7 @@ def labels() -> tuple[str, ...]:
 def natural(name: str) -> tuple[tuple[tuple[int, str], ...], str]:
     """Return a sort key for trace names in natural order: ``run2`` before ``run10``.
 
-    Digits count as the numbers that they are, letters without regard to case; what is the same then is told
-    apart by its characters.
+    Digits compare as numbers, letters without case. The characters decide between names that are still equal.
     """
     parts = re.split(r"(\d+)", name)
     told = (p.lstrip("0") if place % 2 else p.casefold() for place, p in enumerate(parts))
@@ -439,7 +438,7 @@ class TypeMeaning:
     special : str
         One of :data:`SPECIALS`, or the empty string.
     subkind : str
-        What a prop or an unknown is (``cone``, ``traffic_warning``), or the empty string.
+        Subtype of a prop or unknown object (``cone``, ``traffic_warning``), or an empty string.
     """
 
     kind: str

@@ -1,8 +1,8 @@
 """Data of a simulator: frames of a trace as arrays, and the places of its messages in the file.
 
-These are the values that readers hand to the scene graph generator and to the store, which rounds them.
-Conventions of axes, units and signs are those of :mod:`sgstore.geometry`: OpenDRIVE's inertial
-axes, metres, radians, seconds, ``int64`` nanoseconds. A missing number is NaN, a missing code -1.
+Readers pass these values to the scene graph generator and to the store. The store rounds them. Conventions of
+axes, units and signs are those of :mod:`sgstore.geometry`: OpenDRIVE's inertial axes, metres, radians, seconds,
+``int64`` nanoseconds. A missing number is NaN, a missing code -1.
 
 A *node id* names an entity within its trace: 0, 1, 2, … in the order of appearance. Ids below zero
 belong to the road map (:mod:`sgstore.roads`).
@@ -51,7 +51,7 @@ TOLERANCE_SHARE: Final = 100
 def seconds_of(ns: int) -> float:
     """Return a time in nanoseconds as seconds, rounded to whole microseconds.
 
-    Clocks of simulators lose the last nanosecond: 7.499999999 s is 7.5 s.
+    Simulator clocks lose the last nanosecond: 7.499999999 s means 7.5 s.
     """
     whole = (abs(ns) + 500) // 1000 / 1e6
     return whole if ns >= 0 else -whole
@@ -60,8 +60,8 @@ def seconds_of(ns: int) -> float:
 def tolerance_ns(period_ns: int) -> int:
     """Greatest difference of two times of a trace that still count as the same: clocks jitter.
 
-    Every bound of time is compared with this tolerance, in favour of equality: ``>= 3 s`` holds of 2.9999 s,
-    ``< 3 s`` does not.
+    All comparisons of time use this tolerance in favour of equality: ``>= 3 s`` is true for 2.9999 s, ``< 3 s``
+    is false.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def tolerance_ns(period_ns: int) -> int:
     Returns
     -------
     int
-        ns; a hundredth of the period, at least a microsecond.
+        Tolerance; ns. A hundredth of the period, at least a microsecond.
     """
     return max(TOLERANCE_NS, period_ns // TOLERANCE_SHARE)
 
@@ -214,7 +214,7 @@ def is_leap(away: float, seconds: float) -> bool:
     away : float
         Distance; m.
     seconds : float
-        Time that it took; s. If it is not above 0, the clock stands or jumps, and nothing is a leap.
+        Duration of the movement; s. At 0 or less, the clock stands or jumps, and the result is false.
     """
     return seconds > 0 and away > FASTEST * seconds + LEAP
 
@@ -239,11 +239,11 @@ class Sight(NamedTuple):
     Attributes
     ----------
     place : tuple of float
-        x, y and z; m. NaN: not known.
+        x, y and z; m. NaN means unknown.
     time_ns : int
         Simulation time; ns.
     run : int
-        Run of the clock; a jump back begins the next one.
+        Number of the clock run. A backward jump starts a new run.
     """
 
     place: tuple[float, ...]
@@ -266,8 +266,8 @@ class Life(NamedTuple, Generic[AnyEntity]):
     def goes_on(self, kind: int | None, here: Sight) -> bool:
         """True if the entity may be the one with its id in a frame.
 
-        It must have the same kind (``None``: the kind is not certain), at a place that it can have reached.
-        After a jump of the clock, it can have reached any place.
+        The kinds must be equal (``None``: uncertain kind), and the distance must be possible. After a clock
+        jump, any distance is possible.
         """
         seen = self.seen
         if kind is not None and kind != self.kind:
@@ -290,21 +290,21 @@ class Life(NamedTuple, Generic[AnyEntity]):
 class Lives(Generic[AnyEntity]):
     """The entities that one id has had.
 
-    An id that comes back as another kind, or at a place that its entity cannot have reached, has another entity
-    from then on. If several entities have one id by turns, each of them goes on.
+    If an id returns with another kind, or at an impossible distance, it denotes another entity from then on.
+    Entities that use one id in turns continue.
 
     Parameters
     ----------
     last : Life
-        The entity that has the id.
+        Current entity of the id.
 
     Attributes
     ----------
     last : Life
     left : sequence of Life
-        Entities that have lost the id to another one and may go on; the latest at the end.
+        Earlier entities of the id that may continue, latest last.
     count : int
-        How many entities there were.
+        Number of entities so far.
     """
 
     __slots__ = ("count", "last", "left")
@@ -326,9 +326,9 @@ class Lives(Generic[AnyEntity]):
         here : Sight
             Where it is.
         enter : callable
-            Makes the entity if it is another one than all before.
+            Creates a new entity if no earlier one fits.
         sure_kind : bool
-            False: the kind is a guess, and another kind alone makes no other entity.
+            False if the kind is a guess. A different kind alone then does not mean another entity.
         """
         last, judged = self.last, kind if sure_kind else None
         if not last.goes_on(judged, here):
@@ -363,16 +363,18 @@ class Entities:
     kind : (n,) int8
         Codes of :data:`sgstore.vocabulary.KINDS`.
     special, subkind, type_name : tuple of str
-        Special kind, subkind, and the simulator's own type name; empty where there is none.
+        Special kind, subkind, and the simulator's own type name; empty if missing.
     static : (n,) bool
-        Whether it never moves: its pose comes once, in :attr:`FrameBlock.scenery`.
+        True if the entity never moves. Its only pose is in :attr:`FrameBlock.scenery`.
     map_ref : tuple of str
-        Id of the OpenDRIVE signal or object that this entity is, or the empty string. Of a signal that the map
-        does not have: the lanes that it applies to, as :func:`sgstore.roads.lanes_ref` names them.
+        Id of the matching OpenDRIVE signal or object, or an empty string. For a signal that the map lacks: its
+        lanes, in the format of :func:`sgstore.roads.lanes_ref`.
     lifetime : tuple of int
-        1 of the first entity with an id, 2 of the next one with the same id, …; empty: 1 of all.
+        1 for the first entity with an id, 2 for the next one with the same id, and so on. Empty means 1 for
+        all.
     trailer : tuple of str
-        Id of the trailer that it pulls when it is first seen, or the empty string. Left out: not known.
+        Id of the trailer at the first observation, or an empty string. Without the column, trailers are
+        unknown.
     """
 
     first: int
@@ -409,11 +411,11 @@ class States:
     length, width, height : float64
         Full extents of the box; m.
     lights : int64
-        Lights of a vehicle: bit i is :data:`sgstore.vocabulary.VEHICLE_LIGHTS` [i]; -1: not known.
+        Lights of a vehicle: bit i is :data:`sgstore.vocabulary.VEHICLE_LIGHTS` [i]; -1: unknown.
     light_state : int8
-        What a traffic light shows: code of :data:`sgstore.vocabulary.LIGHT_STATES`; -1: no light.
+        State of a traffic light: code of :data:`sgstore.vocabulary.LIGHT_STATES`; -1: no light.
     steer, throttle, brake : float64
-        Control inputs, where the trace tells them; -1 … 1 (positive to the left), 0 … 1, 0 … 1.
+        Control inputs, if recorded; -1 … 1 (positive to the left), 0 … 1, 0 … 1.
     gear : float64
         1, 2, …; 0: neutral; below 0: backwards.
     hand_brake : float64
@@ -421,7 +423,7 @@ class States:
     derived : int64
         Bit 0: velocity, bit 1: acceleration, bit 2: yaw rate was computed by differences, not read.
     carrier : int64
-        Node id of what pulls or carries it; -1: nothing; :data:`UNTOLD`: to be found.
+        Node id of the carrier or towing vehicle; -1: none; :data:`UNTOLD`: not yet computed.
     """
 
     node: Ints
@@ -491,7 +493,7 @@ class MessageRefs:
     channel : int64
         Index into :attr:`TraceInfo.channels`.
     log_time_ns : int64
-        As MCAP has it.
+        Log time in MCAP; ns.
     chunk_offset : int64
         Byte offset of the chunk record in the file; -1: the message is in no chunk.
     offset : int64
@@ -519,7 +521,7 @@ class FrameBlock:
     seq : (F,) int64
         Number of the frame in its trace, from 0, without gaps.
     time_ns : (F,) int64
-        Simulation time; may jump backwards where a recording does.
+        Simulation time; ns. It can jump backwards.
     log_time_ns : (F,) int64
         Log time of the leading message; payloads are joined by it.
     offsets : (F + 1,) int64
@@ -527,16 +529,15 @@ class FrameBlock:
     states : States
         Every entity that moves or changes (traffic lights too), in and out of range.
     ego : (F,) int64
-        Node id of the ego, -1 where it is absent.
+        Node id of the ego; -1 means absent.
     entities : Entities
         Entities that appear in this block for the first time.
     scenery : States
-        Poses of the static ones among them; they stay for the rest of the trace.
+        Poses of the new static entities, valid for the rest of the trace.
     messages : MessageRefs
         The messages read with this block, of all channels that are not latched.
     events : tuple of Event
-        What the simulator says has happened, as far as it was read with this block: of its frames, and perhaps
-        of the next ones.
+        Events read with this block. They belong to its frames, and possibly to later frames.
     """
 
     seq: Ints
@@ -575,9 +576,9 @@ class Channel:
     id : int
         The channel's id in the file.
     topic, schema, schema_encoding, message_encoding : str
-        As the file has them.
+        Values in the file.
     messages : int
-        Number of messages as the file's statistics say, -1 where it has none.
+        Number of messages in the file's statistics; -1 without statistics.
     role : str
         ``ground_truth``, ``map``, or ``payload``.
     """
@@ -600,25 +601,23 @@ class TraceInfo:
     path : Path
         The file.
     size, mtime_ns : int
-        Its size in bytes and time of change, of a bag those of its files together; what later tells that it
-        was replaced.
+        Size in bytes and modification time, summed up for the files of a bag. They later show a replaced file.
     digest : str
         SHA-256 of the whole file, in hexadecimal digits.
     flavour : str
         Name of the reader: ``osi``.
     channels : tuple of Channel
     ego : str
-        The simulator's id of the ego; empty if there is none.
+        Simulator id of the ego; empty without an ego.
     map_text, map_name : str
-        Text of the road map that the trace carries, OpenDRIVE or plain lanes, and what the trace calls it;
-        empty if it carries none.
+        Text (OpenDRIVE or plain lanes) and name of the road map in the trace; empty without a map.
     context : MessageRefs
-        Messages that later ones depend on: maps, latched messages, those that carry static data. A clip
-        must bring the ones before its start.
+        Messages that later messages need: maps, latched messages, static data. A clip must include those before
+        its start.
     mapping : str
-        Digest of the mapping by which it is understood, of flavours that need one.
+        Digest of the type mapping, for flavours that need one.
     lost_lanes : tuple of str
-        Lanes that the trace tells and that its map of lanes does not have, and why.
+        Lanes of the trace that its lane map lacks, with the reasons.
     """
 
     path: Path
@@ -646,18 +645,18 @@ class Event:
     time_ns, log_time_ns : int
         Simulation time and log time.
     seq : int
-        Number of the last frame before it in the file; -1: there is none.
+        Number of the last frame before the event in the file; -1: none.
     ident : str
-        Id of the vehicle; empty: not known.
+        Id of the vehicle; empty: unknown.
     other : str
-        Id of what it collided with; empty: nothing.
+        Id of the other object in a collision; empty: none.
     value : float or None
         Length of the impulse of a collision; N·s.
     detail : str
-        Markings that were crossed: ``broken``, ``solid``, ``other``, with commas. Of an environment, what it
-        is from now on: ``precipitation=light, fog=mist``.
+        Crossed lane markings: ``broken``, ``solid``, ``other``, separated by commas. For an environment, its
+        new state: ``precipitation=light, fog=mist``.
     lifetime, other_lifetime : int
-        Which of the entities with these ids; see :class:`Entities`.
+        Lifetime numbers of the entities; see :class:`Entities`.
     """
 
     kind: str
@@ -697,17 +696,17 @@ class TraceReport(Findings):
     Attributes
     ----------
     frames, states : int
-        How many were read.
+        Numbers of frames and states read.
     unknown_types : dict
-        Type names that no mapping knows → how many entities bear them.
+        Type names without a mapping → number of entities.
     warnings : list of str
-        What is odd but lost nothing.
+        Anomalies without loss of data.
     about_ego : list of str
-        Those of the warnings that do not concern who names the egos.
+        Warnings that do not matter if the caller names the egos.
     losses : list of Loss
-        What could not be used.
+        Unusable data.
     events : list of Event
-        What the simulator says has happened, in the order of the file: the first of very many.
+        Events in file order, up to a limit.
     """
 
     frames: int = 0
@@ -763,8 +762,8 @@ class Origin:
 def origin_of(frames: FrameBlock) -> Origin | None:
     """Return the median position in the first frame with positions, in whole metres.
 
-    It is the same for any ego. Where nothing that moves has a place, that of the scenery; ``None`` while
-    nothing has one.
+    The result does not depend on the ego. Without moving entities, the scenery counts. ``None`` means no
+    positions yet.
     """
     states, scenery = frames.states, frames.scenery
     placed = np.flatnonzero(np.isfinite(states.x) & np.isfinite(states.y))
@@ -793,8 +792,8 @@ def quantize(frames: FrameBlock, origin: Origin) -> FrameBlock:
 def _as_kept(states: States, origin: Origin) -> States:
     """States as float32 about an origin. Doing it twice changes nothing, nor does storing them afterwards.
 
-    A float32 has 24 bits. If the sum of the origin and one has bits below those of a float64, rounding takes
-    some off its end, and the difference to the origin fits into 24 bits all the more.
+    A float32 has 24 significant bits. The sum with the origin may round off low bits in float64; the difference
+    to the origin then still fits into 24 bits.
     """
     if not len(states):
         return states

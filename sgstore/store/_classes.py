@@ -180,9 +180,9 @@ class Abstracted:
         Raises
         ------
         AbstractionError
-            There is no such abstraction.
+            The abstraction does not exist.
         StoreError
-            Others keep the store for too long, or the disk is full.
+            Another process uses the store for too long, or the disk is full.
         """
         name = abstraction_named(name).name
         with self._access.reading() as connection:
@@ -230,9 +230,9 @@ class Abstracted:
         Raises
         ------
         AbstractionError
-            There is no such abstraction.
+            The abstraction does not exist.
         StoreError
-            There is no such trace, or others keep the store for too long.
+            The trace does not exist, or another process uses the store for too long.
         """
         self.complete(name)
         with self._access.reading() as connection:
@@ -274,9 +274,9 @@ class Abstracted:
         Raises
         ------
         AbstractionError
-            There is no such abstraction.
+            The abstraction does not exist.
         StoreError
-            Others keep the store for too long.
+            Another process uses the store for too long.
         """
         self.complete(name)
         with self._access.reading() as connection:
@@ -326,7 +326,7 @@ class Abstracted:
         Raises
         ------
         AbstractionError
-            There is no such abstraction.
+            The abstraction does not exist.
         """
         function = abstraction_named(name).function
         with self._access.reading() as connection:
@@ -339,9 +339,9 @@ class Abstracted:
         Raises
         ------
         AbstractionError
-            There is no such abstraction.
+            The abstraction does not exist.
         StoreError
-            Others keep the store for too long.
+            Another process uses the store for too long.
         """
         function = abstraction_named(name).function
         with self._access.reading() as connection:
@@ -354,9 +354,9 @@ class Abstracted:
         Raises
         ------
         AbstractionError
-            There is no such abstraction.
+            The abstraction does not exist.
         StoreError
-            There is no such frame.
+            The frame does not exist.
         """
         abstraction = abstraction_named(name)
         with self._access.reading() as connection:

@@ -25,7 +25,7 @@ def duckdb(path: str | Path) -> DuckDBPyConnection:
     Raises
     ------
     StoreError
-        There is no such store, or a writer has it.
+        The store does not exist, or a writer process uses it.
     """
     path = Path(path)
     refuse_special(path)

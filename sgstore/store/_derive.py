@@ -148,7 +148,7 @@ class Deriving:
         Raises
         ------
         AbstractionError
-            There is no such set.
+            The set does not exist.
         """
         gone = [one for one in self.sets() if normalize_name(one.name) == normalize_name(name)]
         if not gone:
@@ -346,7 +346,7 @@ class Building:
         Raises
         ------
         StoreError
-            The trace was removed meanwhile, or others keep the store for too long.
+            The trace was removed meanwhile, or another process uses the store for too long.
         """
         self._staging.seal()
         with writing(self._access) as connection:

@@ -87,8 +87,8 @@ class StoreFile:
     ----------
     path : str or Path
     memory : int
-        Most memory that one question may take; bytes. 0: 1 GiB, or a quarter of the machine's if that is
-        less. Beyond it the database spills to temporary files.
+        Memory limit of one query; bytes. 0: 1 GiB, or a quarter of the machine's memory if less. Beyond it, the
+        database writes temporary files.
     wait_s : float
         How long to wait for others that write, or read while this one writes; s.
     spill : int
@@ -103,8 +103,8 @@ class StoreFile:
     Raises
     ------
     StoreError
-        There is no such file, it is no store, or one of another version; or a table is called like one of its
-        own.
+        The file does not exist, is not a store, or has another version; or a table has the name of a store
+        table.
     """
 
     def __init__(
@@ -266,9 +266,9 @@ class StoreFile:
         sql : str
             One statement that only reads. It sees the store and no files, and cannot change settings.
         timeout_s : float, optional
-            When to stop it; s.
+            Time limit; s.
         max_rows : int, optional
-            How many rows to give; ``Rows.truncated`` tells whether there are more.
+            Largest number of rows to return; ``Rows.truncated`` is true if there are more.
         given : function, optional
             Says which tables it speaks of beside the views: statements of ours make them, from the store as it
             is then.
@@ -276,7 +276,7 @@ class StoreFile:
         Raises
         ------
         SqlError
-            It is not one statement that only reads, the database refuses it, or it runs for too long.
+            The text is not a single read-only statement, the database rejects it, or it runs for too long.
         """
         size = BATCH if max_rows is None else max(min(BATCH, max_rows + 1), 1)
         values: list[tuple[Any, ...]] = []
@@ -412,7 +412,7 @@ class StoreFile:
         Raises
         ------
         StoreError
-            None or several are meant; it says which there are.
+            No trace or several traces match; the message lists them.
         """
         with self.access.reading() as connection:
             trace_id, _ = trace_named(connection, str(ref))
@@ -435,7 +435,7 @@ class StoreFile:
         Raises
         ------
         StoreError
-            There is no such frame; it says which there are.
+            The frame does not exist; the message lists the frames.
         """
         with self.access.reading() as connection:
             return frame_named(connection, ref)
@@ -446,7 +446,7 @@ class StoreFile:
         Raises
         ------
         StoreError
-            There is no such frame.
+            The frame does not exist.
         """
         with self.access.reading() as connection:
             frame = frame_named(connection, ref)
@@ -482,7 +482,7 @@ class StoreFile:
         Raises
         ------
         StoreError
-            There is no such trace, or these are too many frames at once.
+            The trace does not exist, or these are too many frames at once.
         """
         from sgstore.store._states import frame_times, states_between
 
@@ -513,7 +513,7 @@ class StoreFile:
         Raises
         ------
         StoreError
-            There is no such trace or number.
+            The trace or value does not exist.
         """
         from sgstore.store._states import series
 
@@ -601,9 +601,9 @@ class StoreFile:
         Raises
         ------
         StoreError
-            There is no such frame or channel, or no message of the channel belongs to the frame.
+            The frame or channel does not exist, or the frame has no message of the channel.
         TraceError
-            The recording is gone, was replaced, or is damaged there.
+            The recording is missing, replaced, or damaged at this position.
         """
         from sgstore.readers import read_message
 
@@ -747,7 +747,8 @@ class StoreFile:
         Raises
         ------
         StoreError
-            The trace came into the store meanwhile, others keep the store for too long, or the disk is full.
+            The trace came into the store meanwhile, another process uses the store for too long, or the disk is
+            full.
         """
         (found,) = self.publish_each([sealed], replace=replace)
         if isinstance(found, SgstoreError):
@@ -809,7 +810,7 @@ class StoreFile:
         Raises
         ------
         StoreError
-            One of them is not there, or others keep the store for too long.
+            One of them is not there, or another process uses the store for too long.
         """
         from sgstore.store._publish import remove
         from sgstore.store._staging import scratch
@@ -852,7 +853,7 @@ class StoreFile:
     def settle(self) -> None:
         """Merge the log of a killed writer into the store file.
 
-        Nothing is done if there is nothing, or if others keep the store for too long.
+        Nothing is done if there is nothing, or if another process uses the store for too long.
         """
         from sgstore.store._rebuild import settle
 
@@ -867,8 +868,8 @@ class StoreFile:
         Raises
         ------
         StoreError
-            Others keep the store for too long, there is no room for a second one, or somebody else's tables are
-            in it, too: they would be lost.
+            Another process uses the store for too long, there is no room for a second one, or somebody else's
+            tables are in it, too: they would be lost.
         """
         from sgstore.store._rebuild import compact
 

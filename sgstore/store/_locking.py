@@ -382,7 +382,7 @@ class Access:
         Raises
         ------
         StoreError
-            There is no such file, it is no database, or a writer kept it for too long.
+            The file does not exist, is not a database, or a writer process used it for too long.
         """
         deadline = _Deadline(self._wait_s)
         connection = self._enter(deadline, public=public, idle=idle)
@@ -568,7 +568,7 @@ class Access:
         Raises
         ------
         StoreError
-            There is no such file, it cannot be written, or others kept it for too long.
+            The file does not exist, is not writable, or another process used it for too long.
         """
         with self.attached(connection, *folders), transaction(connection):
             yield

@@ -215,7 +215,7 @@ def payload_place(
     Raises
     ------
     StoreError
-        There is none; it says why.
+        The message is missing; the error names the reason.
     """
     found = connection.execute(
         """

@@ -294,7 +294,7 @@ def create(path: Path) -> None:
     Raises
     ------
     StoreError
-        There is no such folder, or it cannot be written.
+        The folder does not exist, or is not writable.
     """
     refuse_odd_name(path)
     if not path.parent.is_dir():

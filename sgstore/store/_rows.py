@@ -422,7 +422,7 @@ def user_statement(
     Raises
     ------
     SqlError
-        It is not one statement that only reads, the database refuses it, or it runs for too long.
+        The text is not a single read-only statement, the database rejects it, or it runs for too long.
     """
     with _refused(sql, timeout_s):
         _check(connection, sql)

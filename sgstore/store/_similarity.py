@@ -51,7 +51,7 @@ class SimilarFrames:
     frame : FrameRef
         The first one.
     frames : int
-        How many there are.
+        Number of frames.
     similarity : float
         1 where all features are those of the example, 0 where none is; see
         :mod:`sgstore.abstractions._features`.
@@ -132,9 +132,9 @@ def example_of(file: StoreFile, ref: int | str, name: str, ignored: Sequence[str
     Raises
     ------
     StoreError
-        There is no such frame.
+        The frame does not exist.
     AbstractionError
-        There is no such abstraction, or nothing of it is called as what is to be ignored.
+        The abstraction does not exist, or no name matches ``ignored``.
     """
     abstraction = abstraction_named(name)
     with translated(file.path), file.access.reading() as connection:

@@ -150,7 +150,7 @@ def series(
     Raises
     ------
     StoreError
-        There is no such column.
+        The column does not exist.
     """
     view = "nodes" if other is None else "pairs"
     columns = connection.execute(f"DESCRIBE {view}").fetchall()

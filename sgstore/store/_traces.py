@@ -437,7 +437,7 @@ def trace_named(connection: DuckDBPyConnection, ref: str) -> tuple[int, str]:
     Raises
     ------
     StoreError
-        None or several are meant.
+        No trace or several traces match.
     """
     found = connection.execute("SELECT name, trace_id FROM trace ORDER BY name").fetchall()
     return trace_among(dict(found), ref)

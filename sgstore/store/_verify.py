@@ -278,7 +278,7 @@ def verify_file(path: str | Path, *, recordings: bool = False) -> Verification:
     Raises
     ------
     StoreError
-        There is no such file, or it is no store.
+        The file does not exist, or is not a store.
     """
     place = Path(path)
     access = Access(place, checked=False)

@@ -532,7 +532,7 @@ class CheckRun:
     Raises
     ------
     QueryError
-        The text has no checks, or they have no meaning; it says where.
+        The text has no checks, or they are invalid. The message gives the place.
     """
 
     def __init__(

@@ -58,7 +58,7 @@ class ShortestClip:
     start, end : float
         Their times since the trace began; s.
     frames : int
-        How many there are.
+        Number of frames.
     of : int
         How many there were: of the clip that was given, or of the whole trace.
     clip : Clip
