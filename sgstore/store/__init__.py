@@ -1,21 +1,20 @@
 """The store: one DuckDB file. Only this package uses DuckDB.
 
-Reading: ``_file`` is the face, :class:`StoreFile`. ``_locking`` lets readers and writers share the file,
-and ``_schema`` compares it with ``schema.sql`` before anything is read. ``_rows`` runs statements, users'
-too, and makes tables and files of their rows; ``_given`` has tables that they are given, and ``_steps``
-lets a signal end them. ``_traces`` finds traces and frames by their names, ``_graphs`` reads graphs,
-``_catalog`` tells the compiler of queries what there is, ``_joins`` brings users' own tables beside
-the store, ``_encounters`` has measures of what was recorded later, and ``_contents`` makes digests
-of frames.
+Reading: ``_file`` has the main class, :class:`StoreFile`. ``_locking`` shares the file between readers and
+writers, and ``_schema`` checks it against ``schema.sql`` before the first read. ``_rows`` runs SQL statements
+and converts their rows; ``_given`` creates their temporary tables, and ``_steps`` makes them interruptible.
+``_traces`` finds traces and frames by name, ``_graphs`` reads graphs, ``_catalog`` describes the store for the
+query compiler, ``_joins`` joins user tables, ``_encounters`` computes measures of later encounters, and
+``_contents`` computes digests of frames.
 
-Writing: ``_packing`` turns the graphs of a block into columns and masks. ``_write`` builds a trace aside,
-in arrays that wait in a file of ``_staging``, sorted and summed by ``_columns``; ``_payloads`` joins its
-messages to its frames, and ``_publish`` brings it into the store. ``_classes`` adds classes of frames,
-``_derive`` other sets of relations; ``_similarity`` compares frames. ``_verify`` looks whether all is as it
-was published, ``_rebuild`` makes stores, and makes them anew.
+Writing: ``_packing`` converts the graphs of a block to columns and masks. ``_write`` builds a trace outside the
+store, as arrays in a file of ``_staging``; ``_columns`` sorts them and computes checksums. ``_payloads`` joins
+messages to frames, and ``_publish`` adds the trace to the store. ``_classes`` adds frame classes, ``_derive``
+adds derived sets of relations; ``_similarity`` compares frames. ``_verify`` verifies a store; ``_rebuild``
+creates and rewrites stores.
 
-Collections: ``_bundles`` copies traces into stores of their own and says what is in them, ``_landed`` keeps
-segments that wait for that, and ``_merge`` makes one answer of those of several bundles.
+Collections: ``_bundles`` copies traces into new stores and describes their content, ``_landed`` keeps segments
+before that, and ``_merge`` merges the results of several bundles.
 """
 
 import lazy_loader

@@ -1,8 +1,8 @@
 """Bundles: new stores with sorted, renamed traces of one or several stores.
 
-Numbers of traces, maps, recordings and settings come from digests, so they are the same in every store: rows
-are copied as they are. What is said of a bundle in the catalogue of a collection is read here, too, and the
-tables of that catalogue are read and written as Parquet.
+Ids of traces, maps, recordings and settings come from digests. They are equal in every store, so rows are
+copied unchanged. This module also computes the catalogue rows of a bundle, and reads and writes the Parquet
+tables of a catalogue.
 """
 
 from __future__ import annotations
@@ -64,18 +64,18 @@ def write_bundle(
     Parameters
     ----------
     source : Path
-        The store; it stays as it is.
+        Source store; it does not change.
     to : Path
-        Where the new one is made, in a folder that nobody else uses; nothing is there yet.
+        Path of the new store, in a folder that no other process uses. The file must not exist.
     traces : mapping of int to str
-        Ids of the traces, and the name of each in the new store.
+        Trace id → name in the new store.
     maps : mapping of str to str, optional
-        Digests of road maps, and the name of each in the new store.
+        Digest of a road map → name in the new store.
 
     Raises
     ------
     StoreError
-        The store lacks one of the traces, or a file cannot be read or written.
+        The store lacks one of the traces, or a file is not readable or writable.
     """
     access = Access(source)
     threads = os.cpu_count() or 1
@@ -94,14 +94,14 @@ def join_bundles(
     Parameters
     ----------
     sources : sequence of Path
-        Each is a store of this version; a trace is in one of them.
+        Stores of this version. Each trace is in one of them.
     to, traces, maps
-        As :func:`write_bundle` takes them.
+        See :func:`write_bundle`.
 
     Raises
     ------
     StoreError
-        One of the traces is in none of the stores, or a file cannot be read or written.
+        A trace is missing from all stores, or a file is not readable or writable.
     """
     sources = list(sources)
     with ExitStack() as made:
@@ -325,15 +325,15 @@ _INFO: Final = "SELECT key, value FROM store_info"
 def facts_of(file: StoreFile, bundle: str, size: int) -> Facts:
     """Return the catalogue rows that describe the content of a store.
 
-    Of triples beyond the graphs, ``moving`` is NULL.
+    For triples outside the graphs, ``moving`` is NULL.
 
     Parameters
     ----------
     file : StoreFile
     bundle : str
-        What it is called in the catalogue.
+        Name of the bundle in the catalogue.
     size : int
-        Bytes of its file.
+        File size in bytes.
     """
     with file.access.reading() as connection:
         catalog = file.catalog()
@@ -417,7 +417,7 @@ def parquet_rows(path: Path, columns: Iterable[str]) -> list[tuple[Any, ...]]:
     Raises
     ------
     StoreError
-        It cannot be read, or has no such columns.
+        The file is not readable, or lacks a column.
     """
     names = [*columns]
     listed = ", ".join(map(quoted, names))

@@ -1,7 +1,6 @@
 """Catalog of a store for the query compiler, including the catalog of each abstraction.
 
-Under an abstraction a query sees other tables under the same names: *shadows*, which stand before its
-statement.
+With an abstraction, a query sees other tables under the same names: *shadows*, defined before its statement.
 """
 
 from __future__ import annotations
@@ -107,7 +106,7 @@ def known_range(scope: Mapping[str, Any] | None) -> float:
     Parameters
     ----------
     scope : mapping or None
-        What settings left out, as the report of a trace has it.
+        Counts of excluded data from the report of a trace.
     """
     if scope is None or not scope["beyond_world"]:
         return math.inf
@@ -135,7 +134,7 @@ def _beyond(connection: DuckDBPyConnection) -> dict[str, Any]:
 def _own(connection: DuckDBPyConnection, whose: str) -> dict[str, Type]:
     """Return the types of user-defined node or edge attributes; see :func:`sgstore.lang.own_type`.
 
-    In a trace they are numbers or truth values if all values are, else texts.
+    In a trace, an attribute is a number or a truth value if all its values are; else it is a text.
     """
     types = "list(DISTINCT json_type(value)) FILTER (json_type(value) <> 'NULL')"
     whole = "bool_and(regexp_full_match(value::VARCHAR, '-?[0-9]+'))"
@@ -281,8 +280,8 @@ def _relations(
 ) -> frozenset[str] | None:
     """Return the relations of a derived set according to its settings. ``None`` means unknown.
 
-    What no trace of it answers is lacking, if one of them has a road map: it is all that a relation may need
-    beside settings. Without one, what the traces themselves answer is.
+    If a trace has a road map, the set lacks the relations that no trace answers: a relation needs only settings
+    and a map. Without a map, the set lacks only the relations that the traces can answer in the store.
     """
     if any("abstraction" in one.settings for one in of):
         return (
@@ -304,11 +303,11 @@ def relations_of_set(
     Parameters
     ----------
     answered : frozenset of str
-        What its traces can answer in it.
+        Relations that its traces answer in the set.
     known : frozenset of str
-        What they can answer in the store.
+        Relations that its traces answer in the store.
     mapped : bool
-        Whether one of them has a road map.
+        True if one of its traces has a road map.
     """
     return answered if mapped else frozenset(RELATIONS) - (known - answered)
 

@@ -1,7 +1,7 @@
 """Frame classes of each abstraction: written at ingest, or computed at the first query.
 
-Classes are masks like edges: one row for each class of a bucket, because driving repeats itself. Those that
-are made at ingest are published with their trace; others wait until they are asked for, and are then kept.
+Classes are stored as masks, like edges: one row per class and bucket, because driving repeats itself. Ingest
+publishes some classes with their trace. Other classes are computed and stored at the first query.
 """
 
 from __future__ import annotations
@@ -169,13 +169,13 @@ class Abstracted:
     def complete(self, name: str) -> int:
         """Compute and store the missing frame classes of an abstraction.
 
-        Traces of some thousand frames are one transaction: what is done stays done, and another call goes on
-        from there.
+        Each transaction covers traces with some thousand frames. After an interruption, the next call continues
+        with the rest.
 
         Returns
         -------
         int
-            How many traces lacked them.
+            Number of traces without these classes before.
 
         Raises
         ------
@@ -225,7 +225,7 @@ class Abstracted:
         Returns
         -------
         dict
-            ``frame_id``, int64, ascending; ``class``, str, empty where a graph was given up.
+            ``frame_id``, int64, ascending; ``class``, str, empty for a graph that is too symmetric.
 
         Raises
         ------
@@ -285,7 +285,7 @@ class Abstracted:
     def masks(self, name: str) -> Iterator[tuple[str | None, int, int]]:
         """Yield (class, bucket, frame mask) for all frames. Missing classes are computed but not stored.
 
-        Nothing is kept of what is made.
+        Computed classes are not stored.
         """
         name = abstraction_named(name).name
         with self._access.reading() as connection:
@@ -320,7 +320,7 @@ class Abstracted:
         Yields
         ------
         rows : int64
-            Which of the frames these are.
+            Indices of these frames in the input.
         triples : Triples
 
         Raises
@@ -402,11 +402,11 @@ class CodedClasses:
     Attributes
     ----------
     names : tuple of str
-        The classes that there are.
+        Distinct classes.
     frame_id : (N,) int64
         Ascending.
     code : (N,) int64
-        Index into ``names``; -1: too symmetric to be told.
+        Index into ``names``; -1: too symmetric.
     """
 
     names: tuple[str, ...]
@@ -421,7 +421,7 @@ def coded_classes(connection: DuckDBPyConnection, name: str) -> CodedClasses:
     ----------
     connection : DuckDBPyConnection
     name : str
-        As the store has it.
+        Name of the abstraction in the store.
     """
     return classes_coded(connection, _CLASSES, {"name": name})
 
@@ -456,13 +456,13 @@ class Triples:
     Attributes
     ----------
     names : list of tuple of str
-        Features: labels of an edge's source, of itself and of its destination; or of a node alone.
+        Features: labels of source, edge and destination; or the label of a node.
     frame : (N,) int64
         Frames, counted from 0.
     feature : (N,) int64
         Index into ``names``.
     often : (N,) int64
-        How often it occurs.
+        Count of the feature in the frame.
     """
 
     names: list[tuple[str, ...]]

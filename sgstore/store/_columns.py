@@ -1,10 +1,10 @@
 """Columns of store tables as arrays: types, sort order, and checksums of rows.
 
-Checksums of rows: the same for the same rows in any order, in any version of the database.
+Checksums of rows do not depend on the order of rows, nor on the DuckDB version.
 
-A row becomes 64 bits, mixed from the bits of its values, and the checksum is their sum modulo 2⁶⁴. So rows can
-come in parts and be stored in any order. The mixing is SplitMix64's (Steele, Lea, Flood: Fast splittable
-pseudorandom number generators, 2014): it is no cipher, and tells what happens by chance, not by intent.
+A row is mixed to 64 bits, and the checksum is the sum of all rows modulo 2⁶⁴. So rows can come in parts and in
+any order. The mixing is SplitMix64's (Steele, Lea, Flood: Fast splittable pseudorandom number generators,
+2014): it detects accidental changes, not attacks.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def kept(table: str, name: str, values: NDArray[Any]) -> NDArray[Any]:
     Raises
     ------
     StoreError
-        A number is too large for the column.
+        A value is too large for the column.
     """
     kind = types_of(table)[name]
     if kind in _FLOATS:
@@ -189,7 +189,7 @@ def in_order(table: str, columns: Columns, texts: Sequence[str]) -> Columns:
     ----------
     table : str
     columns : dict
-        As they are staged: texts as indices into ``texts``, -1 where there is none.
+        Staged columns: texts are indices into ``texts``; -1 means missing.
     texts : sequence of str
     """
     rank = np.empty(len(texts) + 1, np.int64)
@@ -230,13 +230,13 @@ def parted(columns: Columns) -> tuple[Columns, Columns]:
     Parameters
     ----------
     columns : dict
-        As they are staged, with ``bucket`` and ``bit``.
+        Staged columns with ``bucket`` and ``bit``.
 
     Returns
     -------
     single, repeated : dict
-        Rows as they came; and, as one row with ``mask``, those that follow one another and differ in
-        nothing but ``bit``.
+        Single rows, unchanged; and groups of consecutive rows that differ only in ``bit``, each as one row with
+        ``mask``.
     """
     bit = columns["bit"].astype(np.int64)
     values = {name: of for name, of in columns.items() if name != "bit"}
@@ -416,7 +416,7 @@ def columns_of(
 def expressions(connection: DuckDBPyConnection, table: str, catalog: str = "") -> str:
     """Return SQL for the columns of a table, in the form of :meth:`Checksum.add`.
 
-    Numbers are as they are, enumerations their codes, texts 60 bits of their MD5.
+    Numbers stay unchanged. Enumerations become codes, and texts become 60 bits of their MD5.
     """
     listed: list[str] = []
     for name, kind in columns_of(connection, table, catalog):

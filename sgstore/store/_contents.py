@@ -1,7 +1,7 @@
 """Digests of frame content. Two digests are equal if the public views of both frames are equal.
 
-Numbers count by their bits, texts by their letters, and a frame by its number in its trace, so that the digest
-of a part of a trace does not depend on the store that it is in, nor on what else is there.
+A digest covers the bits of numbers, the characters of texts, and frame numbers in the trace. So the digest of a
+part of a trace does not depend on the store, nor on its other content.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class Mark:
     Attributes
     ----------
     config, map : str
-        Digests of the settings, and of the text of the road map; empty without one.
+        Digests of the settings and of the road map text; empty without a map.
     """
 
     config: str
@@ -109,7 +109,8 @@ def graph_digests(file: StoreFile, frames: Sequence[Ints]) -> list[str]:
     ----------
     file : StoreFile
     frames : sequence of int64
-        Groups of ids, ascending in each. Groups may come in any order: the store is read in its own, once.
+        Groups of frame ids, each ascending. Groups can be in any order; the store is read once, in its own
+        order.
     """
     digests = [""] * len(frames)
     order = sorted(range(len(frames)), key=lambda number: int(frames[number][0]))

@@ -1,6 +1,6 @@
 """Derived sets of relations, in addition to the relations computed at ingest.
 
-Stored states come out as the generator saw them, and what it makes of them under other settings goes in.
+The module returns the stored states as generator input, and stores the result of other settings.
 """
 
 from __future__ import annotations
@@ -96,11 +96,11 @@ class DerivedSet:
     trace : str
         Name of the trace.
     settings : dict
-        The config that it was made with.
+        Config of the set.
     digest : str
-        Of these.
+        Digest of the config.
     answers : tuple of str
-        Relations that it can answer.
+        Relations that the trace can answer.
     """
 
     name: str
@@ -126,8 +126,8 @@ class Deriving:
     def blocks(self, trace_id: int) -> Iterator[FrameBlock]:
         """Yield the frames of a trace with their stored states, at most two buckets at a time.
 
-        An entity is introduced when it is known for the first time, or before one that is: what the
-        generator did not know then, it does not know now.
+        An entity is introduced at its first known state, or before a later one with a known state. So the
+        generator has the same data as at ingest.
         """
         with self._access.reading() as connection:
             reader = _StateReader(connection, trace_id)
@@ -165,13 +165,13 @@ class Deriving:
         Parameters
         ----------
         whole : SceneGraph
-            The graph as it was ingested.
+            Graph from the ingest.
         name : str
 
         Raises
         ------
         AbstractionError
-            There is no such set of the trace.
+            The trace has no such set.
         """
         with self._access.reading() as connection:
             trace_id, _ = trace_named(connection, whole.trace)
@@ -294,7 +294,7 @@ class Building:
     def append_labelled(self, seq: Ints, seen: GraphColumns, graphs: Labelled) -> None:
         """Add the next abstracted frames. Nodes and edges that a store cannot hold are dropped.
 
-        These are nodes of the scene graph, and edges between them that are labelled with a relation.
+        Kept are nodes of the scene graph, and edges between them with a relation as label.
         """
         self._staging.settle(whole=True)
         rows = seen.row_of(graphs.node_frame, graphs.node)
@@ -346,7 +346,7 @@ class Building:
         Raises
         ------
         StoreError
-            The trace was removed meanwhile, or another process uses the store for too long.
+            The trace was removed in the meantime, or another process uses the store for too long.
         """
         self._staging.seal()
         with writing(self._access) as connection:

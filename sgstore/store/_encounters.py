@@ -1,9 +1,9 @@
 """Measures of later encounters: ``recorded('pet', trace_id, src, dst)`` in SQL, and a view of them.
 
-They need the tracks of two entities, so they are no expression of SQL. DuckDB calls our function for each row
-that the rest of a statement leaves; a pair is worked out once, and kept as long as the file stays as it is. The
-function belongs to an instance of the database, which may have several files; a macro of each connection says
-which one is meant. Both are there only for statements that name them.
+A measure needs the tracks of two entities, so SQL cannot express it. DuckDB calls a Python function for each
+remaining row. A pair is computed once, and cached until the file changes. The function belongs to a database
+instance, which can have several files; a macro of each connection selects the file. Both exist only for
+statements that name them.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class _MeasuredQuestion:
     Parameters
     ----------
     connection : DuckDBPyConnection
-        The one that asks; tracks are read by another one of the same instance.
+        Connection of the statement. Another connection of the same instance reads the tracks.
     known : _Known
     """
 
@@ -167,7 +167,7 @@ def recorded_measures(connection: DuckDBPyConnection, path: Path, sql: str) -> G
     connection : DuckDBPyConnection
     path : Path
     sql : str
-        The statement. For others :func:`show_recorded` is asked.
+        First statement. Call :func:`show_recorded` for further statements.
     """
     _paths[id(connection)] = path
     try:

@@ -1,6 +1,6 @@
 """A store: one DuckDB file, kept open for a short time after each query.
 
-What only writing or drawing needs is imported where it is used: a question is shorter than its imports.
+Imports for writing and drawing are local: they would take longer than a query.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def _damage(connection: DuckDBPyConnection, path: Path) -> str:
 class StoreFile:
     """Store, opened by its path.
 
-    Its file stays open for a second after a question, unless a writer waits for it.
+    The file stays open for a second after a query, unless a writer process waits.
 
     Parameters
     ----------
@@ -90,15 +90,15 @@ class StoreFile:
         Memory limit of one query; bytes. 0: 1 GiB, or a quarter of the machine's memory if less. Beyond it, the
         database writes temporary files.
     wait_s : float
-        How long to wait for others that write, or read while this one writes; s.
+        Longest wait for other processes; s.
     spill : int
-        Most that the temporary files of a question take; bytes. 0: 10 GB.
+        Limit of the temporary files of one query; bytes. 0: 10 GB.
     tables : UserTables, optional
-        Tables of users' own that are seen beside its views.
+        User tables, visible next to the views.
     root : str or Path, optional
-        Where the recordings of the data set are now; see :func:`sgstore.store._traces.located`.
+        New folder of the recordings; see :func:`sgstore.store._traces.located`.
     made : bool
-        Whether this process has just made it, so that it need not be opened to see that it is a store.
+        True if this process has just created the file. The store check is then skipped.
 
     Raises
     ------
@@ -145,7 +145,7 @@ class StoreFile:
         Raises
         ------
         StoreError
-            As for any store.
+            See :class:`StoreFile`.
         """
         file = cls(path, made=True)
         file.access.together = True
@@ -159,7 +159,7 @@ class StoreFile:
         Raises
         ------
         StoreError
-            What is there is no store, or one of another version; or its folder cannot be written.
+            The file is not a store, or has another version; or the folder is not writable.
         """
         path = Path(path)
         made = not path.exists()
@@ -185,16 +185,16 @@ class StoreFile:
         Parameters
         ----------
         sql : str
-            Trusted; users' statements go through :meth:`user_sql`.
+            Trusted SQL. For a user's statement, use :meth:`user_sql`.
         parameters : sequence or mapping, optional
             Values of ``?`` or of ``$name``.
         given : iterable of Given
-            Tables that it speaks of beside those of the store.
+            Temporary tables for the statement.
 
         Raises
         ------
         StoreError
-            The database refuses it.
+            The database rejects the statement.
         """
         with self._answered(lambda at, _: rows.run(at, sql, parameters), sql, given) as found:
             return found
@@ -209,7 +209,7 @@ class StoreFile:
     ) -> dict[str, NDArray[np.generic]]:
         """Run a trusted SQL statement, and return all columns as arrays. NULL values are masked.
 
-        ``plain``: none of them is an enumeration, so that the statement need not be planned to know that.
+        ``plain``: the result has no enumerations. This saves one planning of the statement.
         """
         ask = partial(rows.arrays, sql=sql, parameters=parameters, plain=plain)
         with self._answered(lambda at, _: ask(at), sql, given) as found:
@@ -264,14 +264,14 @@ class StoreFile:
         Parameters
         ----------
         sql : str
-            One statement that only reads. It sees the store and no files, and cannot change settings.
+            One read-only statement. It can read the store, but no files, and cannot change settings.
         timeout_s : float, optional
             Time limit; s.
         max_rows : int, optional
             Largest number of rows to return; ``Rows.truncated`` is true if there are more.
         given : function, optional
-            Says which tables it speaks of beside the views: statements of ours make them, from the store as it
-            is then.
+            Function that returns the temporary tables of the statement. Trusted statements create them from the
+            current store.
 
         Raises
         ------
@@ -430,7 +430,7 @@ class StoreFile:
         Parameters
         ----------
         ref : int or str
-            TRACE is what :meth:`trace` takes; the time is seconds since the trace began.
+            Frame. TRACE is as for :meth:`trace`; times are seconds since the trace start.
 
         Raises
         ------
@@ -594,7 +594,7 @@ class StoreFile:
         Parameters
         ----------
         ref : int or str
-            What :meth:`frame` takes.
+            Frame, as for :meth:`frame`.
         channel : str
             Topic.
 
@@ -616,19 +616,19 @@ class StoreFile:
         Parameters
         ----------
         ref, channel
-            As :meth:`payload` takes them.
+            See :meth:`payload`.
 
         Returns
         -------
         Media
-            A frame of H.264 or H.265 comes with the key frame that it needs and all between.
+            A frame of H.264 or H.265 includes its key frame and all frames between.
 
         Raises
         ------
         StoreError
             As :meth:`payload`.
         TraceError
-            As :meth:`payload`; or the recording lacks what a frame of a video needs to be decoded.
+            As :meth:`payload`; or the recording lacks the data to decode the video frame.
         """
         from sgstore.readers import read_carried
 
@@ -693,14 +693,15 @@ class StoreFile:
         Parameters
         ----------
         info, config, road_map
-            As :meth:`segment` takes them.
+            See :meth:`segment`.
         part : tuple
-            The part of it that is read: since and until; s.
+            Start and end of the part to read; s.
 
         Raises
         ------
         StoreError
-            It has another part of it, or with another config or map; or another trace has its id.
+            The store has another part of the recording, or used another config or map; or another trace has the
+            same id.
         """
         with self.access.reading() as connection:
             return already_stored(connection, Identity.of(info, config, road_map, part))
@@ -719,11 +720,11 @@ class StoreFile:
         ----------
         info : TraceInfo
         config : Config
-            What the graphs are made with.
+            Config of the graphs.
         road_map : RoadMap, optional
-            The map that they lie on.
+            Road map of the graphs.
         answers : tuple of str
-            Relations that they can hold.
+            Relations that the graphs can contain.
         """
         from sgstore.store._write import OnMap, Segment
 
@@ -737,7 +738,7 @@ class StoreFile:
         ----------
         sealed : Sealed
         replace : bool
-            Whether it takes the place of the trace with its id, under the same name.
+            True to replace the stored trace with the same id, under the same name.
 
         Returns
         -------
@@ -747,8 +748,8 @@ class StoreFile:
         Raises
         ------
         StoreError
-            The trace came into the store meanwhile, another process uses the store for too long, or the disk is
-            full.
+            The trace was added to the store in the meantime, another process uses the store for too long, or
+            the disk is full.
         """
         (found,) = self.publish_each([sealed], replace=replace)
         if isinstance(found, SgstoreError):
@@ -763,7 +764,7 @@ class StoreFile:
         Returns
         -------
         list of str or SgstoreError
-            The name of each trace in the store, or why it could not come in.
+            Stored name of each trace, or its error.
         """
         from sgstore.store._publish import publish_each
 
@@ -776,12 +777,12 @@ class StoreFile:
         ----------
         sealed : Sealed
         as_it_is : bool
-            Whether it must have been read in the same way.
+            True if the settings must be equal, too.
 
         Raises
         ------
         StoreError
-            As :meth:`stored`.
+            See :meth:`stored`.
         """
         found = already_stored if as_it_is else stored_name
         with self.access.reading() as connection:
@@ -810,7 +811,7 @@ class StoreFile:
         Raises
         ------
         StoreError
-            One of them is not there, or another process uses the store for too long.
+            A trace does not exist, or another process uses the store for too long.
         """
         from sgstore.store._publish import remove
         from sgstore.store._staging import scratch
@@ -844,7 +845,7 @@ class StoreFile:
         Parameters
         ----------
         recordings : bool
-            Whether the recordings are hashed again, too: each is read as a whole.
+            True to also read and hash all recordings.
         """
         from sgstore.store._verify import verify_store
 
@@ -853,7 +854,7 @@ class StoreFile:
     def settle(self) -> None:
         """Merge the log of a killed writer into the store file.
 
-        Nothing is done if there is nothing, or if another process uses the store for too long.
+        Without a log, or if another process uses the store for too long, nothing happens.
         """
         from sgstore.store._rebuild import settle
 
@@ -862,14 +863,14 @@ class StoreFile:
     def compact(self) -> None:
         """Rewrite the store with its large tables sorted across all traces, and replace the old file.
 
-        Traces come one behind the other, so that a scan for one relation looks into all of them; and what was
-        removed leaves holes. Answers are the same. It is worth its time after many traces have come or gone.
+        Ingest appends each trace, so a scan for one relation reads all traces, and removed traces leave holes.
+        The compacted store gives the same results. Compaction is worthwhile after many ingests or removals.
 
         Raises
         ------
         StoreError
-            Another process uses the store for too long, there is no room for a second one, or somebody else's
-            tables are in it, too: they would be lost.
+            Another process uses the store for too long, the disk lacks space for a second store, or the store
+            has user tables, which would be lost.
         """
         from sgstore.store._rebuild import compact
 
@@ -892,7 +893,7 @@ class StoreFile:
     ) -> Generator[T]:
         """Yield the result of a query while the store is open.
 
-        If the database fails by a fault of its own, the question is asked again. Its stack ends with it.
+        After an internal DuckDB fault, the query runs again. The exit stack of the query is closed at its end.
         """
         with ExitStack() as stack:
             while True:

@@ -1,6 +1,6 @@
 """Temporary tables with rows from outside the store, for the duration of one statement.
 
-They come a block at a time, and the database moves what does not fit into memory to temporary files.
+Rows come block by block. DuckDB moves data beyond the memory limit to temporary files.
 """
 
 from __future__ import annotations
@@ -26,11 +26,12 @@ class GivenTable:
     Attributes
     ----------
     name : str
-        What the statement calls it; like no table of the store.
+        Table name in the statement, different from all store tables.
     types : mapping of str to str
-        The type of each column in the database.
+        Database type of each column.
     blocks : function
-        The columns of some rows, in the same order, and of the next ones; from the first whenever it is called.
+        Function that returns blocks of columns, in the order of ``types``. Each call starts from the first
+        block.
     """
 
     name: str
@@ -87,7 +88,7 @@ _NUMBERS: Final[Mapping[str, tuple[str, object]]] = {
 def _arrays_of(block: Sequence[list[Any]], kinds: Sequence[str]) -> dict[str, Any] | None:
     """Return columns as arrays, which DuckDB reads ten times faster. ``None`` means unsuitable values.
 
-    NaN is one of these: it would become NULL.
+    NaN is unsuitable, because it would become NULL.
     """
     made: dict[str, Any] = {}
     for number, (values, kind) in enumerate(zip(block, kinds, strict=True)):

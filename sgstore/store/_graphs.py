@@ -133,7 +133,7 @@ _EDGES_TOGETHER: Final = 2_000_000
 class Graphs:
     """Reader of the graphs of a store in groups of frames: as columns, or one scene graph at a time.
 
-    The maps that were used last are remembered.
+    Recently used maps are cached.
     """
 
     def __init__(self) -> None:
@@ -169,8 +169,7 @@ class Graphs:
     ) -> Iterator[tuple[NDArray[np.int64], GraphColumns]]:
         """Yield graphs for ascending frame ids of any traces, with their indices in the input.
 
-        As many are read at once as have about two million edges; those on one map are one
-        :class:`GraphColumns`.
+        Frames with about two million edges are read at once. Frames on one map form one :class:`GraphColumns`.
         """
         first, many = 0, FIRST
         while first < len(frame_id):
@@ -189,7 +188,7 @@ class Graphs:
     ) -> tuple[list[tuple[NDArray[np.int64], GraphColumns]], int]:
         """Return graphs grouped by map, and the number of edges. Frames without a map form one group.
 
-        Of no frame there is a graph without frames, if it is said of which trace.
+        Without frames, the result is an empty graph if ``trace_id`` is given.
         """
         by_frame, by_mask = _asked(ids, (trace_id or 0) << SEQ_BITS)
         moving, own = (
@@ -234,8 +233,8 @@ class Graphs:
     ) -> Iterator[SceneGraph]:
         """Yield scene graphs of one trace for ascending frame ids, with all data of the public views.
 
-        Their columns are in memory together, and the records of one graph. ``known``: with all that is known
-        beyond them.
+        Memory holds the columns of all frames, and the records of one graph. ``known``: include the data
+        outside the graphs.
         """
         of = _of_known if known else str
         by_frame, by_mask = _asked(frame_id)
@@ -312,7 +311,7 @@ def _asked(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the SQL parameters for frame ids, and those for bucket masks.
 
-    ``otherwise``: the bounds where there is no frame.
+    ``otherwise``: bounds without any frame.
     """
     bucket, bit = frame_id >> FRAME_BITS, frame_id & ((1 << FRAME_BITS) - 1)
     starts, masks = bucket, bucket

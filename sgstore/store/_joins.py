@@ -1,13 +1,13 @@
 """User tables joined to the frames of a store: labels, outcomes, splits.
 
-A table comes as a file (Parquet, CSV, JSON) or as a data frame. It is read once, by a database of its own that
-sees nothing of the store, and kept as Parquet in a folder of this process. The store's readers may read files
-there and nowhere else, and each of them has the table as a view. So memory does not grow with its length.
+A table is a file (Parquet, CSV, JSON) or a data frame. A separate database reads it once and writes it as
+Parquet into a folder of this process. Store connections can read files only there, and see each table as a
+view. So memory does not grow with the length of a table.
 
-A row belongs to a frame by its ``frame_id``, or by ``trace`` and one of ``seq``, ``time_ns``, ``t`` (seconds
-since the trace began): by time, to the frame that is nearest, if it is no further than half a period of
-the trace. With nothing but ``trace`` it belongs to all frames of the trace. Such a table has the column
-``frame_id``, NULL where there is no such frame. A table without these columns is joined by whatever it has.
+Key columns of a row are ``frame_id``, or ``trace`` and one of ``seq``, ``time_ns``, ``t`` (seconds since the
+trace start). A time selects the nearest frame within half a period of the trace. ``trace`` alone selects all
+frames of the trace. The view of such a table has the column ``frame_id``, NULL for a missing frame. Join a
+table without key columns yourself, by any of its columns.
 """
 
 from __future__ import annotations
@@ -91,14 +91,14 @@ class UserTable:
     ----------
     name : str
     source : str
-        The file that it was read from, or the type of the data frame.
+        Source file, or type of the data frame.
     place : Path
-        Where it is kept.
+        Path of the Parquet copy.
     columns : mapping of str to str
-        Its columns, with their types in the database.
+        Column → database type.
     key : str
-        How its rows belong to frames: ``frame_id``, ``seq``, ``time_ns``, ``t``, ``trace`` (all frames of it);
-        empty: they do not.
+        Key of the join to frames: ``frame_id``, ``seq``, ``time_ns``, ``t``, ``trace`` (all frames of a trace);
+        empty: no key.
     """
 
     name: str
@@ -132,9 +132,9 @@ class JoinedTable:
     ----------
     rows : int
     matched : int
-        Rows that belong to a frame.
+        Rows with a frame.
     frames : int
-        Frames that have rows.
+        Frames with rows.
     """
 
     rows: int
@@ -148,12 +148,12 @@ class UserTables:
     Parameters
     ----------
     given : mapping of str to str, Path or data frame
-        Files, or what DuckDB takes for a table: of pandas, polars, pyarrow.
+        Files, or data frames of pandas, polars, pyarrow.
 
     Raises
     ------
     StoreError
-        A name is none, or a table cannot be read.
+        A name is invalid, or a table is not readable.
 
     Attributes
     ----------
@@ -184,7 +184,7 @@ class UserTables:
         Raises
         ------
         StoreError
-            A name is that of a table or view of the store.
+            The store has a table or view with the name of a user table.
         """
         for table in self.tables:
             taken = connection.execute(

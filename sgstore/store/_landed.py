@@ -22,14 +22,14 @@ def split_segment(sealed: Path, to: Path, of_map: Path) -> str:
     Parameters
     ----------
     sealed : Path
-        The folder of the segment.
+        Folder of the segment.
     to, of_map : Path
-        Folders that are there and empty: for the segment without its map, and for the map.
+        Existing empty folders for the segment without its map, and for the map.
 
     Raises
     ------
     StoreError
-        The segment cannot be read, or a file not be written.
+        The segment is not readable, or a file is not writable.
     """
     told = Sealed.read(sealed)
     tables = TableFile(sealed / FILE, sealed)
@@ -51,7 +51,7 @@ def whole_segment(segment: Path, of_map: Path | None, to: Path) -> Sealed:
     Raises
     ------
     StoreError
-        A file cannot be read or written, or is none of ours.
+        A file is not readable or writable, or is not a staging file.
     """
     told = Sealed.read(segment)
     fresh = TableFile(to / FILE, to, new=True)

@@ -1,16 +1,16 @@
 """Store files that stay open between queries and close when a writer waits.
 
-To open a file takes a hundred times as long as to ask a small question. So the instance of the database that
-reads a file is kept for a while after a question. It is closed
+Opening a file takes a hundred times as long as a small query. So the database instance of a file stays open for
+a while after a query. It closes
 
-* at once, if a writer waits: one of this process says so itself; one of another process closes the *gate*
-  beside the file (see :mod:`sgstore.store._locking`), and a thread of this process looks for it
-  every :data:`LOOK_S` seconds while an instance is kept;
-* :data:`LEASE_S` seconds after the last question, so that other programs can have the file, too; but not a
-  bundle of a collection (:class:`AttachedFile`), which nobody ever writes to;
-* with the last object that reads the file, at the end of the process, and before it is forked.
+* at once, if a writer waits. A writer of another process closes the *gate* file next to the store
+  (see :mod:`sgstore.store._locking`). A thread of this process checks it every :data:`LOOK_S` seconds
+  while an instance is idle;
+* :data:`LEASE_S` seconds after the last query, so that other programs can open the file. A bundle of a
+  collection (:class:`AttachedFile`) stays open, because it never changes;
+* with the last object that uses the file, at process exit, and before a fork.
 
-No answer comes from a file of before: an instance is used again only if the file is the same and as it was.
+Results are never outdated: an instance is reused only if the file is unchanged.
 """
 
 from __future__ import annotations
@@ -91,14 +91,14 @@ class AttachedFile:
     ----------
     path : Path
     connect : function
-        Makes that instance, given the folder that it may read.
+        Function that creates the instance for a readable folder.
     settings : tuple
-        Those that it has: instances with others are others.
+        Settings of the instance. Different settings need different instances.
 
     Attributes
     ----------
     name : str
-        Of the file in the instance.
+        Name of the file in the instance.
     """
 
     def __init__(
@@ -148,27 +148,27 @@ class OpenFile:
     Attributes
     ----------
     instance : DuckDBPyConnection, AttachedFile or None
-        The instance of the database that all readers share.
+        Database instance shared by all readers.
     opened : Stamp
-        The file that it was when it was opened.
+        Stamp of the file when it was opened.
     settings : tuple
-        The settings with which it was opened.
+        Settings of the open instance.
     folder : Path or None
-        The only folder beside it that may be read: that of users' tables.
+        The only other readable folder: the folder of user tables.
     checked : bool
-        Whether the instance has been found to be a store as ``schema.sql`` makes it.
+        True if the instance has passed the schema check.
     good : Stamp
-        The file that last was one.
+        Stamp of the last file that passed the check.
     spoiled : bool
-        Whether a question has failed in it: then it is not kept.
+        True after a failed query. The instance is then closed.
     readers, writing, waiting
-        How many readings are under way, whether somebody writes, and how many wait to write.
+        Number of current readings, True while a thread writes, number of waiting writers.
     careful : bool
-        Whether it is opened without whatever of DuckDB may be at fault.
+        True if suspect DuckDB features are disabled.
     cursors : list
-        The connections of the readings.
+        Connections of the readings.
     used : float
-        When the last reading ended, by the clock of :func:`time.monotonic`.
+        End of the last reading; :func:`time.monotonic`.
     holders : set
         Tokens of the objects that read or write the file.
     """

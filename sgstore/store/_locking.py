@@ -1,6 +1,6 @@
 """Shared access to the DuckDB file: locks, guards, recovery, and errors.
 
-What a store's file may be, and what a connection that writes to it may see.
+This module also defines valid store files, and the files that a writing connection can access.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ class Folder(HeldFolder):
     Raises
     ------
     StoreError
-        Nothing can be written there, or the store can have no such name.
+        The folder is not writable, or the store name is invalid.
     """
 
     def __init__(self, store: Path) -> None:
@@ -155,7 +155,7 @@ def refuse_odd_name(store: Path) -> None:
     Raises
     ------
     StoreError
-        It is not UTF-8, or has a zero byte in it.
+        The path is not UTF-8, or contains a null character.
     """
     try:
         if b"\0" not in str(store).encode():
@@ -240,12 +240,12 @@ _PAUSE: Final = 0.005, 0.1
 def without_faults(connection: DuckDBPyConnection) -> None:
     """Disable features that are faulty in some DuckDB versions.
 
-    * From 1.5.1 on its optimizer *common_subplan* takes two branches of a union for one though they read
-      different columns of the same joins: rows are wrong, and nothing is said (duckdb/duckdb#25819; 2.0, too).
+    * From 1.5.1 on its optimizer *common_subplan* merges two branches of a union that read
+      different columns of the same joins. Rows are wrong, without an error (duckdb/duckdb#25819; 2.0, too).
     * Before 2.0 its optimizer *compressed_materialization* loses a column of some joins of grouped relations
       ("Failed to bind column reference").
-    * In 2.0 operators that gather small chunks take the dictionary of one row group for that of another
-      ("dict-surviving cache"), in stores of some hundred traces. Without that, patterns are as fast.
+    * In 2.0 operators that collect small chunks confuse the dictionaries of row groups
+      ("dict-surviving cache"), in stores of some hundred traces. Patterns are equally fast without this cache.
     """
     old = duckdb.__version__.startswith("1.")
     off = ("common_subplan", "compressed_materialization")[: 1 + old]
@@ -318,28 +318,26 @@ class Access:
     ----------
     path : Path
     memory : int
-        Most memory that reading may take; bytes. 0: :func:`default_memory`. Beyond it DuckDB spills to files.
+        Memory limit of readings; bytes. 0: :func:`default_memory`. Beyond it, DuckDB writes temporary files.
     spill : int
-        Most that these take; bytes. 0: :data:`SPILL`.
+        Limit of the temporary files; bytes. 0: :data:`SPILL`.
     wait_s : float
-        How long to wait for others; s.
+        Longest wait for other processes; s.
     tables : UserTables, optional
-        Tables of users' own that readers see too.
+        User tables, visible to readers.
     checked : bool
-        Whether whatever is no store as ``schema.sql`` makes it is refused. To be left out only by who looks for
-        what is wrong with it, and reads nothing before.
+        True to reject files that do not match ``schema.sql``. Only a diagnosis of damaged stores sets False.
     diagnose : callable, optional
-        Returns what is wrong with the store, empty if nothing is. It is asked where our own code could make
-        nothing of what it read.
+        Function that returns the damage of the store, or an empty string. Called after an internal error on
+        stored data.
 
     Attributes
     ----------
     together : bool
-        Whether the file is attached to an instance of the database that this process has for all files of its
-        folder: that takes a quarter of the time. It is for statements of ours: one of a user's could read the
-        other files.
+        True if the file shares a database instance with all files of its folder. Opening is then four times
+        faster. Only for trusted statements: a user's statement could read the other files.
     root : str, Path or None
-        Where the recordings of the data set are now; see :func:`sgstore.store._traces.located`.
+        New folder of the recordings; see :func:`sgstore.store._traces.located`.
     """
 
     def __init__(
@@ -375,9 +373,9 @@ class Access:
         Parameters
         ----------
         public : bool
-            Whether names are looked for among the public views, not first among the tables.
+            True to resolve names as public views, not as internal tables.
         idle : bool
-            Whether nothing will be asked by the connection, which only keeps the file open.
+            True if the connection only keeps the file open.
 
         Raises
         ------
@@ -436,8 +434,8 @@ class Access:
         Returns
         -------
         bool
-            Whether a question may be asked again: not if other threads read the file, too, or if it was open
-            in this way already.
+            True if the query can run again. False if other threads read the file, or if these features were
+            already disabled.
         """
         file = self._file
         with file.changed:
@@ -577,8 +575,8 @@ class Access:
     def attached(self, connection: DuckDBPyConnection, *folders: Path) -> Generator[None]:
         """Attach the file as ``store`` to the caller's connection, with exclusive access.
 
-        From then on the connection sees no files but the store and what is in the folders that are named, and
-        its settings are locked.
+        From then on, the connection can access only the store and the named folders, and its settings are
+        locked.
         """
         with self._alone() as deadline, _closed_gate(self.path, deadline):
             with translated(self.path):
@@ -669,8 +667,8 @@ class HeldHereError(BusyError):
 def translated(path: Path) -> Generator[None]:
     """Convert DuckDB errors to errors of the store at ``path``, and interruptions to ``KeyboardInterrupt``.
 
-    DuckDB turns Ctrl-C into errors of its own: into a RuntimeError while a statement runs, and into one that
-    quotes the KeyboardInterrupt while it looks at our arrays.
+    DuckDB converts Ctrl-C: to a RuntimeError while a statement runs, and to an error that quotes
+    KeyboardInterrupt while it scans Python arrays.
     """
     try:
         yield

@@ -1,7 +1,7 @@
 """Partial results of a collection, from Parquet files or memory, as tables of one statement.
 
-The statement is ours (:mod:`sgstore.lang._parts`): it puts rows in order, or groups what the parts have
-grouped. What does not fit into memory spills to disk.
+The statement comes from :mod:`sgstore.lang._parts`: it sorts rows, or combines the groups of the parts. Data
+beyond the memory limit spill to disk.
 """
 
 from __future__ import annotations
@@ -64,12 +64,12 @@ class PartFile:
     Attributes
     ----------
     path : Path
-        There is no file if there are no rows, or if they are few.
+        File of the rows. It does not exist for no rows or few rows.
     columns, types : tuple of str
-        Of the rows; types as the database calls them.
+        Names and database types of the columns.
     rows : int
     few : list of tuple
-        The rows, if they are few and of types that are plain; else empty.
+        The rows if they are few and of plain types; else empty.
     """
 
     path: Path
@@ -117,11 +117,11 @@ def write_part(
     ----------
     file : StoreFile
     statement : (str, values)
-        The statement, and what it binds.
+        SQL statement and its parameter values.
     columns : sequence of str
-        What the columns of its rows are called.
+        Column names of the result.
     given : iterable
-        What is made before, as :meth:`StoreFile.batches` takes it.
+        Temporary tables, as for :meth:`StoreFile.batches`.
     to : Path
     """
     sql, values = statement
@@ -178,9 +178,9 @@ def write_classes(
     file : StoreFile
     abstraction : str
     traces : sequence of int
-        Ids; those that are elsewhere do not count.
+        Trace ids; ids outside this store are ignored.
     table : str
-        The name of the table; empty: of the traces.
+        Name of the user table; empty: use ``traces``.
     to : Path
     """
     of = "SELECT DISTINCT c.class FROM classes c"
@@ -221,10 +221,10 @@ def merged_parts(
     parts : mapping of str to sequence of PartFile
         See :data:`Parts`.
     words : mapping of str to sequence of str
-        Enumeration → the values that stores of the collection have beside those of ``schema.sql``.
+        Enumeration → values in the collection that ``schema.sql`` lacks.
     sql : str
     values : sequence
-        What it binds.
+        Parameter values.
     """
     with _tables(parts, words) as connection:
         yield Batches(connection, sql, _numbered(values))
@@ -242,11 +242,11 @@ def merged_file(
     Parameters
     ----------
     parts, words
-        As :func:`merged_parts` takes them.
+        See :func:`merged_parts`.
     statement : (str, values)
-        The statement, and what it binds.
+        SQL statement and its parameter values.
     columns : sequence of str
-        What the columns of its rows are called.
+        Column names of the result.
     to : Path
     """
     sql, values = statement

@@ -1,7 +1,6 @@
 """Conversion of graph blocks to columns of store tables: codes and masks.
 
-A mask holds the 60 frames of a bucket. An edge that holds in many of them is one row, and so is a static
-node that is present in many.
+A mask covers the 60 frames of a bucket. An edge in many of these frames is one row, and so is a static node.
 """
 
 from __future__ import annotations
@@ -117,14 +116,14 @@ def masks_of(keys: Sequence[Whole], bits: Whole) -> tuple[NDArray[np.intp], Ints
     Parameters
     ----------
     keys : sequence of (N,) int
-        Columns of the key, the most significant first.
+        Key columns, most significant first.
     bits : (N,) int
         0 … 59.
 
     Returns
     -------
     first : (M,) intp
-        A row for each distinct key, in ascending order of keys.
+        Index of one row per distinct key, in ascending key order.
     mask : (M,) int64
     """
     if not len(bits):
@@ -145,12 +144,12 @@ def packed(keys: Sequence[NDArray[Any]]) -> Ints | None:
     Parameters
     ----------
     keys : sequence of (N,) array
-        The most significant first; N is not 0.
+        Key columns, most significant first; N > 0.
 
     Returns
     -------
     (N,) int64 or None
-        ``None`` if it would be too large, or if a column is not of whole numbers.
+        ``None`` if the number is too large, or a column is not an integer.
     """
     if any(key.dtype.kind == "f" for key in keys):
         return None

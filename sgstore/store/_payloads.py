@@ -1,6 +1,6 @@
 """Sensor messages and events of frames.
 
-Which message of each channel belongs to a frame, and where it stands.
+The tables hold the message of each channel at a frame, and its file position.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Periods:
     times : dict
         Channel id → log times of its first messages, in pieces; ns. -1: the frames themselves.
     counts : dict
-        Channel id → how many these are.
+        Channel id → number of these messages.
     """
 
     times: dict[int, list[Ints]] = field(default_factory=dict[int, "list[Ints]"])
@@ -83,7 +83,7 @@ def joined(
     ----------
     frames : FrameTimes
     messages : callable
-        Gives all that were seen, some at a time.
+        Function that returns all messages in groups.
     """
     own = _own(frames, messages, [c.id for c in channels if c.role == "ground_truth"])
     rows_of = {
@@ -160,7 +160,7 @@ def _chosen(
 ) -> Columns:
     """Return for each frame the nearest message in log time (the earlier of two), or the latest message.
 
-    Of messages of one time the last one in the file counts.
+    Among messages of equal time, the last one in the file counts.
     """
     before = after = _none(len(frames.time))
     for some in messages:
@@ -259,7 +259,7 @@ class Happenings:
 
     Notes
     -----
-    An event that happened after all frames so far may belong to the next one, and waits for it.
+    An event after all frames so far can belong to the next frame, so it is held back.
     """
 
     def __init__(self, trace_id: int) -> None:

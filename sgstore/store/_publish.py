@@ -1,6 +1,6 @@
 """Publication and removal of traces, and additions to published traces, each in one transaction.
 
-From a sealed segment into the store, and out of it: what one transaction does.
+Each function is part of one transaction on the store.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class PresentError(StoreError):
     Attributes
     ----------
     name : str
-        Of the trace in the store.
+        Stored name of the trace.
     """
 
     def __init__(self, message: str, name: str) -> None:
@@ -155,7 +155,7 @@ def _publish_shared(
     Raises
     ------
     StoreError
-        The store has another one that has its number by chance.
+        The store has different data with the same id (a hash collision).
     """
     number, place = id_of(digest), f"store.inside.{owner}"
     sql = f"SELECT digest FROM {place} WHERE {owner}_id = ?"

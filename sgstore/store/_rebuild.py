@@ -1,10 +1,9 @@
 """Rebuild of a store: reads the content of an old store, and replaces its file.
 
-What is known of a store's traces, however old or altered it is: enough to make it anew.
+The reader works with old and altered stores, and returns enough data to rebuild them.
 
-Only the tables that say which recordings there are, and with which settings they were read, are looked at. They
-have not changed since version 2, but for that of recordings, which came with version 4. They must be tables,
-because a view could read anything.
+It reads only the tables of recordings and settings. These have not changed since schema version 2, except for
+table ``recording``, new in version 4. They must be tables, because a view could read anything.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ class OldTrace:
     Attributes
     ----------
     imported : dict or None
-        How it was imported, if it came as graphs of another tool.
+        Import settings, for imported graphs of another tool.
     """
 
     trace_id: int
@@ -101,14 +100,14 @@ class Remains:
     Attributes
     ----------
     traces : tuple of OldTrace
-        In the order in which they came.
+        Traces in ingest order.
     maps : dict
-        By their numbers.
+        Maps by id.
     sets : tuple of OldSet
     abstractions : tuple of str
-        Those whose classes were asked for later.
+        Abstractions whose classes were computed after ingest.
     others : tuple of str
-        Tables and views that are none of ours.
+        User tables and views.
     """
 
     traces: tuple[OldTrace, ...]
@@ -124,7 +123,7 @@ def remains_of(path: Path) -> Remains:
     Raises
     ------
     StoreError
-        It is no store, or what is needed of it cannot be read.
+        The file is not a store, or the needed tables are not readable.
     """
     access = Access(path, checked=False)
     with access.reading() as connection:
@@ -334,7 +333,7 @@ def write_empty(place: Path) -> None:
     Raises
     ------
     StoreError
-        It cannot be written.
+        The file is not writable.
     """
     try:
         if not _empty:
@@ -446,7 +445,7 @@ def take_place(fresh: Path, path: Path, old: Remains) -> None:
     Raises
     ------
     StoreError
-        Traces have come to the old one, or gone, since it was looked at.
+        The traces of the old store have changed in the meantime.
     """
     access = Access(path, checked=False)
     with scratch(spill_folder()) as connection, access.attached(connection):
@@ -463,8 +462,8 @@ def _replace(path: Path, fresh: Path) -> None:
     Raises
     ------
     StoreError
-        There is a log beside one of them: that of the old one would be taken for the new one's, or the new
-        one's be lost.
+        One of the files has a log. The log of the old file would apply to the new file, or the new log would be
+        lost.
     """
     for one in (path, fresh):
         if one.with_name(f"{one.name}.wal").exists():

@@ -152,13 +152,13 @@ class Tabular:
             gaps = store.find("MATCH (e:Ego), (v:Vehicle) RETURN v.kind AS kind, gap(e, v) AS metres")
             gaps.relation().filter("metres < 5").aggregate("kind, count(*) AS often").df()
 
-        The rows are asked for once and copied into a database of their own, in memory or, where that does not
-        suffice, on disk, as the table ``answer``; what is built on it is worked out when it is fetched.
+        The rows are queried once and copied into a new database as the table ``answer``, in memory or on disk.
+        Further relations are computed when they are fetched.
 
         Raises
         ------
         ExportError
-            There is no room for them.
+            Disk and memory are too small for the rows.
         """
         from sgstore.store._relation import relation_of
 
@@ -171,13 +171,13 @@ class Rows(Tabular):
     Attributes
     ----------
     columns : tuple of str
-        Their names.
+        Column names.
     types : tuple of str
-        Their types in the database: ``BIGINT``, ``VARCHAR``, ``ENUM('car', …)``, …
+        Database types: ``BIGINT``, ``VARCHAR``, ``ENUM('car', …)``, …
     truncated : bool
-        Whether there were more rows than asked for.
+        True if there were more rows than requested.
     reasons : mapping of str to str
-        Why traces are left out by a pattern in the statement, by name.
+        Reasons why a pattern in the statement skips traces, by trace name.
     """
 
     def __init__(
@@ -229,13 +229,13 @@ class LaterRows(Rows):
     Parameters
     ----------
     first : Rows
-        The first ones.
+        First rows.
     ask : callable
-        Gives all rows, which are kept.
+        Function that returns all rows; they are cached.
     table : callable
-        Gives them as Arrow: see :meth:`Tabular._table`.
+        Function that returns an Arrow table; see :meth:`Tabular._table`.
     parquet : callable
-        Writes them to a Parquet file; how many there are.
+        Function that writes a Parquet file, and returns the number of rows.
     """
 
     def __init__(
@@ -281,9 +281,9 @@ class Batches:
     Attributes
     ----------
     columns, types : tuple of str
-        As in :class:`Rows`.
+        See :class:`Rows`.
     shortened : bool
-        Whether numbers of 32 bits come as those of 64 bits that have the same shortest text.
+        True to return float32 values as the float64 with the shortest text.
     """
 
     def __init__(
@@ -327,8 +327,8 @@ class Batches:
 def table_of(connection: DuckDBPyConnection, sql: str, parameters: Parameters | None = None) -> Any:
     """Return all rows of a statement as a ``pyarrow.Table``. Enumeration values are texts.
 
-    ``None``, and nothing is searched, if a column holds anything but numbers, truth values and texts: of others
-    Arrow and Python have different notions.
+    ``None`` means that a column is not a number, truth value or text; the statement does not run. Arrow and
+    Python values of other types differ.
     """
 
     def step() -> Any:
@@ -359,11 +359,11 @@ def as_told(
     Parameters
     ----------
     tables : sequence of pyarrow.Table
-        At least one; all have the same columns.
+        At least one table; all with the same columns.
     columns : sequence of str, optional
-        What these are to be called.
+        New column names.
     most : int, optional
-        Rows that are taken, from the first.
+        Largest number of rows.
     """
     arrow = _package("pyarrow")
     table = arrow.concat_tables(tables).slice(0, most)
@@ -417,7 +417,7 @@ def user_statement(
 ) -> Generator[T]:
     """Run a user's SQL statement on a connection that can read only the store and its views.
 
-    ``ask`` begins it; what is read of it is read before this is left.
+    ``ask`` starts the statement. Read the result inside the block.
 
     Raises
     ------
@@ -529,7 +529,7 @@ def write_csv(columns: Sequence[str], rows: Iterable[Sequence[Any]], to: Path) -
     Returns
     -------
     int
-        How many rows were written.
+        Number of rows written.
 
     Raises
     ------
@@ -598,24 +598,24 @@ _TYPES: Final = ((bool, "BOOLEAN"), (int, "BIGINT"), ((int, float), "DOUBLE"))
 class ParquetTable:
     """Parquet file, written in blocks of rows. Use it as a context manager.
 
-    What the blocks add up to waits in a file of its own, not in memory. The same blocks are the same bytes.
+    Rows wait in a temporary file, not in memory. Equal blocks give equal bytes.
 
     Parameters
     ----------
     to : Path
-        The file; one that is there is replaced.
+        Output file; an existing file is replaced.
     columns : iterable of (str, str)
-        Names, and types as DuckDB has them: ``BIGINT``, ``VARCHAR``, ``ENUM('car', …)``.
+        Names and DuckDB types: ``BIGINT``, ``VARCHAR``, ``ENUM('car', …)``.
     enums : bool
-        Whether enumerations stay what they are. By default they become texts, because they would be
-        dictionaries, which not every reader of Parquet knows.
+        True to keep enumerations. By default they become texts, because not every Parquet reader supports
+        dictionaries.
     called : Path, optional
-        The file as errors call it; by default as it is.
+        File name in error messages; default ``to``.
 
     Attributes
     ----------
     rows : int
-        How many were written.
+        Number of rows written.
 
     Raises
     ------
@@ -665,7 +665,7 @@ class ParquetTable:
         Parameters
         ----------
         columns : mapping
-            Name → values, for every column of the table; masked, or ``None``, where one is missing.
+            Name → values, for every column. Missing values are masked or ``None``.
 
         Raises
         ------
@@ -724,16 +724,16 @@ def write_parquet(
     columns : sequence of str
         Distinct names.
     rows : iterable of sequences
-        Plain Python values, ``None`` where one is missing.
+        Plain Python values; ``None`` means missing.
     to : Path
     types : sequence of str, optional
-        DuckDB's types of the columns. By default the narrowest that holds the first 50,000 rows: truth
-        value, whole number, number, else text.
+        DuckDB's types of the columns. Default: the narrowest type of the first 50,000 rows: truth value,
+        integer, number, else text.
 
     Returns
     -------
     int
-        How many rows were written.
+        Number of rows written.
 
     Raises
     ------
@@ -758,7 +758,8 @@ def record_batches(
 ) -> ArrowStream | None:
     """Return the columns of a statement, and a stream of Arrow batches, one in memory at a time.
 
-    ``None``, and nothing is searched: pyarrow is not installed, or a column is not plain (:func:`table_of`).
+    ``None`` means that pyarrow is missing, or a column is not plain (:func:`table_of`); the statement does not
+    run.
     """
     try:
         _package("pyarrow")
@@ -841,7 +842,7 @@ def count_parquet(file: Path) -> tuple[int, tuple[str, ...]]:
     Raises
     ------
     ExportError
-        It cannot be read.
+        The file is not readable.
     """
     try:
         with duckdb.connect() as connection:
@@ -868,7 +869,7 @@ def give_to_user(
     Raises
     ------
     SqlError
-        They take too long, or too much memory.
+        The statements take too long, or too much memory.
     """
     if given is None:
         return

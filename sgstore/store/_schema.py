@@ -1,11 +1,11 @@
 """Check of a store's tables and views against ``schema.sql``. The store may be from an untrusted source.
 
-A file that a stranger sends may hold a view in the place of a table, a macro that is called like a function,
-a trigger. So before anything is read of a store, its catalogue is compared with the one that ``schema.sql``
-makes: tables, types and views by their text, whatever version of DuckDB wrote it. What is somebody else's,
-under a name of its own, is left alone, and nothing of ours reads it.
+An untrusted file may have a view instead of a table, a macro with the name of a function, or a trigger. So
+before the first read, the catalogue of a store is compared with ``schema.sql``: the text of tables, types and
+views, for any DuckDB version. User objects with other names are allowed, and never read.
 
-Nothing that a store says is trusted before: here are no functions and no names that it could define.
+Until then, the content of the store is not trusted: the check uses no functions and names that a store could
+define.
 """
 
 from __future__ import annotations
@@ -139,9 +139,9 @@ class Shape:
     Attributes
     ----------
     tables, types : dict
-        The statements, as words that do not depend on who wrote them down.
+        Statements as tokens, independent of the DuckDB version.
     views, inner : dict
-        The texts of the public views, and of those among the tables.
+        Texts of the public views, and of the internal views.
     """
 
     tables: dict[str, Tokens]
@@ -192,7 +192,7 @@ def check(connection: DuckDBPyConnection, database: str, path: Path) -> None:
     ----------
     connection : DuckDBPyConnection
     database : str
-        The name under which the connection has the file.
+        Database name of the file in the connection.
     path : Path
 
     Raises
@@ -221,7 +221,7 @@ def looked_at(connection: DuckDBPyConnection, path: Path) -> tuple[list[str], tu
     Raises
     ------
     StoreError
-        It is no store.
+        The file is not a store.
     """
     database = database_of(connection)
     objects = objects_of(connection, database)
@@ -299,7 +299,7 @@ def other_version(about: dict[str, str]) -> str:
 def altered(connection: DuckDBPyConnection, database: str) -> list[str]:
     """Return faults: tables, views and types that differ from ``schema.sql``, and objects that shadow them.
 
-    Kinds, relations and states of lights may have come to those of ``schema.sql``; they are made known here.
+    A store can have additional kinds, relations and light states. They are registered here.
     """
     return _altered(connection, database, objects_of(connection, database))
 

@@ -49,16 +49,15 @@ class SimilarFrames:
     Attributes
     ----------
     frame : FrameRef
-        The first one.
+        First frame.
     frames : int
         Number of frames.
     similarity : float
-        1 where all features are those of the example, 0 where none is; see
-        :mod:`sgstore.abstractions._features`.
+        From 0 (no common feature) to 1 (all features equal); see :mod:`sgstore.abstractions._features`.
     same : bool or None
-        Whether the graphs are isomorphic: of the same class. ``None``: so symmetric that it was given up.
+        True if the graphs are isomorphic, so of the same class. ``None`` means too symmetric.
     shared, missing, extra : dict of str to int
-        How often which features are there in both; in the example alone; in these frames alone.
+        Feature counts: in both; only in the example; only in these frames.
     """
 
     frame: FrameRef
@@ -94,12 +93,12 @@ class Example:
     Attributes
     ----------
     features : dict of str to int
-        How often which features are there; without what is ignored.
+        Feature counts, without ignored features.
     graph_class : str or None
-        Its class; ``None``: so symmetric that it was given up.
+        Class of the graph. ``None`` means too symmetric.
     trace_id : int
     beside : (int, int)
-        The first and the last frame around it, itself among them, by their numbers in its trace.
+        Numbers of the first and last frame near the example, in its trace.
     abstraction : str
     ignored : list of str
     """
@@ -123,11 +122,11 @@ def example_of(file: StoreFile, ref: int | str, name: str, ignored: Sequence[str
     ----------
     file : StoreFile
     ref : int or str
-        As :meth:`sgstore.store.StoreFile.frame` takes it.
+        Frame, as for :meth:`sgstore.store.StoreFile.frame`.
     name : str
-        The abstraction whose graphs are compared.
+        Abstraction of the compared graphs.
     ignored : sequence of str
-        Labels and relations that do not count; see :func:`sgstore.abstractions._features.without`.
+        Labels and relations to ignore; see :func:`sgstore.abstractions._features.without`.
 
     Raises
     ------
@@ -160,11 +159,11 @@ def frames_like(
     ----------
     file : StoreFile
     example : Example
-        A frame of this store, or of another one.
+        Frame of this or another store.
     limit : int
-        How many runs to give.
+        Largest number of runs.
     each_trace : bool
-        Whether only the best run of each trace counts, and frames beside the example do not.
+        True for only the best run of each trace, without frames near the example.
     """
     abstraction, graphs = abstraction_named(example.abstraction), Graphs()
     search = _RunSearch(example, max(limit, 0), each_trace=each_trace)

@@ -1,8 +1,7 @@
 """Staged tables of a trace: arrays in a file next to the store, until publication.
 
-The tables that grow with a trace are cut into parts of some ten thousand rows, each sorted as the store is and
-written behind the others, so that memory does not grow. In the end all tables are in one file, with a checksum
-of the rows of each.
+Large tables are cut into parts of some ten thousand rows. Each part is sorted in store order and appended to
+the file, so memory does not grow. In the end, one file has all tables, with a checksum of each.
 """
 
 from __future__ import annotations
@@ -66,10 +65,10 @@ class Piece(NamedTuple):
     table : str
     rows : int
     columns : dict
-        Column → its type and its place behind ``at``, or its value in all rows; what is added to each value;
-        of its texts how long each is, where they stand behind ``at``, and their bytes.
+        Column → description: type and offset from ``at``, or a constant value; an offset added to each value;
+        and the lengths, offset and size of its texts.
     at : int
-        Where the columns begin in the file.
+        File offset of the columns.
     """
 
     table: str
@@ -85,9 +84,9 @@ class TableFile:
     ----------
     path : Path
     store : Path
-        The store that it is meant for: that is what errors name.
+        Target store, named in errors.
     new : bool
-        Whether it is made, and written to.
+        True to create the file and write to it.
     """
 
     def __init__(self, path: Path, store: Path, *, new: bool = False) -> None:
@@ -177,7 +176,7 @@ class TableFile:
         Raises
         ------
         StoreError
-            They are not in the file, or cannot be read.
+            The columns are missing or not readable.
         """
         return {name: self.column(piece, name, first, end) for name in piece.columns}
 
@@ -302,7 +301,7 @@ _RUNS: Final = {
 class StagedRows(NamedTuple):
     """Rows of whole tables, written by a :class:`Staging`.
 
-    ``words``: enumeration → values in them that ``schema.sql`` has not.
+    ``words``: enumeration → values that ``schema.sql`` lacks.
     """
 
     pieces: bytes
@@ -316,16 +315,15 @@ class Staging:
     Parameters
     ----------
     store : Path
-        The store that they are meant for.
+        Target store.
     place : tuple, optional
-        The folder where the file is written, which the caller removes; and how many wait at a time, this one
-        included: those of several egos share the memory. By default a folder beside the store, removed with
-        this.
+        Folder of the file, removed by the caller; and the number of simultaneous stagings, which share the
+        memory. Default: a folder next to the store, removed at close.
 
     Attributes
     ----------
     checksums : dict
-        Table → checksum of its rows, as far as they are in the file; once sealed, of all.
+        Table → checksum of its rows in the file; after sealing, of all rows.
     """
 
     def __init__(self, store: Path, place: tuple[Path, int] | None = None) -> None:
@@ -418,8 +416,8 @@ class Staging:
         Parameters
         ----------
         whole : bool
-            Whether the rows so far end with a bucket. Only then they can become a part: the pieces of a mask
-            are merged within one.
+            True if the rows end with a whole bucket. Only then can they form a part, because masks are merged
+            within a part.
         """
         rows = sum(self._rows[table] for table in _GROWING)
         if whole and (rows >= PART_ROWS or any(self._runs.values())):
@@ -520,9 +518,9 @@ def scratch(spill: Path, *, memory: int = 0, threads: int = 1) -> DuckDBPyConnec
     Parameters
     ----------
     memory : int
-        Most memory that it takes; bytes. 0: :data:`MEMORY`.
+        Memory limit; bytes. 0: :data:`MEMORY`.
     threads : int
-        Each has buffers of its own.
+        Number of threads. Each has its own buffers.
     """
     config: dict[str, str | bool | int | float | list[str]] = {
         "memory_limit": memory_setting(memory or MEMORY),
@@ -550,16 +548,16 @@ class Sealed:
     Attributes
     ----------
     folder : Path
-        Where its :class:`TableFile` is.
+        Folder of its :class:`TableFile`.
     path : Path
         The recording.
     identity : Identity
     trace : dict
-        Its row in table ``trace``, but for what the store gives it.
+        Row of table ``trace``, without the values that the store assigns.
     checksums : dict
         Table → checksum of its rows.
     words : dict
-        Enumeration → values in it that are not those of ``schema.sql``, or may not be: a store takes them, too.
+        Enumeration → values that the store may have to add.
     """
 
     folder: Path
@@ -575,7 +573,7 @@ class Sealed:
         Raises
         ------
         StoreError
-            It cannot be written.
+            The file is not writable.
         """
         values = asdict(self) | {"folder": "", "path": str(self.path)}
         try:
@@ -590,7 +588,7 @@ class Sealed:
         Raises
         ------
         StoreError
-            There is nothing.
+            The folder has no sealed segment.
         """
         try:
             values = json.loads((folder / _SAID).read_text(encoding="utf-8"))

@@ -1,7 +1,7 @@
 """Entity states of frames as plain columns, for drawing in a viewer.
 
-Positions are those of the tables, about the origin of the trace, so that they fit into 32 bits; what is not
-known is NaN. Kinds and states of lights are numbers; :func:`kinds_of` gives their names.
+Positions are relative to the origin of the trace, so they fit into 32 bits. NaN means unknown. Kinds and light
+states are codes; :func:`kinds_of` returns their names.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def states_between(connection: DuckDBPyConnection, trace_id: int, first: int, la
     Raises
     ------
     StoreError
-        More than :data:`MOST_FRAMES` are asked for.
+        The range has more than :data:`MOST_FRAMES` frames.
     """
     if last - first >= MOST_FRAMES:
         raise StoreError(
@@ -113,7 +113,7 @@ def names_of_nodes(connection: DuckDBPyConnection, trace_id: int) -> dict[int, t
 def places(connection: DuckDBPyConnection) -> dict[str, tuple[float, float, str, list[str]]]:
     """Return for each trace its origin (m, in map axes), the digest of its map, and its camera topics.
 
-    Of all traces at once, because there may be thousands. Cameras are topics of pictures, by name.
+    One statement reads all traces, because there may be thousands. Cameras are the sorted topics of pictures.
     """
     rows = connection.execute(
         "SELECT t.name, t.origin_x, t.origin_y, coalesce(m.digest, ''), coalesce(c.topics, [])"
@@ -141,9 +141,9 @@ def series(
     Parameters
     ----------
     connection : DuckDBPyConnection
-        That sees the public views.
+        Connection with access to the public views.
     attribute : str
-        A column of numbers of the view ``nodes``; of ``pairs`` if there is another node.
+        Numeric column of the view ``nodes``; with ``other``, of ``pairs``.
     node, other
         Node ids.
 

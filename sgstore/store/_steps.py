@@ -1,9 +1,8 @@
 """Database calls that a signal interrupts at once.
 
-Python runs the handler of a signal only between its own steps and in the main thread, and DuckDB lets it do so
-only between its tasks, one of which may take minutes. So the main thread does no such step itself: it waits for
-a thread that does, which Python can interrupt at any time, and then interrupts the database, which heeds that
-within a task, too.
+Python runs signal handlers only in the main thread, between bytecodes. DuckDB allows this only between its
+tasks, and a task may take minutes. So another thread runs the call, and the main thread waits. A signal
+interrupts this wait at once. The main thread then interrupts the database, which also stops within a task.
 """
 
 from __future__ import annotations
@@ -33,18 +32,18 @@ def interruptible(connection: DuckDBPyConnection, step: Callable[[], T]) -> T:
     Parameters
     ----------
     connection : DuckDBPyConnection
-        The one that the step uses, and nobody else while it lasts.
+        Connection of the call. No other thread may use it meanwhile.
     step : callable
-        In another thread than the caller's, if that is the main thread: no other has handlers of signals.
+        Database call. If the caller is the main thread, it runs in another thread.
 
     Returns
     -------
-    Whatever the step returns.
+    Result of the call.
 
     Raises
     ------
     BaseException
-        What the step raises; or, once the step has ended, what a handler raised: ``KeyboardInterrupt`` after
+        Exception of the call; or, after its end, the exception of a signal handler: ``KeyboardInterrupt`` after
         Ctrl-C.
     """
     if threading.current_thread() is not threading.main_thread():
@@ -128,7 +127,7 @@ class _Task(Generic[T]):
 class _StepThread:
     """Thread that runs the database calls of the main thread, one after another.
 
-    It lasts, because to start one takes longer than a short question.
+    The thread is reused, because a thread start takes longer than a short query.
     """
 
     def __init__(self) -> None:

@@ -43,16 +43,16 @@ class Identity:
     trace_id : int
         39 bits of a digest of the recording and its ego.
     digest, ego : str
-        SHA-256 of the recording, and the simulator's id of the ego.
+        SHA-256 of the recording, and simulator id of the ego.
     settings : str
-        The config as JSON, without its egos: the trace has one.
+        Config as JSON, without its egos, because a trace has one ego.
     settings_digest : str
-        Of the settings, and of the mapping by which the recording is understood.
+        Digest of the settings and of the type mapping.
     payloads : Payloads
     map_digest, map_name : str
         Empty without a map.
     since, until : float or None
-        The part of the recording that is read; seconds since its first frame.
+        Part of the recording; seconds since its first frame.
     """
 
     trace_id: int
@@ -130,33 +130,32 @@ class StoredTrace:
     name : str
         Unique in its store.
     path : Path
-        The recording: where it was ingested, or beneath the root of the data set.
+        Path of the recording: its original path, or below the root of the data set.
     size, mtime_ns : int
-        Of the recording then.
+        Size and modification time of the recording at ingest.
     digest, flavour, ego : str
         As in :class:`sgstore.world.TraceInfo`.
     since, until : float or None
-        The part of the recording that was read, if not all of it; seconds since its first frame.
+        Part of the recording, if not all; seconds since its first frame.
     map : str
-        Name of its road map; empty without one.
+        Name of the road map; empty without a map.
     frames : int
     start_ns, end_ns : int
         Simulation time of the first and of the last frame; ns.
     period_ns : int
         Median difference of consecutive frames; ns.
     uneven : int
-        What it has that is no pair of bodies: bits of :data:`sgstore.pair_numbers.UNEVEN`.
+        Special pairs of bodies: bits of :data:`sgstore.pair_numbers.UNEVEN`.
     answers : tuple of str
-        Relations that it can answer.
+        Relations that the trace can answer.
     report : dict
-        What reading it brought to light: :class:`sgstore.world.TraceReport`, and what was counted of entities,
-        jumps of the clock and gaps.
+        Report of the ingest: :class:`sgstore.world.TraceReport`, and counts of entities, clock jumps and gaps.
     settings : dict
-        The config it was ingested with.
+        Config of the ingest.
     ingested_at : datetime
         UTC.
     version : str
-        Of sgstore then.
+        Version of sgstore at ingest.
     """
 
     trace_id: int
@@ -204,7 +203,7 @@ class FrameRef:
     time_ns, log_time_ns : int
         Simulation time, and log time of its leading message; ns.
     t : float
-        Since the trace began; s.
+        Time since the trace start; s.
     """
 
     frame_id: int
@@ -253,16 +252,16 @@ def located(
     Parameters
     ----------
     uri : str
-        Where it was ingested: ``/data/town/a.mcap``.
+        Path at ingest: ``/data/town/a.mcap``.
     place : str or None
-        The same from the folder of the store, if it was below it.
+        Path relative to the store's folder, if it was below it.
     size : int
-        Of the recording; another one of the same name is passed over.
+        Size of the recording. Files of the same name and another size are skipped.
     store : Path or None
-        The store; ``None``: nothing is looked for, it is where it was ingested.
+        Path of the store. ``None`` means no search; the path at ingest is returned.
     root : str or Path, optional
-        Where the data set is now; by default what :data:`ROOT` says. It may stand for any of the folders on the
-        way: ``ROOT/data/town/a.mcap``, ``ROOT/town/a.mcap`` and ``ROOT/a.mcap`` are looked at, in this order.
+        New folder of the data set; default :data:`ROOT`. It can replace any part of the old path:
+        ``ROOT/data/town/a.mcap``, ``ROOT/town/a.mcap`` and ``ROOT/a.mcap`` are tried in this order.
     """
     path = Path(uri)
     if store is None:
@@ -289,16 +288,16 @@ def scope_of(reports: Iterable[Mapping[str, Any]], *, world: bool | None) -> dic
     Parameters
     ----------
     reports : iterable of mapping
-        Reports of the traces that are asked.
+        Reports of the queried traces.
     world : bool or None
-        Whether all that is known is asked, and not the graphs alone; ``None``: no question is asked.
+        True for a query on all known data, False for a query on graphs. ``None`` means no query.
 
     Returns
     -------
     dict
-        ``scope`` (``graph`` or ``world``; not without a question), ``radius`` and ``world`` (m; ``None`` where
-        traces differ), ``states``, ``beyond_radius``, ``beyond_world`` and ``excluded`` (kind → states),
-        ``rate`` (Hz).
+        ``scope`` (``graph`` or ``world``; only with a query), ``radius`` and ``world`` (m; ``None`` if traces
+        differ), ``states``, ``beyond_radius``, ``beyond_world`` and ``excluded`` (kind → states), ``rate``
+        (Hz).
     """
     told = [one["scope"] for one in reports if "scope" in one]
     found: dict[str, Any] = {} if world is None else {"scope": "world" if world else "graph"}
@@ -364,7 +363,7 @@ def stored_name(
     Raises
     ------
     StoreError
-        It has another trace under its id.
+        The store has another trace with this id.
     """
     sql = (
         f"SELECT t.name, r.digest, coalesce(t.ego, '') FROM {catalog}trace t"
@@ -390,7 +389,7 @@ def already_stored(
     Raises
     ------
     StoreError
-        It has the trace with other settings or another map, or another trace under its id.
+        The store has the trace with other settings or another map, or another trace with this id.
     """
     name = stored_name(connection, identity, catalog=catalog)
     if name is None:
@@ -464,7 +463,7 @@ def frame_named(connection: DuckDBPyConnection, ref: int | str) -> FrameRef:
     Raises
     ------
     StoreError
-        There is no such frame, or the text is none of these.
+        The frame does not exist, or the text has another form.
     """
     text = str(ref).strip()
     if re.fullmatch(r"-?\d{1,19}", text):

@@ -1,6 +1,6 @@
 """Verification of a store: rows against checksums, masks, and references between rows.
 
-Reading a table also makes the database verify the checksums of its blocks.
+Reading a table also verifies DuckDB's block checksums.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ class Fault:
     Attributes
     ----------
     trace : str
-        Name of the trace; empty where it concerns no single one.
+        Name of the trace; empty for a fault of the whole store.
     check : str
         ``schema``, ``rows``, ``masks``, ``frames``, ``references``, ``map``, ``payloads``.
     detail : str
-        What is wrong.
+        Description of the fault.
     """
 
     trace: str
@@ -55,10 +55,10 @@ class Verification:
     Attributes
     ----------
     traces, rows, recordings : int
-        How many traces and rows were looked at, and how many recordings were hashed.
+        Numbers of verified traces and rows, and of hashed recordings.
     faults : list of Fault
     others : tuple of str
-        Tables and views in it that are none of ours; they are not looked at.
+        User tables and views; they are not verified.
     """
 
     traces: int = 0
@@ -267,13 +267,13 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
 def verify_file(path: str | Path, *, recordings: bool = False) -> Verification:
     """Verify a store file, even one that is too altered to open.
 
-    If its tables and views are not those that sgstore makes, that is all that is said: nothing is read of them.
+    If the schema was altered, only that fault is returned, and the tables are not read.
 
     Parameters
     ----------
     path : str or Path
     recordings : bool
-        As :meth:`StoreFile.verify` takes it.
+        See :meth:`StoreFile.verify`.
 
     Raises
     ------
@@ -307,12 +307,12 @@ def verify_store(access: Access, *, recordings: bool = False) -> Verification:
 def verify(connection: DuckDBPyConnection, path: Path) -> Verification:
     """Verify an open store.
 
-    What the database cannot read becomes a fault.
+    An unreadable table becomes a fault.
 
     Raises
     ------
     StoreError
-        What it says of its traces cannot be read.
+        The table of traces is not readable.
     """
 
     def attempt(check: Callable[[], Iterable[Fault]]) -> list[Fault]:

@@ -1,7 +1,6 @@
 """Writer of a trace: builds it outside the store, block by block, and publishes it in a short transaction.
 
-The store itself is touched only to publish: then a trace is in it, with everything that belongs to it, or not
-at all.
+Only the publication changes the store: it adds a complete trace, or nothing.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ class OnMap:
     Parameters
     ----------
     road_map : RoadMap or None
-        Also an attribute.
+        Road map; also an attribute.
     """
 
     def __init__(self, road_map: RoadMap | None) -> None:
@@ -74,21 +73,20 @@ class Segment:
     Parameters
     ----------
     store : Path
-        The store that it is meant for. It need not be there yet.
+        Target store. The file may not exist yet.
     info : TraceInfo
     identity : Identity
-        What the trace is in the store, and the settings it was read with.
+        Identity of the trace and its settings.
     on_map : OnMap
-        The map, with what other segments on it have made already.
+        Road map, with data shared by its segments.
     answers : tuple of str
         Relations that the generator can answer.
     place : tuple, optional
-        As :class:`Staging` takes it: where it is built. By default a folder beside the store, which goes with
-        it.
+        Folder of the segment; see :class:`Staging`. Default: a folder next to the store, removed at close.
 
     Notes
     -----
-    Use it as a context manager: what was not published when it is left is forgotten.
+    Use it as a context manager. Unpublished data are discarded at the end of the block.
     """
 
     def __init__(
@@ -140,8 +138,8 @@ class Segment:
     def as_kept(self, frames: FrameBlock) -> FrameBlock:
         """Return the next frames with values rounded as in the store.
 
-        Positions are kept as float32 about an origin, all else as float32. Graphs that are made of these
-        numbers can be made again from the store, to the last edge; so this comes before the generator.
+        Positions are float32 relative to an origin; other values are float32. The generator uses these rounded
+        values, so the store can reproduce its graphs exactly.
         """
         self._origin = self._origin or origin_of(frames)
         return quantize(frames, self._origin or Origin(0.0, 0.0, 0.0))
@@ -152,14 +150,14 @@ class Segment:
         Parameters
         ----------
         graph : GraphBlock
-            Made of what :meth:`as_kept` gave.
+            Graphs of the frames from :meth:`as_kept`.
 
         Raises
         ------
         StoreError
-            The trace is longer than a store can number, or the disk is full.
+            The trace is too long for the store, or the disk is full.
         ValueError
-            Frames are not consecutive, or nodes were not introduced: a defect of the caller.
+            Frames are not consecutive, or nodes were not introduced (an error of the caller).
         """
         frames = graph.frames
         if not len(frames):
@@ -185,7 +183,7 @@ class Segment:
         seq : (F,) int64
         graphs : list of str
         places, images : (F,) int64
-            Row or line where each begins, and how many frames of the source it stands for.
+            Row or line of each graph in the file, and number of source frames that it covers.
         """
         columns = {
             "bucket": packing.trace_bucket(self._identity.trace_id, seq),
@@ -205,7 +203,7 @@ class Segment:
         ----------
         seq : (F,) int64
         own : sequence of tuple
-            Row in ``seq``, node, relation (of an edge; -1: of the node) and the other end, name, value as JSON.
+            Row in ``seq``, node, relation (-1: node attribute), other node, name, and value as JSON.
         """
         if own:
             frame, src, relation, dst, name, value = zip(*own, strict=True)
@@ -232,16 +230,16 @@ class Segment:
         ----------
         report : TraceReport
         more : mapping, optional
-            What else the report in the store is to say, as plain values.
+            Additional values of the stored report.
         parked : sequence of (n,) int8
-            Whether each entity is parked, by the graphs and by all known rows: 1 or 0; -1: not known.
+            Parked state of each entity, from the graphs and from all known rows: 1 or 0; -1: unknown.
 
         Raises
         ------
         StoreError
             The disk is full.
         ValueError
-            There are no frames.
+            The segment has no frames.
         """
         if not self._next_seq:
             raise ValueError("a trace without frames")
