@@ -1,7 +1,7 @@
-"""The explorer: a page on one's own machine that shows what a store holds and what a query finds.
+"""Explorer: a local web page that shows the contents of a store and the matches of queries.
 
-A server of this process answers the page. What somebody typed is answered by a pool of sandboxes; what the page
-reads by trace and frame (states, pictures, graphs) is read here.
+A server in this process serves the page. A pool of sandboxes runs the queries of users. This
+process reads states, pictures and graphs by trace and frame.
 """
 
 import lazy_loader

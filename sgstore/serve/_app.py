@@ -1,4 +1,4 @@
-"""The application: what the page can ask, and who answers it."""
+"""Application: the endpoints of the page."""
 
 from __future__ import annotations
 
@@ -42,49 +42,49 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MOST_QUESTIONS: Final = 8
-"""Questions under way; one more is refused with 503."""
+"""Greatest number of running queries; further ones are rejected with 503."""
 
 TIMEOUT_S: Final = 60.0
-"""Longest time for a question that somebody typed; s."""
+"""Time limit of a query of a user; s."""
 
 LONGEST_S: Final = 86_400.0
-"""Longest time for a lock, an export, or a comparison of stores; s."""
+"""Time limit of a lock, an export, or a comparison of stores; s."""
 
 MOST_MATCHES: Final = 50_000
-"""Matches and rows of a question; the page says if there are more."""
+"""Greatest number of matches and rows of a query; the page shows that there are more."""
 
 WORKER: Final = "sgstore.serve._worker"
 FIRST: Final = {"ask": "rows", "text": "MATCH (e:Ego) RETURN e.id LIMIT 1", "parameters": {}}
-"""What each sandbox is asked first: the language, the catalogue and the database are loaded for it."""
+"""First query of each sandbox: loads the language, the catalogue and the database."""
 
 _NONCE: Final = "{{nonce}}"
 _SCRIPT: Final = "js/main.js"
 
 
 async def _lines(replies: Replies) -> AsyncGenerator[bytes]:
-    """Replies as lines of JSON, as they come."""
+    """Yield replies as lines of JSON on arrival."""
     async for reply in replies:
         yield as_json(reply) + b"\n"
 
 
 async def _last(replies: Replies) -> AsyncGenerator[bytes]:
-    """The last reply: the whole answer to a question that has one."""
+    """Yield the last reply: the complete result of a query with one result."""
     *_, last = [reply async for reply in replies]
     yield as_json(last)
 
 
 class _Answer(StreamingResponse):
-    """Answer that comes in parts; whatever ends it, the browser that has left, too, ends the question.
+    """Streamed response; its end, for any reason, cancels the query.
 
     Parameters
     ----------
     pool : function
-        Gives what answers: the sandboxes, or an errand; it may take its time.
+        Function that returns the sandboxes or an errand; it may be slow.
     question : mapping
     key : str
-        What it is cancelled by.
+        Key for cancelling.
     told : function
-        Makes the bytes that are sent of the replies.
+        Function that converts the replies to bytes.
     media_type : str
     """
 
@@ -110,7 +110,7 @@ class _Answer(StreamingResponse):
             self.end()
 
     def ask(self) -> None:
-        """Ask, in a thread of its own; an error is a reply."""
+        """Run the query in its own thread; an error becomes a reply."""
         tell = partial(self._loop.call_soon_threadsafe, self._found.put_nowait)
         try:
             self._asked = self._pool()
@@ -131,33 +131,33 @@ class _Answer(StreamingResponse):
             yield reply
 
     def end(self) -> None:
-        """Cancel it, if it is not answered yet."""
+        """Cancel the query if it still runs."""
         self._gone.set()  # it may not have begun
         if self._asked is not None:
             self._asked.cancel(self._key)
 
 
 class Explorer:
-    """State that the endpoints of one store share.
+    """Shared state of the endpoints of one store.
 
     Parameters
     ----------
     path : Path
-        Of the store.
+        Path of the store.
     other : Path, optional
-        A second store, to compare with.
+        A second store for comparison.
     write_to : Path, optional
-        Folder that locks and clips may be written below; without it nothing is written but tags.
+        Folder for locks and clips; without it only tags are written.
 
     Attributes
     ----------
     busy : set
-        Answers whose questions are under way.
+        Responses with running queries.
 
     Raises
     ------
     StoreError
-        There is no such store.
+        The store is missing.
     """
 
     def __init__(
@@ -177,18 +177,18 @@ class Explorer:
         self.busy = set[_Answer]()
 
     def warm(self) -> None:
-        """Read maps in a thread of its own, before somebody asks for them."""
+        """Read maps in a background thread before the first request."""
         for reads in self.reads.values():
             self._threads.submit(reads.warm, self._ended)
 
     def close(self) -> None:
-        """End the sandboxes, wait for what is read, and give the stores back."""
+        """Stop the sandboxes, wait for running reads, and close the stores."""
         self._ended.set()
         for answer in tuple(self.busy):
             answer.end()
         for pool in self._pools.values():
             pool.close()
-        # The process must not end while a thread is within the database.
+        # The process must not end while a thread is in the database.
         self._threads.shutdown(cancel_futures=True)
         self._folder.cleanup()
         for store in self.stores.values():
@@ -206,7 +206,7 @@ class Explorer:
         )
 
     def _tables(self) -> dict[str, Path]:
-        """The tags, as a table that queries can speak of."""
+        """Return the tags as a table for queries."""
         found = self.notes.read()
         if not found:
             return {}
@@ -215,7 +215,7 @@ class Explorer:
         return {"notes": table}
 
     def pool(self, side: str, text: str) -> SandboxPool:
-        """The sandboxes of a store; those that are asked for tags know all that were written."""
+        """Return the sandboxes of a store; a query about tags gets sandboxes with the current tags."""
         if side == "a" and "notes" in text.lower() and self._stamp != self.notes.stamp():
             self._stamp = self.notes.stamp()
             old, self._pools["a"] = self._pools["a"], self._pool("a")
@@ -223,18 +223,18 @@ class Explorer:
         return self._pools[side]
 
     def _side(self, fields: Mapping[str, Any]) -> str:
-        """Which of the stores is asked."""
+        """Return the requested store: ``a`` or ``b``."""
         return one_of(*self.stores)(fields.get("side"), "side")
 
     # What somebody typed -------------------------------------------------------------------------
 
     def _answer(self, pool: Callable[[], SandboxPool | Errand], *asked: Any) -> _Answer:
-        """The answer to a question that is asked from now on, in a thread.
+        """Start a query in a thread and return its response.
 
         Raises
         ------
         RequestError
-            There are too many questions under way.
+            Too many queries are running.
         """
         if len(self.busy) >= MOST_QUESTIONS:
             raise RequestError(f"{MOST_QUESTIONS} questions are under way; try again later", 503)
@@ -245,7 +245,7 @@ class Explorer:
         return answer
 
     async def find(self, request: Request) -> Response:
-        """Matches of a pattern, or rows of SQL: lines of JSON, as they come."""
+        """Stream matches of a pattern, or rows of SQL, as lines of JSON."""
         fields = await fields_of(request)
         question = taken(fields, "ask", "text", "parameters")
         if is_statement(question["text"]):
@@ -254,13 +254,13 @@ class Explorer:
         return self._answer(partial(self.pool, side, question["text"]), question, key)
 
     async def cancel(self, request: Request) -> Response:
-        """Stop a question."""
+        """Stop a query."""
         key = str(request.path_params["key"])
         done = any(pool.cancel(key) for pool in self._pools.values())
         return JSONResponse({"cancelled": done})
 
     async def one(self, request: Request, ask: str) -> Response:
-        """The whole answer to a question: lanes of truth, why not, verdicts. An error is an answer, too."""
+        """Return the complete result of a query (truth lanes, why not, verdicts) or its error."""
         fields = await fields_of(request)
         side = self._side(fields)
         question = {"ask": ask, **taken(fields, *_QUESTIONS[ask])}
@@ -273,18 +273,18 @@ class Explorer:
     # What the page reads by trace and frame --------------------------------------------------------
 
     async def threaded(self, ask: Callable[..., T], *arguments: Any) -> T:
-        """Answer of a function that takes its time."""
+        """Return the result of a slow function, run in a thread."""
         return await asyncio.get_running_loop().run_in_executor(self._threads, ask, *arguments)
 
     async def read(self, request: Request, name: str) -> Response:
-        """Something that is read of a store: columns as bytes, a picture, or plain values."""
+        """Read from a store: columns as bytes, a picture, or plain values."""
         fields = await fields_of(request)
         reads = self.reads[self._side(fields)]
         ask = partial(getattr(reads, name), **taken(fields, *READS[name]))
         return answered(await self.threaded(ask))
 
     async def about(self, _: Request) -> Response:
-        """The stores: their traces, and what the page may do."""
+        """Return the stores with their traces, and the permissions of the page."""
         sides = {side: await self.threaded(reads.about) for side, reads in self.reads.items()}
         writing = self.write_to is not None
         return JSONResponse({**sides["a"], "other": sides.get("b"), "writing": writing})
@@ -292,7 +292,7 @@ class Explorer:
     # Tags, measures, files ---------------------------------------------------------------------------
 
     async def tags(self, request: Request) -> Response:
-        """All tags; with POST one is written, or taken away."""
+        """Return all tags; POST adds or removes a tag."""
         fields = await fields_of(request)
         if request.method == "POST":
             told = taken(fields, "trace", "seq", "tag", "note", "do")
@@ -304,7 +304,7 @@ class Explorer:
         return JSONResponse({"notes": notes, "file": self.notes.path.name})
 
     async def work(self, request: Request, name: str) -> Response:
-        """A longer piece of work, as lines of JSON: what is done of it, then its result or an error."""
+        """Run a longer task; stream its progress as lines of JSON, then its result or error."""
         fields = await fields_of(request)
         question = {"ask": name, **taken(fields, *_WORK[name])}
         if "name" in question:
@@ -319,12 +319,12 @@ class Explorer:
         return self._answer(lambda: errand, question, "")
 
     def target(self, name: str) -> Path:
-        """A place below the folder that may be written to.
+        """Return a path in the writable folder.
 
         Raises
         ------
         RequestError
-            Nothing may be written, or the name is none of a file.
+            Writing is disabled, or the name is not a file name.
         """
         if self.write_to is None:
             raise RequestError("start 'sgstore serve' with --write-to DIR to write files", 403)
@@ -335,7 +335,7 @@ class Explorer:
 
 
 async def page_of(request: Request, script: str = "main.js") -> Response:
-    """A page, by its first script; its nonce is that of the policy of this answer."""
+    """Return a page by its first script, with the nonce of the response's policy."""
     text = (PAGE / "index.html").read_text(encoding="utf-8").replace(_SCRIPT, f"js/{script}")
     nonce = request.scope["state"]["nonce"]
     return Response(text.replace(_NONCE, nonce), media_type="text/html")
@@ -351,14 +351,14 @@ _WORK: Final[Mapping[str, tuple[str, ...]]] = {
     **dict.fromkeys(("lock", "export"), ("clips", "name", "format")),
     "diff": ("abstraction",),
 }
-"""The fields of a question, and of a longer piece of work, by its name."""
+"""Fields of each query and of each longer task, by name."""
 
 
 _METHODS: Final = {name: "POST" if "frames" in told else "GET" for name, told in READS.items()}
 
 
 def answered(found: Any) -> Response:
-    """Answer of columns as bytes, of a picture with its type, or of plain values."""
+    """Return a response with columns as bytes, a picture with its type, or plain values."""
     if isinstance(found, bytes):
         return Response(found, media_type="application/octet-stream")
     if isinstance(found, tuple):
@@ -368,16 +368,16 @@ def answered(found: Any) -> Response:
 
 
 def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: str) -> Guard:
-    """The ASGI application of a store, behind a token.
+    """Return the ASGI application of a store, behind a token.
 
     Parameters
     ----------
     explorer : Explorer
     token : str
     hosts : tuple of str
-        Hosts, with ports, under which it may be asked for.
+        Permitted hosts, with ports.
     cookie : str
-        Name of the cookie that holds the token.
+        Name of the cookie with the token.
     """
     table: list[tuple[str, Endpoint]] = [
         ("GET /", page_of),
@@ -400,7 +400,7 @@ def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: 
 
 
 class _PageFiles(StaticFiles):
-    """Modules, styles and licences of the page; a browser asks whether it has the latest."""
+    """Modules, styles and licences of the page; browsers must revalidate them."""
 
     def file_response(self, *args: Any, **kwargs: Any) -> Response:
         response = super().file_response(*args, **kwargs)
@@ -411,8 +411,8 @@ class _PageFiles(StaticFiles):
 def application_of(
     table: Iterable[tuple[str, Endpoint]], lifespan: Callable[[Any], Any] | None = None
 ) -> Starlette:
-    """An application of endpoints, each by its method and its path, and of the files of the page."""
-    mimetypes.add_type("text/javascript", ".js")  # some machines call it otherwise
+    """Return an application from endpoints (method and path) and the files of the page."""
+    mimetypes.add_type("text/javascript", ".js")  # some systems map it to another type
     pairs = ((*where.split(), endpoint) for where, endpoint in table)
     routes = [Route(path, endpoint, methods=[method]) for method, path, endpoint in pairs]
     files = Mount("/static", _PageFiles(directory=PAGE, follow_symlink=True))
@@ -421,7 +421,7 @@ def application_of(
 
 
 async def _refusal(_: Request, error: Any) -> Response:
-    """An error of ours as an answer, with its status."""
+    """Return an error of sgstore as a response with its status."""
     is_query = isinstance(error, QueryError | SqlError)
     usual = 404 if isinstance(error, StoreError) and not is_query else 422
     return JSONResponse(error.as_dict(), getattr(error, "status", usual))

@@ -1,10 +1,10 @@
-"""Guard of the server: the owner of a token may ask, from a page of this server, in a browser of no other code.
+"""Guard of the server: requires the token, and rejects requests from other sites.
 
-A page of somebody else's could send requests to this machine: by its name for it (DNS rebinding), as a form,
-as a picture. So the host, the origin and what the browser says of the request's site are compared before
-anything else, and everything but the first address needs a cookie that scripts cannot read. The host is one of
-the names of this machine that are known, or the very address that a connection came to: no name of somebody
-else's leads there.
+Pages of other sites can send requests to this machine: through a name for it (DNS rebinding), as a
+form, as a picture. Therefore the host, the origin and the browser's site header are checked first.
+Everything except the first address needs a cookie that scripts cannot read. The host must be a
+known name of this machine, or the address that the connection used; names of other owners do not
+match.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ POLICY: Final = (
     " style-src-attr 'unsafe-inline'; img-src 'self' blob: data:; connect-src 'self'; font-src 'self';"
     " base-uri 'none'; form-action 'none'; frame-ancestors 'none'; require-trusted-types-for 'script'"
 )
-"""What the page may load; the editor's styles have the nonce, and the browser itself writes some attributes."""
+"""Content policy of the page; the editor's styles have the nonce, and the browser itself writes
+some attributes."""
 
 _ALWAYS: Final = {
     "x-content-type-options": "nosniff",
@@ -36,14 +37,14 @@ _ALWAYS: Final = {
 
 
 class Guard:
-    """An application behind a token; see the module.
+    """Application behind a token; see the module.
 
     Parameters
     ----------
     app : ASGIApp
     token : str
     hosts : tuple of str
-        Hosts, with ports, under which it may be asked for.
+        Permitted hosts, with ports.
     cookie : str
         Name of the cookie.
     """
@@ -52,7 +53,7 @@ class Guard:
         self._app, self._token, self._hosts, self._cookie = app, token, hosts, cookie
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, or refuse it."""
+        """Forward or reject a request."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
@@ -71,7 +72,7 @@ class Guard:
         await (answer or self._app)(scope, receive, sent)
 
     def _refusal(self, scope: Scope) -> Response | None:
-        """Answer that refuses a request, or lets it in; ``None``: it may pass."""
+        """Return a response that rejects or logs in a request; ``None`` if it may pass."""
         asked = HTTPConnection(scope)
         headers = asked.headers
         host = headers.get("host", "")
@@ -101,7 +102,7 @@ class Guard:
 
 
 def host_of(name: str, port: int | None) -> str:
-    """A name, or an address, with a port, as a browser tells it."""
+    """Return a host name or address with a port, as browsers send it."""
     return f"[{name}]:{port}" if ":" in name else f"{name}:{port}"
 
 

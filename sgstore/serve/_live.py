@@ -1,8 +1,8 @@
-"""A monitor as a page: every frame as it comes, what checks and patterns become, and lanes of truth of a match.
+"""Live page of a monitor: frames on arrival, states of checks and patterns, and truth lanes of matches.
 
-The monitor tells a :class:`LiveRun` of each frame. It keeps the last ones, as they are sent, and of the last
-few seconds the graphs, so that the parts of a match can be looked at before and after it was found. Whoever
-reads too slowly misses frames, and nobody waits for him.
+The monitor passes each frame to a :class:`LiveRun`. It keeps the last frames as sent messages, and
+the graphs of the last few seconds, so that the page can show the parts of a match around its time.
+A slow reader misses frames; the monitor never waits.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ if TYPE_CHECKING:
     Things = Mapping[int, Mapping[str, Any]]
 
 MOST_FRAMES: Final = 3000
-"""Frames that are kept for whoever opens the page later, and at most so many bytes of them."""
+"""Greatest number of frames kept for pages that are opened later, and their greatest size in bytes."""
 MOST_BYTES: Final = 32 << 20
 
 MOST_NAMES: Final = 20_000
-"""Entities whose names are kept."""
+"""Greatest number of entities with kept names."""
 
 LOOK_S: Final = 0.02
-"""How often is looked for a new frame; s."""
+"""Polling interval for new frames; s."""
 
 _STATES: Final = {
     **dict.fromkeys(("x", "y", "heading", "speed", "length", "width"), np.float32),
@@ -72,19 +72,19 @@ ASKED: Final = {
     "POST /api/parts": ("parts", "text", "binding"),
     "POST /api/why": ("why", "text", "seq"),
 }
-"""Requests of the page: the method of :class:`LiveRun` that answers each, and the fields that it takes."""
+"""Requests of the page: the method of :class:`LiveRun` for each, and its fields."""
 
 
 class LiveRun:
-    """What a page that follows a monitor is sent.
+    """Messages for the page of a monitor.
 
     Parameters
     ----------
     name : str
-        Of the recording, or of the world.
+        Name of the recording, or of the world.
     road_map : RoadMap, optional
     cameras : Cameras, optional
-        They know the pictures of the frames.
+        Source of the pictures of frames.
     """
 
     def __init__(self, name: str, road_map: RoadMap | None, cameras: Cameras | None = None) -> None:
@@ -105,11 +105,11 @@ class LiveRun:
     # What the monitor tells ------------------------------------------------------------------------
 
     def follow(self, monitor: Monitor) -> None:
-        """Take the monitor that tells; before its first frame."""
+        """Set the monitor; call it before the first frame."""
         self._monitor = monitor
 
     def event(self, event: MonitorEvent) -> None:
-        """Take an event: it goes with its frame."""
+        """Add an event; it is sent with its frame."""
         told = {name: getattr(event, name) for name in _OF_EVENTS}
         told |= {"first": event.start.seq, "start": event.start.t}
         told |= {"last": event.end.seq, "end": event.end.t}
@@ -117,7 +117,7 @@ class LiveRun:
             self._events.append(finite(told))
 
     def step(self, here: FrameTime, graphs: Sequence[SceneGraph]) -> None:
-        """Take a frame with its graphs; of several egos the first one's is shown."""
+        """Add a frame with its graphs; of several egos the first one is shown."""
         graph, monitor = graphs[0], self._monitor
         with self._lock:
             if self._origin is None:
@@ -133,7 +133,7 @@ class LiveRun:
             self._recent.add(here, graph, self.name if monitor is None else monitor.trace)
 
     def end(self, verdicts: Sequence[Verdict]) -> None:
-        """Take the verdicts: there are no more frames."""
+        """Add the verdicts after the last frame."""
         with self._lock:
             listed = [[one.check, one.verdict, len(one.violations), one.reason] for one in verdicts]
             told = {"verdicts": listed, "events": self._events}
@@ -156,7 +156,7 @@ class LiveRun:
         return found
 
     def _new_still(self, things: Things) -> list[list[Any]]:
-        """What stands and was not there before: node, kind, x, y, heading, length, width."""
+        """Return new static entities: node, kind, x, y, heading, length, width."""
         x, y = self._origin or (0.0, 0.0)
         new = [n for n, about in things.items() if about["is_static"] and n not in self._still]
         for node in new:
@@ -170,7 +170,7 @@ class LiveRun:
     # What the page asks --------------------------------------------------------------------------------
 
     def about(self) -> dict[str, Any]:
-        """What the page is told first, as of a store with one trace."""
+        """Return the description for the page, like a store with one trace."""
         key, cameras = "live" * self._has_map, [] if self._cameras is None else self._cameras.topics
         trace = {"name": self.name, "frames": 0, "seconds": 0.0, "period": 0.0, "map": ""}
         trace |= {"map_key": key, "origin": self._origin or (0.0, 0.0), "cameras": [*cameras]}
@@ -183,16 +183,16 @@ class LiveRun:
         return {**told, "writing": False, "checks": checks, "patterns": patterns}
 
     def map(self) -> bytes:
-        """Outlines of the road map; without points where there is none."""
+        """Return the outlines of the road map; empty without a map."""
         return self._map
 
     def parts(self, text: str, binding: Mapping[str, int] | None) -> dict[str, Any]:
-        """Lanes of truth of a match, over the frames whose graphs are kept; they are followed on.
+        """Return the truth lanes of a match, over the frames with kept graphs; later frames continue them.
 
         Raises
         ------
         QueryNameError
-            There is no such pattern, or it has no such variable.
+            The pattern is unknown, or has no such variable.
         """
         query = self._query(text)
         with self._lock:
@@ -201,50 +201,50 @@ class LiveRun:
             return {**match.lanes(self.name, self._gone).as_dict(), "known": known}
 
     def series(self, attribute: str, node: int, other: int | None = None) -> bytes:
-        """An attribute over the frames whose graphs are kept, as the explorer gives it; it is followed on.
+        """Return an attribute over the frames with kept graphs, as the explorer; later frames continue it.
 
         Raises
         ------
         StoreError
-            There is no such number.
+            The attribute is unknown.
         """
         with self._lock:
             columns = self._recent.curve(attribute, node, other).columns()
         return packed({"trace": self.name, "attribute": attribute}, columns)
 
     def picture(self, seq: int, channel: str) -> tuple[bytes, str]:
-        """Picture of a camera at a frame, and its type; empty where there is none.
+        """Return the camera picture of a frame with its type; empty without a picture.
 
         Raises
         ------
         StoreError
-            There is no such camera.
+            The camera is unknown.
         ExportError
-            The message holds no picture that a browser shows.
+            The message has no picture that browsers can show.
         """
         if self._cameras is None or channel not in self._cameras.topics:
             raise StoreError(f"no camera {channel!r}")
         return shown_picture(self._cameras.at(seq, channel), channel)
 
     def frame(self, seq: int) -> dict[str, Any]:
-        """The scene graph of a frame, as the explorer gives it.
+        """Return the scene graph of a frame, in the form of the explorer.
 
         Raises
         ------
         StoreError
-            The graph of this frame is not kept.
+            The graph of this frame is no longer kept.
         """
         return told_graph(self._kept(seq).graph)
 
     def why(self, text: str, seq: int) -> dict[str, Any]:
-        """The first part of a pattern that fails in a frame, as the explorer tells it.
+        """Return the first part of a pattern that fails in a frame, in the form of the explorer.
 
         Raises
         ------
         QueryNameError
-            There is no such pattern.
+            The pattern is unknown.
         StoreError
-            The graph of this frame is not kept.
+            The graph of this frame is no longer kept.
         """
         return why_not(self._query(text), self._kept(seq)).as_dict()
 
@@ -259,19 +259,19 @@ class LiveRun:
             return self._recent.view(seq)
 
     def _hello(self) -> tuple[int, bytes]:
-        """The number of the first message that is kept, and what a page must know before it."""
+        """Return the number of the first kept message, and the initial message for a page."""
         with self._lock:
             told = {"about": self.about(), "names": self._names, "still": [*self._still.values()]}
             return self._gone, b"event: hello\ndata: " + as_json(told) + b"\n\n"
 
     def _since(self, number: int) -> tuple[int, list[bytes]]:
-        """Messages from a number on, as far as they are kept, and the number of the next."""
+        """Return the kept messages from a number on, and the number of the next message."""
         with self._lock:
             found = list(islice(self._sent, max(number - self._gone, 0), None))
             return self._gone + len(self._sent), found
 
     async def messages(self) -> AsyncIterator[bytes]:
-        """Server-sent events: all that is kept, then each frame as it comes."""
+        """Yield server-sent events: all kept messages, then each frame on arrival."""
         number, hello = self._hello()
         yield hello
         while True:
@@ -282,7 +282,7 @@ class LiveRun:
 
 
 def live_application(run: LiveRun, token: str, hosts: tuple[str, ...], cookie: str) -> Guard:
-    """The ASGI application of a monitor, behind a token; as :func:`sgstore.serve.application`."""
+    """Return the ASGI application of a monitor, behind a token; see :func:`sgstore.serve.application`."""
 
     async def ask(request: Request, name: str, fields: Sequence[str]) -> Response:
         told = taken(await fields_of(request), *fields)
@@ -300,7 +300,7 @@ def live_application(run: LiveRun, token: str, hosts: tuple[str, ...], cookie: s
 
 
 def _columns(things: Things, ego: int | None, origin: tuple[float, float]) -> dict[str, Any]:
-    """States of what moves, as the page draws them."""
+    """Return the states of moving entities as columns for the page."""
     moving = {node: about for node, about in things.items() if not about["is_static"]}
     columns = {name: [a.get(name, math.nan) for a in moving.values()] for name in _STATES}
     for name, place in zip("xy", origin, strict=True):
@@ -315,7 +315,7 @@ def _columns(things: Things, ego: int | None, origin: tuple[float, float]) -> di
 
 
 def _origin_of(graph: SceneGraph) -> tuple[float, float]:
-    """A place near which the others are, so that they fit into 32 bits."""
+    """Return an origin near the entities, so that coordinates fit into 32 bits."""
     places = [a for n, a in graph.nodes.items() if n >= 0]
     first = graph.nodes[graph.ego] if graph.ego is not None else next(iter(places), {})
     return float(round(first.get("x", 0.0))), float(round(first.get("y", 0.0)))

@@ -1,6 +1,6 @@
-"""Longer pieces of work of the page: coverage, ticked clips as a test set, two stores compared.
+"""Longer tasks of the page: coverage, marked clips as a test set, comparison of two stores.
 
-Each function is what a question of its name asks, and takes what is told with it.
+Each function implements the task of its name, with the fields as parameters.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     Clips = Sequence[tuple[str, int, int]]
 
 MOST_ROWS: Final = 2000
-"""Rows of a table that the page is sent; it says how many there are."""
+"""Greatest number of table rows that are sent; the total is sent too."""
 
 
 def coverage(store: Store, what: str, abstraction: str) -> dict[str, Any]:
-    """A table of coverage of a store: classes by rank, growth, or combinations of two features that lack.
+    """Return a coverage table of a store: classes by rank, growth, or missing pairs of features.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def coverage(store: Store, what: str, abstraction: str) -> dict[str, Any]:
 
 
 def select(store: Store, clips: Clips, abstraction: str) -> dict[str, Any]:
-    """Size of clips, and share of the store's classes that they keep.
+    """Return the size of clips, and the share of the store's classes that they keep.
 
     Returns
     -------
@@ -86,7 +86,7 @@ def lock(store: Store, clips: Clips, to: str, **_: str) -> dict[str, Any]:
 
 
 def export(store: Store, clips: Clips, to: str, format: str) -> dict[str, Any]:
-    """Write clips in a format of export."""
+    """Export clips in a format."""
     with store.file.snapshot():
         times = [(clip[0], store.file.log_times(*clip)) for clip in clips]
     cut = tuple(Clip(trace, int(log.min()), int(log.max())) for trace, log in times)
@@ -97,7 +97,7 @@ def export(store: Store, clips: Clips, to: str, format: str) -> dict[str, Any]:
 
 
 def diff(store: Store, other: str, abstraction: str) -> dict[str, Any]:
-    """Scenes and frames in which two stores differ."""
+    """Return the differing scenes and frames of two stores."""
     with Store(other) as second:
         a, b = (classed(ChosenFrames(s.file.path.name, s), abstraction) for s in (store, second))
         return {"result": {"scenes": _table(scenes(a, b)), "frames": _table(by_frame(a, b))}}
@@ -108,10 +108,12 @@ def _done(done: int, whole: int) -> None:
 
 
 def _frames(store: Store, clips: Clips) -> Iterator[tuple[tuple[str, int, int], Any, float]]:
-    """Clips that are apart, each with the ids of its frames and how many seconds it lasts."""
+    """Yield separate clips, each with the ids of its frames and its length in seconds."""
     traces = {one.name: one for one in store.traces()}
     for trace, first, last in _apart(clips):
-        of = traces.get(trace) or store.file.trace(trace)  # which says what there is
+        of = traces.get(trace) or store.file.trace(
+            trace
+        )  # raises an error that lists the known traces
         if last >= of.frames:
             raise StoreError(f"no frame #{last} in {trace!r}; it has #0 … #{of.frames - 1}")
         ids = frame_ids(of.trace_id, np.arange(first, last + 1))
@@ -119,7 +121,7 @@ def _frames(store: Store, clips: Clips) -> Iterator[tuple[tuple[str, int, int], 
 
 
 def _apart(clips: Clips) -> list[tuple[str, int, int]]:
-    """Clips by trace and time; those that overlap or touch are one."""
+    """Sort clips by trace and time, and merge overlapping or adjacent ones."""
     found: list[tuple[str, int, int]] = []
     for trace, first, last in sorted(clips):
         if found and found[-1][0] == trace and first <= found[-1][2] + 1:
@@ -130,6 +132,6 @@ def _apart(clips: Clips) -> list[tuple[str, int, int]]:
 
 
 def _table(of: ReportTable) -> dict[str, Any]:
-    """A table as the page shows it; it says how many rows there are."""
+    """Return a table for the page, with the total number of rows."""
     rows = finite(of.rows[:MOST_ROWS])
     return {"columns": of.columns, "rows": rows, "of": len(of.rows), "said": of.said}

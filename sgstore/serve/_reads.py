@@ -1,6 +1,6 @@
-"""Readings of a store by trace and frame: columns of states, maps, pictures, graphs, words.
+"""Reads of a store by trace and frame: columns of states, maps, pictures, graphs, words.
 
-What each of them is asked with stands in :data:`READS`.
+:data:`READS` has their fields.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MOST_THUMBS: Final = 400
-"""Frames whose states are sent for small pictures at once."""
+"""Greatest number of frames per request of thumbnails."""
 
 READS: Final[Mapping[str, tuple[str, ...]]] = {
     "words": (),
@@ -45,10 +45,10 @@ READS: Final[Mapping[str, tuple[str, ...]]] = {
     "series": ("trace", "attribute", "node", "other"),
     "thumbs": ("frames",),
 }
-"""Methods of :class:`Reads` that a page asks, each with the fields that it takes."""
+"""Methods of :class:`Reads` for the page, each with its fields."""
 
 _PICTURES: Final = "jpeg", "png", "webp", "bmp"
-"""Forms of pictures that a browser shows."""
+"""Picture formats that browsers can show."""
 
 
 class Reads:
@@ -67,7 +67,7 @@ class Reads:
 
     def _traces(self) -> tuple[dict[str, StoredTrace], dict[str, Any]]:
         """The traces by name, and what the page is told of the store; remembered while the file stays."""
-        with self._looking:  # after a change one looks, and the others wait for what it finds
+        with self._looking:  # after a change one thread reads, and the others wait
             catalog = self._store.catalog()
             if self._known is None or self._known[0] is not catalog:
                 with self._store.file.snapshot():
@@ -86,45 +86,45 @@ class Reads:
         return {"store": file.path.name, "traces": listed, "codes": file.codes()}
 
     def about(self) -> dict[str, Any]:
-        """The traces of the store, and the names of numbers in columns."""
+        """Return the traces of the store, and the names of codes in columns."""
         return self._traces()[1]
 
     def frame_id(self, trace: str, seq: int) -> int:
-        """Id of a frame.
+        """Return the id of a frame.
 
         Raises
         ------
         StoreError
-            There is no such trace or frame.
+            The trace or frame is unknown.
         """
         self._trace(trace)
         return self._store.file.frame(f"{trace}#{seq}").frame_id
 
     def _trace(self, name: str) -> StoredTrace:
-        """A trace by its whole name."""
+        """Return a trace by its full name."""
         return _among(self._traces()[0], name)
 
     # Columns -------------------------------------------------------------------------------------
 
     def thumbs(self, frames: Sequence[tuple[str, int]]) -> bytes:
-        """States in some frames, for small pictures."""
+        """Return states in some frames, for thumbnails."""
         if len(frames) > MOST_THUMBS:
             raise RequestError(f"frames: expected at most {MOST_THUMBS}")
-        traces = self._traces()[0]  # asked for once: the store may change all the time
+        traces = self._traces()[0]  # read once, because the store may change
         of = [(_among(traces, trace).trace_id, seq) for trace, seq in frames]
         return packed({}, self._store.file.states_at(of))
 
     def states(self, trace: str, first: int, last: int) -> bytes:
-        """States in a window of frames: ``frame.…`` of each frame, the others of each state."""
+        """Return states in a window of frames: ``frame.…`` columns per frame, the others per state."""
         frames, states = self._store.file.states(self._trace(trace).trace_id, first, last)
-        # Where the states of each frame begin, so that the page need not look for them.
+        # Start of the states of each frame, so that the page need not search.
         start = np.searchsorted(states.pop("seq"), [*frames["seq"].tolist(), 1 << 31])
         columns = {f"frame.{name}": column for name, column in frames.items()}
         columns["frame.start"] = start.astype(np.uint32)
         return packed({"trace": trace, "first": first, "last": last}, columns | states)
 
     def static(self, trace: str) -> bytes:
-        """Things that never move in a trace, and the names of all entities, as bytes."""
+        """Return static entities of a trace, and the names of all entities, as bytes."""
         of = self._trace(trace).trace_id
         with self._store.file.snapshot():
             names = self._store.file.entity_names(of)
@@ -132,16 +132,16 @@ class Reads:
         return packed({"trace": trace, "names": names}, columns)
 
     def map(self, trace: str) -> bytes:
-        """Outlines of the road map of a trace; without points where it has none."""
+        """Return the outlines of the road map of a trace; empty without a map."""
         key = _among(self._store.file.places(), trace)[2]
-        with self._reading:  # one map at a time: two who ask for one do not read it twice
+        with self._reading:  # one map at a time, so that it is not read twice
             if key not in self._maps:
                 found = self._store.file.road_map_text(trace)
                 self._maps[key] = drawn_map(None if found is None else read_map(found[1], found[0]))
             return self._maps[key]
 
     def warm(self, ended: threading.Event) -> None:
-        """Read the maps before they are asked for, until somebody has had enough."""
+        """Read the maps before the first request, until ``ended`` is set."""
         with suppress(SgstoreError):
             for trace in self._traces()[0]:
                 if ended.is_set():
@@ -149,32 +149,32 @@ class Reads:
                 self.map(trace)
 
     def series(self, trace: str, attribute: str, node: int, other: int | None) -> bytes:
-        """An attribute over time."""
+        """Return an attribute over time."""
         columns = self._store.file.series(self._trace(trace).trace_id, attribute, node, other)
         return packed({"trace": trace, "attribute": attribute}, columns)
 
     # Plain values, pictures --------------------------------------------------------------------------
 
     def frame(self, trace: str, seq: int) -> dict[str, Any]:
-        """The scene graph of a frame: all that is known of its nodes and edges."""
+        """Return the scene graph of a frame: all attributes of its nodes and edges."""
         return told_graph(self._store.file.graph(self.frame_id(trace, seq)))
 
     def picture(self, trace: str, seq: int, channel: str) -> tuple[bytes, str]:
-        """Picture of a camera at a frame, as it stands in the recording, and its type.
+        """Return the recorded camera picture of a frame, and its type.
 
         Raises
         ------
         ExportError
-            The message holds no picture that a browser shows.
+            The message has no picture that browsers can show.
         """
         return shown_picture(self._store.file.carried(self.frame_id(trace, seq), channel), channel)
 
     def words(self) -> dict[str, Any]:
-        """Words of the language, for completion."""
+        """Return the words of the language for completion."""
         return words(self._store.catalog())
 
     def library(self) -> list[dict[str, Any]]:
-        """Patterns that have names, with their drawings."""
+        """Return the named patterns with their drawings."""
         names = ("name", "kind", "text", "sentence", "library")
         return [
             {name: getattr(one, name) for name in names} | {"drawing": one.example}
@@ -183,14 +183,14 @@ class Reads:
 
 
 def _among(traces: Mapping[str, T], name: str) -> T:
-    """What is told of a trace, by its whole name."""
+    """Return the entry of a trace by its full name."""
     if name not in traces:
         raise StoreError(f"no trace {name!r} in the store")
     return traces[name]
 
 
 def shown_picture(media: Media | None, channel: str) -> tuple[bytes, str]:
-    """A picture as a browser shows it, and its type; empty where there is none."""
+    """Return a picture that browsers can show, with its type; empty without a picture."""
     if media is None:
         return b"", "application/octet-stream"
     if media.form not in _PICTURES:
@@ -199,7 +199,7 @@ def shown_picture(media: Media | None, channel: str) -> tuple[bytes, str]:
 
 
 def drawn_map(road_map: RoadMap | None) -> bytes:
-    """Outlines of a map; without points where there is none."""
+    """Return the outlines of a map; empty without a map."""
     if road_map is None:
         return packed({"origin": [0, 0], "words": []}, {})
     drawn = drawn_outlines(road_map)
@@ -209,7 +209,7 @@ def drawn_map(road_map: RoadMap | None) -> bytes:
 
 
 def told_graph(graph: SceneGraph) -> dict[str, Any]:
-    """All that is known of the nodes and edges of a scene graph, as JSON holds it."""
+    """Return all attributes of the nodes and edges of a scene graph, as JSON values."""
     nodes = [{"id": node, **about} for node, about in graph.nodes.items()]
     edges = [
         {"src": src, "relation": relation, "dst": dst, **about}

@@ -1,4 +1,4 @@
-"""Requests of the page as values: what is not as it should be is refused before a store is asked."""
+"""Validation of the page's requests, before a store is read."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ if TYPE_CHECKING:
     from starlette.requests import Request
 
 MOST_BODY: Final = 1 << 20
-"""Longest body; bytes."""
+"""Greatest length of a body; bytes."""
 
 MOST_TEXT: Final = 100_000
-"""Longest text in it; characters."""
+"""Greatest length of a text in it; characters."""
 
 MOST_ITEMS: Final = 10_000
-"""Longest list in it."""
+"""Greatest length of a list in it."""
 
 MOST_NUMBER: Final = 1 << 53
-"""Greatest whole number that a page can tell from others."""
+"""Greatest integer that is exact in browsers."""
 
 
 LEAST_NODE: Final = -(1 << 31)
@@ -32,13 +32,13 @@ LEAST_NODE: Final = -(1 << 31)
 
 
 class RequestError(SgstoreError):
-    """A request that is not as it should be.
+    """Invalid request.
 
     Parameters
     ----------
     reason : str
     status : int
-        Of HTTP.
+        HTTP status.
     """
 
     def __init__(self, reason: str, status: int = 400) -> None:
@@ -48,12 +48,12 @@ class RequestError(SgstoreError):
 
 
 async def fields_of(request: Request) -> dict[str, Any]:
-    """The fields of a body of JSON; of a GET those of the address.
+    """Return the fields of a JSON body; for GET those of the address.
 
     Raises
     ------
     RequestError
-        The body is too long, or no object of JSON.
+        The body is too long, or not a JSON object.
     """
     if request.method in {"GET", "DELETE"}:
         return dict(request.query_params)
@@ -74,12 +74,12 @@ async def fields_of(request: Request) -> dict[str, Any]:
 
 
 def taken(fields: Mapping[str, Any], *names: str) -> dict[str, Any]:
-    """Values by name, each as :data:`FIELDS` says; what is not told is as in :data:`USUAL`."""
+    """Return validated values by name (:data:`FIELDS`), with defaults from :data:`USUAL`."""
     return {name: FIELDS[name](fields.get(name, USUAL.get(name)), name) for name in names}
 
 
 def one_of(*words: str) -> Callable[[object, str], str]:
-    """A field that is one of some words; the first, where it is not told."""
+    """Return the validator of a field with fixed words; the first is the default."""
 
     def read(value: object, name: str) -> str:
         if value not in (None, *words):
@@ -100,7 +100,7 @@ def _text(value: object, name: str) -> str:
 
 
 def _parameters(value: Any, _: str) -> dict[str, Any]:
-    """Values of ``$name``: numbers, texts, truth values, lists of these."""
+    """Validate values of ``$name``: numbers, texts, truth values, lists of these."""
     found = value or {}
     if not isinstance(found, dict) or len(found) > 100:
         raise RequestError("parameters: expected an object")
@@ -112,7 +112,7 @@ def _parameters(value: Any, _: str) -> dict[str, Any]:
 
 
 def _binding(value: Any, _: str) -> dict[str, int] | None:
-    """Node ids by variable; ``None`` where none are told."""
+    """Validate node ids by variable; ``None`` if the field is missing."""
     if value is None:
         return None
     if not isinstance(value, dict) or len(value) > 1000:
@@ -121,7 +121,7 @@ def _binding(value: Any, _: str) -> dict[str, int] | None:
 
 
 def _spans(rows: object, name: str, width: int) -> list[tuple[Any, ...]]:
-    """Lists of a trace and numbers of frames."""
+    """Validate lists of a trace and frame numbers."""
     if not isinstance(rows, list) or len(rows) > MOST_ITEMS:
         raise RequestError(f"{name}: expected a list of at most {MOST_ITEMS}")
     for row in rows:
@@ -131,7 +131,7 @@ def _spans(rows: object, name: str, width: int) -> list[tuple[Any, ...]]:
 
 
 def _clips(value: object, name: str) -> list[tuple[Any, ...]]:
-    """Clips as trace, first and last number."""
+    """Validate clips: trace, first and last number."""
     found = _spans(value, name, 3)
     if any(first > last for _, first, last in found):
         raise RequestError("clips: one ends before it begins")
@@ -160,13 +160,13 @@ def _refuse_constant(word: str) -> float:
 _node: Final = partial(_whole, least=LEAST_NODE)
 
 USUAL: Final = {"abstraction": "RSV", "format": "mcap", "id": "", "note": ""}
-"""What fields are that are not told."""
+"""Default values of fields."""
 
 FIELDS: Final[Mapping[str, Callable[[Any, str], Any]]] = {
     **dict.fromkeys(("text", "trace", "channel", "attribute", "name", "tag", "note", "id"), _text),
     **dict.fromkeys(("abstraction", "format"), _text),
     **dict.fromkeys(("seq", "first", "last"), _whole),
-    "node": _node,  # those of the map are negative
+    "node": _node,  # map nodes are negative
     "other": lambda value, name: None if value is None else _node(value, name),
     "ask": one_of("matches", "rows"),
     "what": one_of("classes", "growth", "combos"),
@@ -176,4 +176,4 @@ FIELDS: Final[Mapping[str, Callable[[Any, str], Any]]] = {
     "clips": _clips,
     "frames": partial(_spans, width=2),
 }
-"""What each field of a request is, whatever is asked."""
+"""Validator of each field of a request."""

@@ -1,4 +1,4 @@
-"""The server as a program: an address with a token, and an end by Ctrl-C."""
+"""Server program: an address with a token, ended by Ctrl-C."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 HOST: Final = "127.0.0.1"
 EVERYWHERE: Final = {"0.0.0.0", "::", ""}  # noqa: S104 - only where somebody asks for it
-"""Addresses that stand for all of this machine's; then it is called by its names, too."""
+"""Addresses for all interfaces of this machine; then its names are permitted hosts, too."""
 
 
 def serve(
@@ -49,25 +49,25 @@ def serve(
     ----------
     store : Path
     host : str
-        Address to listen on. Others than this machine's see whatever the token lets them see. ``0.0.0.0`` are
-        all of this machine's: it answers to each of them, and to the name of the machine.
+        Address to listen on. Other machines can connect if it is not local; the token protects the
+        page. ``0.0.0.0`` means all addresses of this machine, and its names.
     port : int
-        0: any that is free.
+        0 means any free port.
     other : Path, optional
-        A second store to compare with.
+        A second store for comparison.
     write_to : Path, optional
-        Folder for locks and clips; without it the page writes no files but tags.
+        Folder for locks and clips; without it the page writes only tags.
     browse : bool
-        Whether the address is opened in a browser.
+        True to open the address in a browser.
     on_start : function
-        Told the address, with its token.
+        Called with the address and its token.
 
     Raises
     ------
     StoreError
-        There is no such store.
+        The store is missing.
     ConfigError
-        The address cannot be listened on.
+        The server cannot listen on the address.
     """
     with closing(Explorer(store, other=other, write_to=write_to)) as explorer:
         explorer.warm()
@@ -86,18 +86,18 @@ def serve(
 def serve_live(
     run: LiveRun, *, port: int = 0, browse: bool = False, on_start: Callable[[str], None] = print
 ) -> Generator[None]:
-    """Serve the page of a monitor beside it, on this machine alone; at the end of the block it is gone.
+    """Serve the page of a monitor on this machine until the end of the block.
 
     Parameters
     ----------
     run : LiveRun
     port, browse, on_start
-        As :func:`serve` takes them.
+        As in :func:`serve`.
 
     Raises
     ------
     ConfigError
-        The address cannot be listened on.
+        The server cannot listen on the address.
     """
     make = partial(live_application, run)
     with _begun(make, HOST, port, (on_start, webbrowser.open)[: 1 + browse]) as (server, listening):
@@ -117,7 +117,7 @@ def _begun(
     port: int,
     told: Iterable[Callable[[str], object]],
 ) -> Generator[tuple[uvicorn.Server, socket.socket]]:
-    """A server of an application, and the socket that it is to listen on; its address is told."""
+    """Yield a server of an application and its socket, and report its address."""
     with _listening(host, port) as listening:
         number = listening.getsockname()[1]
         token = secrets.token_urlsafe(24)
@@ -128,8 +128,8 @@ def _begun(
             log_level="warning",
             access_log=False,
             server_header=False,
-            lifespan="on",  # at its end the explorer is closed
-            timeout_graceful_shutdown=1,  # a question under way does not keep the server
+            lifespan="on",  # the explorer is closed at the end
+            timeout_graceful_shutdown=1,  # a running query does not block the shutdown
         )
         address = f"http://{hosts[0]}/?token={token}"
         for tell in told:
@@ -139,12 +139,13 @@ def _begun(
 
 def _listening(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # With its protocol, or asyncio leaves out TCP_NODELAY, and each answer waits 40 ms for the one before it.
+    # With its protocol; otherwise asyncio omits TCP_NODELAY, and each response waits 40 ms for the
+    # previous one.
     found = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         found.bind((host, port))
-        found.listen()  # who has the address waits in line until the server has begun
+        found.listen()  # early connections wait until the server has started
     except OSError as error:
         found.close()
         raise ConfigError(f"{host}:{port} cannot be listened on: {error.strerror}") from error

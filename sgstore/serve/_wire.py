@@ -1,4 +1,4 @@
-"""Columns as bytes, for a page that makes typed arrays of them without copying; and JSON as browsers read it.
+"""Binary columns, which the page uses as typed arrays without copying; and JSON for browsers.
 
 ``u32 length of the header, u32 0``, the header as JSON padded to 8 bytes, then each column, little-endian,
 padded to 8 bytes. The header names the columns with their types and lengths under ``columns``.
@@ -25,12 +25,12 @@ PAGE: Final = Path(__file__).parent / "page"
 
 
 def packed(header: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]) -> bytes:
-    """A header and columns as bytes.
+    """Pack a header and columns into bytes.
 
     Parameters
     ----------
     header : mapping
-        As JSON can hold it.
+        JSON values.
     columns : mapping of str to array
         Numbers, one dimension each.
     """
@@ -48,5 +48,5 @@ def _padding(data: bytes) -> bytes:
 
 
 def as_json(value: object) -> bytes:
-    """A value as browsers read it: a number that JSON has no word for is a text, as ``inf``."""
+    """Return a value as JSON for browsers; infinite numbers become texts, such as ``inf``."""
     return json_text(value, str).encode(errors="replace")

@@ -1,7 +1,7 @@
-"""Questions of the explorer's page, answered in the process of a sandbox.
+"""Queries of the explorer's page, run in a sandbox process.
 
-A question has ``ask``, one of :data:`QUESTIONS`, and what that needs: ``text``, ``parameters``, ``frame``, ….
-Replies come as they are found; one with ``more`` is followed by others.
+A query has ``ask``, a key of :data:`QUESTIONS`, and its parameters: ``text``, ``parameters``,
+``frame``, …. Replies are sent when they are ready; a reply with ``more`` is followed by others.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ Reply = dict[str, Any]
 Asked = Callable[[Store, dict[str, Any], int], Iterator[Reply]]
 
 BATCH_S: Final = 0.1
-"""How long matches wait for others, to be sent together; s."""
+"""Time to collect matches for one message; s."""
 
 BATCH_ROWS: Final = 500
-"""Matches that are sent together."""
+"""Greatest number of matches per message."""
 
 
 def _told_matches(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
-    """Intervals with their bindings, in batches; before them, what the pattern binds and who cannot answer."""
+    """Yield the columns and the traces that cannot answer, then intervals with bindings in batches."""
     with store.file.snapshot():
         matches = store.find(question["text"], **question["parameters"])
         names, found = tuple[str, ...](), list[list[Any]]()
@@ -38,7 +38,7 @@ def _told_matches(store: Store, question: dict[str, Any], most: int) -> Iterator
             many += 1
             if many > most:
                 break
-            if names != tuple(interval.values):  # each part of a union binds nodes of its own
+            if names != tuple(interval.values):  # each part of a union has its own variables
                 if found:
                     yield {"more": True, "matches": found}
                 names, found = tuple(interval.values), []
@@ -53,22 +53,22 @@ def _told_matches(store: Store, question: dict[str, Any], most: int) -> Iterator
 
 
 def _told_rows(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
-    """Rows of a pattern or of a statement of SQL, as JSON holds them."""
+    """Yield rows of a pattern or of an SQL statement, as JSON values."""
     key = "sql" if question["ask"] == "sql" else "find"
     told = rows_found(store, {key: question["text"], "parameters": question["parameters"]}, most)
-    for row in told["rows"]:  # identifiers of frames are larger than numbers of a page are exact
+    for row in told["rows"]:  # frame ids exceed the exact integers of a browser
         row[:] = [str(v) if isinstance(v, int) and abs(v) > 2**53 else v for v in row]
     yield told
 
 
 def _told_parts(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
-    """Lanes of truth."""
+    """Yield truth lanes."""
     text, values, binding = question["text"], question["parameters"], question["binding"]
     yield store.parts(text, question["frame"], binding, **values).as_dict()
 
 
 def _told_why(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
-    """The first part that fails in a frame, and numbers that would let it hold."""
+    """Yield the first part that fails in a frame, and parameter values that would match."""
     text, values, frame = question["text"], question["parameters"], question["frame"]
     answer = store.why_not(frame, text, **values)
     steps = answer.steps if isinstance(answer, WhyNotSteps) else (answer,)
@@ -88,7 +88,7 @@ def _told_why(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]
 
 
 def _told_check(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
-    """Verdicts of checks, each trace with its violations."""
+    """Yield verdicts of checks, with the violations of each trace."""
     run = store.check(question["text"], **question["parameters"])
     many, verdicts = 0, list[Reply]()
     for verdict in run:
@@ -106,7 +106,7 @@ def _told_check(store: Store, question: dict[str, Any], most: int) -> Iterator[R
 
 
 def _measured(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
-    """Coverage, a selection, or work on clips; what is done of it is told before."""
+    """Yield the result of coverage, a selection, or a clip task, after its progress."""
     from sgstore.serve import _measures  # not needed by the others
 
     yield getattr(_measures, question.pop("ask"))(store, **question)
@@ -121,11 +121,11 @@ QUESTIONS: Final[Mapping[str, Asked]] = {
     "check": _told_check,
     **dict.fromkeys(("coverage", "select", "lock", "export", "diff"), _measured),
 }
-"""What ``ask`` may be; each is given the store, the question, and the most matches or rows."""
+"""Functions by ``ask``; each gets the store, the query, and the limit of matches or rows."""
 
 
 def answer(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
-    """Replies to a question."""
+    """Yield replies to a query."""
     return QUESTIONS[question["ask"]](store, question, most)
 
 
