@@ -43,7 +43,7 @@ _ENCODING: Final = re.compile(rb"""\s*<\?xml[^>]{0,100}\sencoding=["']([A-Za-z0-
 
 
 def read_map_file(path: str | Path, signs: Signs = SIGNS) -> RoadMap:
-    """The road map in an OpenDRIVE, Lanelet2 or SUMO file; ``signs`` as in :func:`sgstore.opendrive.read_map`.
+    """Read a road map file; ``signs`` as in :func:`sgstore.opendrive.read_map`.
 
     Points of a Lanelet2 map use ``local_x`` and ``local_y``. Without them,
     ``map_projector_info.yaml`` in the same folder defines the projection, as in Autoware; the

@@ -514,7 +514,7 @@ class Strands:
         self._roles: OrderedDict[int, dict[int, int]] = OrderedDict()
 
     def roles(self, ego: int) -> dict[int, int]:
-        """Strand → its role beside the ego's: 0 the ego's own, n the n-th to its left, -n to its right."""
+        """Map strands to roles: 0 for the ego's, n for the n-th on its left, -n for its right."""
         if ego not in self._roles:
             roles = {ego: 0}
             for beside, sign in ((self._left, 1), (self._right, -1)):
@@ -762,7 +762,7 @@ def _numbered(seen: GraphColumns, inside: Part, lanes: Part) -> Ints:
 
 
 def _from_ego(seen: GraphColumns) -> tuple[NDArray[np.float64], Bools]:
-    """Distance of each node from the ego in the plane, infinite if unknown; and which frames have an ego."""
+    """Return plane distances of nodes from the ego (infinite if unknown), and a mask of frames with ego."""
     x, y = (np.full(seen.frames, np.nan) for _ in range(2))
     ego = np.flatnonzero(seen.is_ego)
     x[seen.node_frame[ego]], y[seen.node_frame[ego]] = seen.x[ego], seen.y[ego]

@@ -222,9 +222,9 @@ class Combos:
 
     @property
     def missing(self) -> ReportTable:
-        """Return the missing combinations:
+        """Return the missing combinations.
 
-        ``combination``, ``frames_in_reference`` (or ``None``), ``query`` that finds it.
+        The columns are ``combination``, ``frames_in_reference`` (or ``None``), ``query``.
         """
         names, members = self.found.features.names, self.found.members[self.gaps]
         often = [None] * len(members) if self.there is None else self.there[self.gaps].tolist()
@@ -241,7 +241,7 @@ class Combos:
         return ReportTable(("combination", "frames"), list(listed))
 
     def matrix(self) -> tuple[list[str], Ints, Bools]:
-        """Pairs of features, whatever k: names, frames with both (F, F), and which pairs should be (F, F)."""
+        """Return pairs of features: names, frames with both (F, F), and a mask of wanted pairs (F, F)."""
         own = self.found.features
         frames = _together(own)
         wanted = np.ones(frames.shape, np.bool_)

@@ -92,7 +92,7 @@ _TEXT: Final = re.compile(r"'(?:[^'\\]|\\.|'')*'")
 
 
 def block_of(pattern: str) -> str | None:
-    """A pattern, ``MATCH … WHERE …``, as the inside of ``EXISTS {…}``; ``None`` if it is more than that."""
+    """Convert ``MATCH … WHERE …`` to the content of ``EXISTS {…}``; ``None`` for other clauses."""
     found = _PATTERN.fullmatch(pattern)
     if found is None or _BEYOND.search(_TEXT.sub("''", found["body"])):
         return None

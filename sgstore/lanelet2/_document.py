@@ -91,7 +91,7 @@ def read_osm(text: str, projection: Projection) -> OsmDocument:
 
 
 def _places(nodes: list[OsmElement], projection: Projection, warnings: list[str]) -> Floats:
-    """Places (n, 3) of nodes: ``local_x`` and ``local_y`` where all have them, else projected; NaN: none."""
+    """Return places (n, 3) of nodes: ``local_x`` and ``local_y`` if complete, else projected."""
     if not nodes:
         return np.zeros((0, 3))
     height, x, y = (

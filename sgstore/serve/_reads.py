@@ -66,7 +66,7 @@ class Reads:
         self._reading, self._looking = threading.Lock(), threading.Lock()
 
     def _traces(self) -> tuple[dict[str, StoredTrace], dict[str, Any]]:
-        """The traces by name, and what the page is told of the store; remembered while the file stays."""
+        """Return traces by name, and the page's store description; cached while the file stays."""
         with self._looking:  # after a change one thread reads, and the others wait
             catalog = self._store.catalog()
             if self._known is None or self._known[0] is not catalog:
