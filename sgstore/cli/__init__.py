@@ -1,8 +1,8 @@
 """The command line: each verb parses, calls one function of the library, and prints.
 
-Results go to stdout, everything else to stderr; with ``--json`` an error is one line of JSON there.
-Exit codes: 0 done; 1 error; 2 wrong usage, the language of queries and SQL included; 3 done, but something in a
-recording was lost; 4 nothing matched (with ``--require``).
+Results go to stdout, everything else to stderr; with ``--json`` an error is one line of JSON on
+stderr. Exit codes: 0 success; 1 error; 2 wrong usage, including invalid queries and SQL; 3 success,
+but parts of a recording were lost; 4 no match (with ``--require``).
 """
 
 from __future__ import annotations
@@ -42,24 +42,24 @@ VERBS: Final = {
     "serve": ("serve", "report", "mcp"),
     "collections": ("collection",),
 }
-"""The modules of the verbs, and what is in them; help lists the modules in this order.
+"""Modules of the verbs, with their verbs; help lists the modules in this order.
 
-A verb is known once its module is imported and its options are worked out: :func:`application` does that for
-what is asked, because for all of them it takes longer than many an answer.
+A verb exists only after its module is imported and its options are built. :func:`application` does
+this for the requested verb only, because all of them take longer than many queries.
 """
 
 _OF_ALL: Final = ("--help", "-h", "--version", "--show-completion", "--install-completion")
-"""Orders that are about the application itself, of whose verbs no more is told than what they do."""
+"""Options of the application itself; they need only the summaries of the verbs."""
 
 
 def application(arguments: Sequence[str] = ()) -> typer.Typer:
-    """The application for a command line.
+    """Return the application for a command line.
 
     Returns
     -------
     typer.Typer
-        It knows the verb that is asked for; where none is, or one that there is not, it knows all of them. For
-        help on itself, and where a verb is being typed, it knows them without their options.
+        It contains the requested verb, or all verbs if none or an unknown one is requested. For its
+        own help, and for completion of a verb, it contains all verbs without their options.
     """
     if (typed := words_before()) is not None:
         arguments = typed or ("--help",)
@@ -77,20 +77,21 @@ def application(arguments: Sequence[str] = ()) -> typer.Typer:
 
 
 def _verb_in(arguments: Sequence[str]) -> Sequence[str]:
-    """The verb of a command line, which words on all verbs may stand before; at most one."""
+    """Return the verb of a command line, after global options; at most one."""
     return [one for one in arguments if one not in {"--quiet", "--verbose"}][:1]
 
 
 _PUBLISHING: Final = ("ingest", "import", "derive")
-"""Verbs that do their work in parts, each of which is in the store when it is done."""
+"""Verbs that work in parts, where each finished part is already in the store."""
 
 
 def main() -> None:
     """Run the command line of this process and end it with the right exit code."""
-    # Numpy starts a thread for each core when it is imported; only what multiplies large tables needs them.
+    # Numpy starts a thread for each core on import; only large matrix products need them.
     if not {*_verb_in(sys.argv[1:])} & {*VERBS["coverage"]}:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Nothing of what is imported is ever garbage: to look for some while it comes takes a tenth of a short run.
+    # Imported objects are never garbage: a search for garbage during imports takes a tenth of a
+    # short run.
     gc.set_threshold(50_000)
     spare_packages()
     take_streams()
@@ -98,7 +99,7 @@ def main() -> None:
         ending.heed_signals()
         code = run(sys.argv[1:])
         ending.ignore_signals()
-    except KeyboardInterrupt:  # it came before the run began, or once it was over
+    except KeyboardInterrupt:  # before the run began, or after its end
         ending.ignore_signals()
         complain(ending.word())
         code = ending.exit_code()
@@ -106,7 +107,7 @@ def main() -> None:
 
 
 def _wants_json(arguments: list[str]) -> bool:
-    """Return true if output, errors included, is for machines."""
+    """True if the output, including errors, is for programs."""
     forms = {"--format=json", "--format=ndjson"}
     named = {value for name, value in pairwise(arguments) if name == "--format"}
     return "--json" in arguments or bool(forms & set(arguments)) or bool(named & {"json", "ndjson"})
@@ -118,18 +119,19 @@ def run(arguments: list[str]) -> int:
     Returns
     -------
     int
-        The exit code, as the module says.
+        The exit code, as listed in the module.
     """
     try:
         code = _ran(arguments)
     except SgstoreError as error:
         return 0 if isinstance(error, ReaderGoneError) else _refused(error, arguments)
     except BrokenPipeError:
-        # The reader of our output went away (`| head`): nothing to say, and nothing more to flush.
+        # The reader of our output has exited (`| head`): there is nothing to report or flush.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
-        # Wrong usage: the class of these errors has moved between versions of typer, its faces have not.
+        # Wrong usage: the class of these errors differs between versions of typer, their attributes
+        # do not.
         show = getattr(error, "show", None)
         if not callable(show):
             raise
@@ -139,7 +141,7 @@ def run(arguments: list[str]) -> int:
         ending.clear_deadline()
         talk_as_usual()
         forget_asked()
-    if code == ending.INTERRUPTED:  # which typer, too, makes of Ctrl-C
+    if code == ending.INTERRUPTED:  # typer also converts Ctrl-C to this code
         more = (
             "; what was finished is in the store" if {*_verb_in(arguments)} & {*_PUBLISHING} else ""
         )
@@ -149,7 +151,7 @@ def run(arguments: list[str]) -> int:
 
 
 def _ran(arguments: list[str]) -> int:
-    """Run one command line; the exit code of an interruption, whatever became of that on its way."""
+    """Run one command line; return the exit code, also after a lost interruption."""
     try:
         asked = application(arguments)
         code = int(asked(args=arguments, prog_name="sgstore", standalone_mode=False) or 0)
@@ -161,7 +163,7 @@ def _ran(arguments: list[str]) -> int:
         if not (ended or is_interruption(error)):
             raise
         code = ending.INTERRUPTED
-    if ending.was_ended():  # an interruption may end as the error of one recording
+    if ending.was_ended():  # an interruption can appear as the error of one recording
         code = ending.INTERRUPTED
     if code == ending.INTERRUPTED:
         ending.refuse_late()
@@ -169,7 +171,7 @@ def _ran(arguments: list[str]) -> int:
 
 
 def _refused(error: SgstoreError, arguments: list[str]) -> int:
-    """Say what was refused; the exit code."""
+    """Report an error; return the exit code."""
     if _wants_json(arguments):
         write_error(error.as_dict())
     else:

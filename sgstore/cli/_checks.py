@@ -1,6 +1,6 @@
 """The verbs check, monitor and timeline.
 
-Verdicts as JUnit's XML, which build servers read: a test for each check and trace.
+Verdicts can be written as JUnit XML for build servers: one test per check and trace.
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ PANEL: Final = "Rules over time"
 
 
 _NO_XML: Final = re.compile(r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-"""Characters that no XML can hold, not even as references."""
+"""Characters that XML cannot hold, not even as references."""
 
 
 def write_junit(path: Path, verdicts: Iterable[Verdict]) -> None:
-    """Write a suite for each check, with a case for each trace.
+    """Write a test suite for each check, with a case for each trace.
 
-    A violated check is a failure whose text names each violation. What a trace cannot answer, or what is still
-    due at its end, is skipped. A case that is kept says in how many frames an entity is absent.
+    A violated check is a failure whose text names each violation. A trace that cannot answer, or a
+    pending verdict, is skipped. A passed case contains the number of frames without an entity.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def write_junit(path: Path, verdicts: Iterable[Verdict]) -> None:
     Raises
     ------
     ExportError
-        The file cannot be written; what was there before is still there.
+        The file cannot be written; an existing file stays unchanged.
     """
     from xml.etree import ElementTree as Xml  # few need it
 
@@ -105,14 +105,14 @@ def write_junit(path: Path, verdicts: Iterable[Verdict]) -> None:
 
 
 def _word(verdict: Verdict) -> str:
-    """A verdict without a reason, in words."""
+    """Return the text of a verdict without a reason."""
     return (
         "still due at the end of the recording" if verdict.verdict == "pending" else verdict.verdict
     )
 
 
 def _violations(verdict: Verdict) -> list[str]:
-    """A line for each violation: from which frame to which, when, and by whom."""
+    """Return a line for each violation: frames, times and values."""
     return [
         _plain(
             f"{one.trace}#{one.start_seq}-{one.end_seq}, {one.start:.3f} to {one.end:.3f} s,"
@@ -124,7 +124,7 @@ def _violations(verdict: Verdict) -> list[str]:
 
 
 def _plain(text: str) -> str:
-    """A text without characters that no XML can hold: they are written as escapes."""
+    """Replace characters that XML cannot hold by escapes."""
     return _NO_XML.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
 
 
@@ -178,7 +178,7 @@ def _reported(
     require: bool,
     junit: Path | None,
 ) -> int:
-    """Print verdicts, or how the checks are understood; the exit code."""
+    """Print verdicts, or the explanation of the checks; return the exit code."""
     from sgstore.temporal import columns_returned, verdict_columns, verdict_rows
 
     if explain:
@@ -234,11 +234,11 @@ _DOCUMENT: Final = (
     "witnesses",
     "absent_frames",
 )
-"""Columns of verdicts as a program reads them."""
+"""Columns of verdicts for programs."""
 
 
 def _document(verdict: Verdict, returned: Sequence[str]) -> tuple[Any, ...]:
-    """A verdict as a program reads it."""
+    """Return a verdict as a row for programs."""
     spans = [_span(one, returned) for one in verdict.violations]
     witnesses = [
         {
@@ -254,7 +254,7 @@ def _document(verdict: Verdict, returned: Sequence[str]) -> tuple[Any, ...]:
 
 
 def _margin_document(verdict: Verdict) -> dict[str, Any] | None:
-    """By how much a check is met, as a program reads it; no number is infinite in JSON."""
+    """Return the robustness of a verdict for programs, with None for infinite numbers."""
     found = verdict.robustness
     if found is None:
         return None
@@ -271,7 +271,8 @@ def _span(interval: Interval, returned: Sequence[str]) -> dict[str, Any]:
     return about
 
 
-# The verb that watches: checks and patterns over a recording as if it were live, or a running simulator ----
+# The verb monitor: checks and patterns over a recording as if it were live, or over a running
+# simulator.
 
 
 SensorFile = Annotated[
@@ -348,7 +349,7 @@ def monitor(
 
 
 def _sensors(file: Path | None, *, shown: bool) -> list[Sensor]:
-    """The sensors that a file lists; ``shown``: a page will show what they see."""
+    """Load the sensors listed in a file; ``shown``: a page displays their data."""
     from sgstore.readers import load_sensors
 
     if file is not None and not shown:
@@ -364,7 +365,7 @@ def _watched_on_a_page(
     longest: float | None,
     port: int,
 ) -> tuple[Monitor, tuple[Verdict, ...]]:
-    """A monitor that has watched, beside a page that shows it; and the verdicts, when both have ended."""
+    """Run a monitor with its page; return it and the verdicts after both have ended."""
     from sgstore.serve import LiveRun, serve_live
     from sgstore.temporal import paced
 
@@ -388,7 +389,7 @@ def _watched_on_a_page(
 
 
 def _called(asked: Mapping[str, list[str]]) -> list[str]:
-    """Names of the patterns in events, in the order in which they are asked."""
+    """Return the names of the patterns in events, in query order."""
     from sgstore.lang import each_match, parse
     from sgstore.lang.syntax import MatchClause
 
@@ -449,7 +450,7 @@ def _tell_verdict(verdict: Verdict, *, as_json: bool) -> None:
 
 
 def _line(text: str) -> None:
-    """A line that is there at once, whoever reads it."""
+    """Print a line without buffering."""
     typer.echo(without_controls(text))
 
 
@@ -527,7 +528,7 @@ def timeline(
 def _asked(
     queries: list[str], files: list[Path], names: list[str], values: Mapping[str, Any]
 ) -> dict[str, tuple[str, Mapping[str, Any]]]:
-    """Texts to plot and their values, by the names of the lanes."""
+    """Return the texts to plot with their values, by lane name."""
     from sgstore.lang.library import pattern_named
 
     found: dict[str, tuple[str, Mapping[str, Any]]] = {}
@@ -545,7 +546,7 @@ def _asked(
 
 
 def _free(name: str, longer: str, taken: Mapping[str, object]) -> str:
-    """A name for a lane that no other has."""
+    """Return an unused name for a lane."""
     if name not in taken:
         return name
     numbers = (f"{longer} ({number})" for number in count(2))

@@ -37,7 +37,7 @@ def _say(url: Path, told: str) -> None:
 
 
 def _statuses(done: Commit) -> list[tuple[str, str]]:
-    """What became of traces."""
+    """Return the status of each trace after a commit."""
     from sgstore.vocabulary import natural
 
     present = sorted(done.present, key=natural)
@@ -45,7 +45,7 @@ def _statuses(done: Commit) -> list[tuple[str, str]]:
 
 
 def _new_in(done: Commit) -> str:
-    """What a commit has brought into a collection."""
+    """Return a summary of a commit."""
     if not done.added:
         return f"nothing new; the last snapshot is {done.number}"
     told = f"{number_of(len(done.added), 'trace')} in {number_of(len(done.bundles), 'bundle')}"

@@ -1,7 +1,7 @@
 """Completion in a shell: patterns, traces, frames, formats, presets, abstractions.
 
-Typer asks these functions when the tabulator is pressed behind an argument or an option of theirs. They answer
-soon: what only the package knows is told without the database, which is opened for what a store knows.
+Typer calls these functions when the user presses Tab after one of their arguments or options. They
+must be fast: names of the package need no database; only names of a store open it.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ if TYPE_CHECKING:
     from sgstore.store import StoredTrace, StoreFile
 
 Offers = Iterator[tuple[str, str]]
-"""What could stand there, each with a word on it."""
+"""Possible values, each with a description."""
 
 STORE: Final = "SGSTORE_STORE"
-"""The variable that names the store where none is given."""
+"""Environment variable with the default store."""
 
 STORE_ENDINGS: Final = (".sgstore", ".duckdb", ".db")
 _ASKED: Final = "_SGSTORE_COMPLETE"
-"""The variable by which a shell asks what could stand there."""
+"""Environment variable by which a shell requests completions."""
 
 _KEPT: Final = "_SGSTORE_KEPT"
-"""The variable that holds what bash keeps of the word that is being typed."""
+"""Environment variable with the part of the typed word that bash keeps."""
 
 
 def words_before() -> list[str] | None:
-    """The words of a command line that is to be completed, up to the one that is being typed; else ``None``.
+    """Return the words before the completed word of a command line, or ``None``.
 
-    Each shell tells them in variables of its own, as typer's scripts for it do.
+    Each shell passes them in its own variables, as in typer's scripts.
     """
     if not os.environ.get(_ASKED, "").startswith("complete"):
         return None
@@ -50,10 +50,10 @@ def words_before() -> list[str] | None:
 
 
 def _words_of_bash(words: list[str], at: int) -> list[str]:
-    """The words before the one at a place; what bash broke at ``@`` is one word again, for typer, too.
+    """Return the words before a position; words that bash split at ``@`` are joined again, also for typer.
 
-    Bash takes ``town@7`` for three words, and replaces the last two by what is offered. So where that is being
-    typed, the word for typer is ``@7``, and ``town`` is kept.
+    Bash splits ``town@7`` into three words, and replaces the last two by the completion. Therefore
+    the word for typer is ``@7``, and ``town`` is kept.
     """
     typed = words[: at + 1]
     if "@" in typed:
@@ -67,7 +67,7 @@ def _words_of_bash(words: list[str], at: int) -> list[str]:
 
 
 def stores(ctx: typer.Context, incomplete: str) -> Offers:
-    """Stores beside; where one is the default, what could come behind it, too."""
+    """Yield stores in the folder; with a default store, also the possible next arguments."""
     folder, _, start = incomplete.rpartition("/")
     with suppress(OSError):
         for path in sorted(Path(folder or ("/" if incomplete[:1] == "/" else ".")).iterdir()):
@@ -85,7 +85,7 @@ def stores(ctx: typer.Context, incomplete: str) -> Offers:
 
 
 def patterns(ctx: typer.Context) -> Offers:
-    """Names of the library; only such as can be asked, unless they are to be shown."""
+    """Yield names of the library; predicates only for ``show``, because they cannot be run."""
     from sgstore.lang import patterns as every
 
     for one in every().values():
@@ -94,13 +94,13 @@ def patterns(ctx: typer.Context) -> Offers:
 
 
 def traces(ctx: typer.Context) -> Offers:
-    """Names of the traces of the store."""
+    """Yield the names of the traces of the store."""
     for one in _traces(ctx):
         yield one.name, _about(one)
 
 
 def frames(ctx: typer.Context, incomplete: str) -> Offers:
-    """Frames by trace and number, or by trace and time: one digit more than there is."""
+    """Yield frames by trace and number, or by trace and time, with one more digit."""
     kept = os.environ.get(_KEPT, "")
     typed = f"{kept}{incomplete}"
     for one in _traces(ctx):
@@ -119,7 +119,7 @@ def frames(ctx: typer.Context, incomplete: str) -> Offers:
 
 
 def presets() -> Offers:
-    """Settings with a name."""
+    """Yield the names of presets."""
     from sgstore.config import PRESETS
 
     for name, one in PRESETS.items():
@@ -127,7 +127,7 @@ def presets() -> Offers:
 
 
 def formats() -> Offers:
-    """Formats of exports."""
+    """Yield the formats of exports."""
     from sgstore import plugins
     from sgstore.exporters import EXPORTERS
 
@@ -136,7 +136,7 @@ def formats() -> Offers:
 
 
 def abstractions() -> Offers:
-    """Abstractions of graphs."""
+    """Yield the abstractions of graphs."""
     from sgstore.plugins import ABSTRACTIONS
 
     for name in (*ABSTRACTIONS.own, *ABSTRACTIONS.others()):
@@ -144,7 +144,7 @@ def abstractions() -> Offers:
 
 
 def channels(ctx: typer.Context) -> Offers:
-    """Channels of the recordings of the store."""
+    """Yield the channels of the recordings of the store."""
     sql = "SELECT DISTINCT channel, schema FROM payloads ORDER BY channel"
     with suppress(SgstoreError, OSError):
         file = _store(ctx)
@@ -156,7 +156,7 @@ def _about(trace: StoredTrace) -> str:
 
 
 def _traces(ctx: typer.Context) -> list[StoredTrace]:
-    """Traces of the store that the command line names so far; none if it cannot be asked."""
+    """Return the traces of the store on the command line; empty if it cannot be read."""
     with suppress(SgstoreError, OSError):
         file = _store(ctx)
         return [] if file is None else [*file.traces()]

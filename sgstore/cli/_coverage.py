@@ -110,10 +110,10 @@ Within = Annotated[
 
 @dataclass(frozen=True)
 class FrameAskOptions(CollectionOptions, AskOptions):
-    """Options of a verb that asks stores or collections for classes of frames."""
+    """Options of a verb for classes of frames in stores or collections."""
 
     def frames(self, *texts: str) -> Iterator[ChosenFrames]:
-        """Frames that each of some texts means."""
+        """Yield the selected frames of each text."""
         from sgstore.coverage import selection_of
 
         spill = self.spill()
@@ -132,7 +132,7 @@ class WindowOptions:
     incomplete: Incomplete = "equal"
 
     def of(self, ask: FrameAskOptions, *texts: str, slots: Path | None = None) -> list[Classed]:
-        """Frames that texts mean, with their classes; says which traces cannot answer a query."""
+        """Return the selected frames with their classes; report traces that cannot answer."""
         from sgstore.coverage import classed
 
         found: list[Classed] = []
@@ -149,7 +149,7 @@ class WindowOptions:
 
 @dataclass(frozen=True)
 class SceneOptions(WindowOptions):
-    """Options for the classes of frames, by declared slots, too."""
+    """Options for the classes of frames, or for declared slots."""
 
     slots: Slots = None
 
@@ -475,7 +475,7 @@ def _slot_table(
 
 
 def _slot_picture(text: str, slots: Path, ask: FrameAskOptions, to: Path) -> None:
-    """Draw the pairs of values of the slots in a file, and its gaps."""
+    """Draw the pairs of slot values of a file, with gaps."""
     from sgstore.coverage import slot_matrix
     from sgstore.draw import draw_matrix
 
@@ -489,7 +489,7 @@ def _slot_picture(text: str, slots: Path, ask: FrameAskOptions, to: Path) -> Non
 
 
 def _one_specification(slots: Path) -> Specification:
-    """The only specification in a file."""
+    """Return the only specification in a file."""
     from sgstore.coverage import read_specifications
 
     declared, *more = read_specifications(slots)
@@ -499,7 +499,7 @@ def _one_specification(slots: Path) -> Specification:
 
 
 def _short(text: str) -> str:
-    """A selection as a title has room for it."""
+    """Shorten the text of a selection for a title."""
     path, colon, query = text.partition(":")
     name = f"{Path(path).name}{colon}{query}"
     return name if len(name) <= 60 else f"{name[:59]}…"
@@ -528,7 +528,7 @@ Objective = Literal["units", "frames", "seconds", "bytes"]
 
 @dataclass(frozen=True)
 class ChoiceOptions:
-    """Options for a choice: its strategy, its units, and its limits."""
+    """Options for a selection: strategy, units, and limits."""
 
     minimal: Annotated[
         bool, Option("--minimal", help="The fewest that keep everything that occurs.")
@@ -577,7 +577,7 @@ class ChoiceOptions:
     seed: Annotated[int, Option("--seed", min=0, max=(1 << 63) - 1, help="Random seed.")] = 0
 
     def spec(self) -> SelectionSpec:
-        """Make what the options say together."""
+        """Return the specification of these options."""
         from sgstore.selection import Budget, SelectionSpec, SelectionUnit
 
         return SelectionSpec(
@@ -652,7 +652,7 @@ def select(
     from sgstore.selection import split as split_up
 
     spec = choice.spec()
-    if output is not None and output.suffix != ENDING:  # before anything is searched
+    if output is not None and output.suffix != ENDING:  # before the search starts
         raise typer.BadParameter(f"--output {output}: the name of a lock ends in {ENDING}")
     shares = parse_split(split) if split else {}
     opened = whole.opened_at(store, bounds)
@@ -666,7 +666,7 @@ def select(
     if output is not None:
         asked = query or "", parameters_of(parameters)
         _lock(found, asked, parts, output, payloads=not no_payloads)
-    # Last: who reads only the first rows has the lock all the same.
+    # Last, so that the lock exists even if the reader stops after the first rows.
     if curve or picture is not None:
         _curve(found, picture, out, printed=curve)
     else:
@@ -676,7 +676,7 @@ def select(
 def chosen_frames(
     opened: Store | Collection, name: str, query: str | None, parameters: list[str] | None
 ) -> ChosenFrames:
-    """The frames that are selected from."""
+    """Return the frames to select from."""
     from sgstore.coverage import ChosenFrames, frames_of
 
     if query is None:
@@ -798,7 +798,7 @@ def minus_(a: LockA, b: LockB, output: LockOut) -> None:
 
 
 def say_made(made: Lock, output: Path) -> None:
-    """Write a lock, and say what is in it."""
+    """Write a lock, and report its contents."""
     made.write(output)
     say(f"{output}: {len(made.cases)} cases of {len(made.traces)} traces")
 
@@ -840,7 +840,7 @@ def diff(
     else:
         compare = differences.by_frame if by_frame else differences.scenes
         table = compare(*(classed(one, abstraction) for one in ask.frames(a, b)))
-    # People read the reasons below the table, each once.
+    # In a table the reasons are below it, each once.
     ask.report(table.without(*differences.REASONS) if ask.for_people else table)
     different = any(row[0] != differences.SAME for row in table.rows)
     return NO_MATCH if require and different else 0

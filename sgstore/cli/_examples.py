@@ -1,4 +1,4 @@
-"""Two examples of every verb, which its help shows: as they are typed, each with what it is for."""
+"""Two examples for every verb, shown in its help, each with its purpose."""
 
 from __future__ import annotations
 
@@ -254,13 +254,13 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
         "collection gc fleet/ --keep 3 --older 60min  # remove it, but keep three snapshots",
     ),
 }
-"""By the words that the verb is typed with: the rest of a command line, and what it is for."""
+"""Verb → the rest of the command line, and the purpose."""
 
 
 def examples_of(verb: str) -> str:
-    """The examples of a verb, or of a group of verbs, as help shows them; empty if there are none.
+    """Return the examples of a verb or group for its help; empty without examples.
 
-    They stand in no frame, and a line is not broken, so that it can be copied.
+    They have no frame and no line breaks, so that users can copy them.
     """
     lines: list[str] = []
     for one in EXAMPLES.get(verb, ()):

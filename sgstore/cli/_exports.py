@@ -40,7 +40,7 @@ PANEL: Final = "Pictures and exports"
 
 
 def _formats(option: str = "") -> str:
-    """Formats of this package, or those of them that heed an option, for help."""
+    """Return the built-in formats, or those that support an option, for help."""
     return ", ".join(one.name for one in EXPORTERS if not option or option in one.options)
 
 
@@ -106,7 +106,7 @@ class ClipOptions:
     ] = "pcd"
 
     def order(self, store: Store, clips: Sequence[Clip], **about: Any) -> Export:
-        """Make the export that they ask for."""
+        """Return the export of these options."""
         from sgstore.exporters import Export, parse_mounts
 
         return Export(
@@ -168,7 +168,7 @@ def export(
         write_export,
     )
 
-    exporter_named(form)  # before anything is searched
+    exporter_named(form)  # before the search starts
     check_folder(to)
     texts = parse_labels(clip.labels or [])
     opened = bounds.opened(store)
@@ -192,7 +192,7 @@ def export(
 
 
 def _write(written: Sequence[WrittenClip | WrittenFile], form: Format) -> None:
-    """Say what was lost, and print what was written, a row each."""
+    """Report losses, and print one row per written file."""
     _say_lost(written)
     rows = [one.as_row() for one in written]
     write_rows(tuple(rows[0]), [tuple(row.values()) for row in rows], form)
@@ -211,7 +211,7 @@ def _clips(
     parameters: Mapping[str, Any],
     margins: tuple[float, float],
 ) -> list[Clip]:
-    """The clips around what a query finds or frames that are named; or the cases of a lock, as they are."""
+    """Return clips around matches or given frames; or the unchanged cases of a lock."""
     frames, lock = named
     if lock is not None:
         from sgstore.locks import cases_of
@@ -263,7 +263,7 @@ def shrink(
     from sgstore.exporters import check_folder
 
     if to is not None:
-        check_folder(to)  # before anything is searched
+        check_folder(to)  # before the search starts
     opened = bounds.opened(store)
     text, values = question.asked()
     found = list(opened.shrink(text, clip, **values))
@@ -296,7 +296,7 @@ def shrink(
 def _cut_out(
     store: Store, clips: list[Clip], text: str, to: Path
 ) -> dict[Clip, WrittenClip | WrittenFile]:
-    """Write clips as their recordings have them; says what was lost."""
+    """Write clips from their recordings, and report losses."""
     from sgstore.exporters import Export, write_export
 
     with count_bar(to.name or "shrink", "clips") as progress:
@@ -338,7 +338,7 @@ class DrawOptions:
     ] = 10.0
 
     def options(self, matches: Matches | None) -> dict[str, Any]:
-        """Make what the functions that draw take."""
+        """Return the parameters of the drawing functions."""
         return {
             "matches": matches,
             "camera": self.camera,

@@ -1,7 +1,7 @@
-"""Help and errors as typer draws them, without the packages that it loads for texts that we have none of.
+"""Fast replacement for unused packages of typer's help and errors.
 
-Typer names a class for texts in Markdown and one for tracebacks. To load them takes half as long as all else
-that help needs, so they are loaded when somebody uses them.
+Typer names a class for Markdown texts and one for tracebacks. Their import takes half as long as
+everything else that help needs; therefore they are loaded on first use.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _UNUSED: Final = {"rich.markdown": "Markdown", "rich.traceback": "Traceback"}
 
 
 def spare_packages() -> None:
-    """Put classes that are loaded when they are used in the place of modules that only typer names."""
+    """Replace modules that typer only names by classes that load them on first use."""
     for module, name in _UNUSED.items():
         if module not in sys.modules:
             sys.modules[module] = stand_in = _LaterModule(module)
@@ -23,7 +23,7 @@ def spare_packages() -> None:
 
 
 class _LaterModule(ModuleType):
-    """Module that makes way for the real one when more is asked of it than the class that it has."""
+    """Module with one class, replaced by the real module on any other access."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -32,7 +32,7 @@ class _LaterModule(ModuleType):
 
 
 class _LaterClass(type):
-    """Class that does as the real one when it is called, or asked for an attribute."""
+    """Class that forwards calls and attributes to the real class."""
 
     def __call__(cls, *given: Any, **named: Any) -> Any:
         return getattr(_loaded(cls.__module__), cls.__name__)(*given, **named)

@@ -1,4 +1,4 @@
-"""The application, arguments that verbs share, and bundles of these."""
+"""The application, shared arguments of verbs, and groups of options."""
 
 from __future__ import annotations
 
@@ -35,12 +35,13 @@ if TYPE_CHECKING:
 
 
 class Verb(TyperCommand):
-    """A verb that refuses an option which is given twice, unless it collects what it is given."""
+    """Verb that rejects repeated options, unless they collect values."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Read a command line; what follows of it is none of the verb's."""
-        if ctx.resilient_parsing:  # which completes a command line that is not whole yet
-            whole = args[:-1] if args and args[-1].startswith("-") else args  # its value comes now
+        """Parse a command line; return the remaining arguments."""
+        if ctx.resilient_parsing:  # completion of an unfinished command line
+            # the value of this option is being typed
+            whole = args[:-1] if args and args[-1].startswith("-") else args
             return super().parse_args(ctx, _with_store(self, ctx, whole))
         try:
             args = _with_store(self, ctx, args)
@@ -60,7 +61,7 @@ class Verb(TyperCommand):
         return rest
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write help, and examples below it."""
+        """Write help, followed by examples."""
         super().format_help(ctx, formatter)
         _write_examples(ctx)
 
@@ -72,9 +73,9 @@ def _write_examples(ctx: Any) -> None:
 
 
 def _with_store(verb: Verb, ctx: Any, args: list[str]) -> list[str]:
-    """A command line with the store of ``SGSTORE_STORE`` before it, where it names none itself.
+    """Insert the store of ``SGSTORE_STORE`` into a command line without a store.
 
-    What stands first is a store if it looks like one, or if there are as many arguments as the verb takes.
+    The first argument is a store if it looks like one, or if the number of arguments is complete.
     """
     named = os.environ.get(STORE)
     arguments = [one for one in verb.params if one.param_type_name == "argument"]
@@ -99,17 +100,17 @@ def _looks_like_store(place: str) -> bool:
     path = Path(place)
     try:
         whole = (path / COLLECTION_FILE).is_file()
-    except (OSError, ValueError):  # a query is no name of a file
+    except (OSError, ValueError):  # a query is not a file name
         return False
     return whole or path.suffix in completion.STORE_ENDINGS or _is_database(path)
 
 
 _LIMITED: Final = {"find": "the query", "sql": "the SQL"}
-"""Verbs whose text says itself how many rows are wanted."""
+"""Verbs whose text limits the rows itself."""
 
 
 def _advise(error: Any, verb: Verb) -> None:
-    """Add to an error of usage what is to be done, if that is plain; each typer has another class for these."""
+    """Add advice to a usage error, independent of the typer version."""
     if getattr(error, "option_name", "") == "--limit" and verb.name in _LIMITED:
         error.possibilities = None
         error.message = f"{error.message}; write LIMIT 10 at the end of {_LIMITED[verb.name]}"
@@ -119,13 +120,13 @@ def _advise(error: Any, verb: Verb) -> None:
 
 
 def _places(verb: Verb) -> list[str]:
-    """Names of the arguments of a verb whose first one is a store; nothing of another verb."""
+    """Return the names of the arguments of a verb with a store as its first; else an empty list."""
     names = [one.name or "" for one in verb.params if one.param_type_name == "argument"]
     return names if names[:1] == ["store"] else []
 
 
 def _refuse_late_store(verb: Verb, ctx: Any) -> None:
-    """Refuse a store that stands where something else is expected, and something else in its place."""
+    """Reject swapped arguments: a store in the place of another argument."""
     values = [ctx.params[name] for name in _places(verb)]
     if not values or _is_database(values[0]):
         return
@@ -140,32 +141,33 @@ def _refuse_late_store(verb: Verb, ctx: Any) -> None:
 def _is_database(place: str | Path) -> bool:
     try:
         path = Path(place)
-        if not path.is_file():  # to open a pipe would wait for who writes into it
+        if not path.is_file():  # opening a pipe would block
             return False
         with path.open("rb") as file:
             return file.read(12)[8:] == b"DUCK"
-    except (OSError, ValueError):  # a query is no name of a file
+    except (OSError, ValueError):  # a query is not a file name
         return False
 
 
 class Application(TyperGroup):
-    """The verbs of an application; see :func:`_spare`."""
+    """Verbs of an application; see :func:`_spare`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Read a command line up to the verb."""
+        """Parse a command line up to the verb."""
         _spare(self.get_params(ctx))
         return super().parse_args(ctx, args)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write help, and examples below it."""
+        """Write help, followed by examples."""
         super().format_help(ctx, formatter)
         _write_examples(ctx)
 
 
 def _spare(parameters: Iterable[Any]) -> None:
-    """Let parameters take plain values as they are.
+    """Let parameters accept plain values without validation by pydantic.
 
-    From 0.29 on typer asks pydantic about every value, whose import takes longer than many an answer.
+    From 0.29 on typer validates every value with pydantic, whose import takes longer than many
+    queries.
     """
     for one in parameters:
         if hasattr(one, "type_descriptor") and "process_value" not in vars(one):
@@ -180,11 +182,11 @@ def _taken(parameter: Any, ask: Callable[[Any, Any], Any], context: Any, value: 
 
 
 _NOT_PLAIN: Final = object()
-"""Neither a default nor a text that is taken as it stands: something may be wrong with it."""
+"""Neither a default nor a plain text: the value needs validation."""
 
 
 def _plain(parameter: Any, value: Any) -> Any:
-    """The value that a parameter has; :data:`_NOT_PLAIN` where that is not plain to see."""
+    """Return the value of a parameter, or :data:`_NOT_PLAIN` if it needs validation."""
     about, several = parameter.type_descriptor, parameter.multiple or parameter.nargs == -1
     kind = about.annotation
     if value is None:
@@ -205,17 +207,17 @@ def _plain_text(kind: Any, value: Any) -> Any:
 
 
 def _says_one_thing(parameter: Any) -> bool:
-    """Return true if an option takes one value, so that a second one would replace it."""
+    """True if an option takes one value, so that a second value would replace it."""
     if parameter.param_type_name != "option" or parameter.multiple or parameter.count:
         return False
-    return not parameter.is_flag or bool(parameter.secondary_opts)  # a flag said twice is said
+    return not parameter.is_flag or bool(parameter.secondary_opts)  # a repeated flag has no effect
 
 
 class Verbs(typer.Typer):
-    """An application, or a part of one, whose commands are each a :class:`Verb`.
+    """Application, or a part of one, whose commands are :class:`Verb` objects.
 
-    Its verbs are noted first and built later, because to work out the options of all takes longer than many an
-    answer.
+    Verbs are registered first and built later, because the options of all take longer than many
+    queries.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -224,9 +226,9 @@ class Verbs(typer.Typer):
         self._built: set[str] = set()
 
     def command(self, name: str | None = None, **options: Any) -> Callable[[Any], Any]:
-        """A decorator that makes a function a verb; see :meth:`typer.Typer.command`.
+        """Return a decorator that makes a function a verb; see :meth:`typer.Typer.command`.
 
-        A parameter whose type is a dataclass stands for the options that are its fields.
+        A parameter with a dataclass type represents the options of its fields.
         """
 
         def noted(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -236,7 +238,7 @@ class Verbs(typer.Typer):
         return noted
 
     def build(self, only: Collection[str] = (), *, options: bool = True) -> None:
-        """Register the verbs of these names, by default all, with their options or only with what they do."""
+        """Build the verbs of these names (default all), with or without their options."""
         built = [one for one in self.registered_commands if one.name in self._built]
         self.registered_commands = built
         for name, (about, function) in self._verbs.items():
@@ -255,7 +257,7 @@ def _without_options(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a function that takes the fields of dataclasses in place of these."""
+    """Convert a function with dataclass parameters to one with their fields as parameters."""
     hints = get_type_hints(function, include_extras=True)
     bundles: dict[str, Any] = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
     parameters: list[inspect.Parameter] = []
@@ -295,13 +297,13 @@ app = Verbs(
 )
 
 ERROR, USAGE, LOSS, NO_MATCH = 1, 2, 3, 4
-"""Exit codes; 0 is done."""
+"""Exit codes; 0 means success."""
 
 IN_TABLE: Final = 40
-"""Rows of a report on a terminal, unless more are asked for."""
+"""Default number of report rows on a terminal."""
 
 COLLECTION_FILE: Final = "COLLECTION.json"
-"""The file by which a folder is known as a collection."""
+"""The file that marks a folder as a collection."""
 
 StorePath = Annotated[
     Path,
@@ -353,7 +355,7 @@ QueryFile = Annotated[
 
 
 def pattern_option(about: str) -> Any:
-    """The option ``-p NAME``, for a pattern of the library."""
+    """Return the option ``-p NAME`` for a pattern of the library."""
     names = ("--pattern", "-p")
     return Option(*names, metavar="NAME", help=about, autocompletion=completion.patterns)
 
@@ -403,7 +405,7 @@ Verbose = Annotated[
     Option("--verbose", help="Also what is done, and when, on stderr.", rich_help_panel=MESSAGES),
 ]
 _TALK: Final = {"quiet": Quiet, "verbose": Verbose}
-"""What every verb takes beside its own options."""
+"""Options of every verb."""
 AsJson = Annotated[bool, Option("--json", help="Short for --format json.", rich_help_panel=ROWS)]
 Output = Annotated[
     Path | None,
@@ -413,7 +415,7 @@ Output = Annotated[
 
 @dataclass(frozen=True)
 class PrintedRows:
-    """Options for the format of rows, and the one way in which verbs write rows."""
+    """Options for the format of rows, and the writer of rows."""
 
     form: Annotated[
         Format, Option("--format", help="Format of the rows.", rich_help_panel=ROWS)
@@ -421,16 +423,16 @@ class PrintedRows:
     as_json: AsJson = False
 
     def __post_init__(self) -> None:
-        _ = self.chosen  # refuses what does not fit together before anything is done
+        _ = self.chosen  # reject inconsistent options early
 
     @property
     def file(self) -> Path | None:
-        """File that the rows go to; ``None``: stdout."""
+        """Return the output file of the rows; ``None`` means stdout."""
         return getattr(self, "output", None)
 
     @property
     def chosen(self) -> Format:
-        """Format that the options mean together."""
+        """Return the format that results from the options."""
         return form_of(self.form, self.file, as_json=self.as_json)
 
     @property
@@ -445,10 +447,10 @@ class PrintedRows:
         types: Sequence[str] | None = None,
         totals: Mapping[str, str] | None = None,
     ) -> int:
-        """Write rows, and return how many; see :func:`sgstore.cli._output.write_rows`.
+        """Write rows, and return their number; see :func:`sgstore.cli._output.write_rows`.
 
-        Below a long table on a terminal stands the number of its rows, and the sum of columns: ``totals`` has
-        these by name, with their units.
+        A long table on a terminal ends with the number of rows, and sums of the columns in
+        ``totals`` (column → unit).
         """
         if not on_terminal(self):
             return write_rows(columns, rows, self.chosen, self.file, types)
@@ -468,7 +470,7 @@ class PrintedRows:
         return number
 
     def report(self, table: ReportTable, limit: int | None = 0) -> None:
-        """Write a table and the remarks on it; with ``limit`` 0 all rows, with ``None`` some for people."""
+        """Write a table and its notes; ``limit`` 0 means all rows, ``None`` some rows on a terminal."""
         if limit is None:
             limit = IN_TABLE if self.for_people and self.file is None else 0
         rows = table.rows[:limit] if limit else table.rows
@@ -480,7 +482,7 @@ class PrintedRows:
 
 
 def on_terminal(out: PrintedRows) -> bool:
-    """Tell whether a person sees the rows as they come."""
+    """True if rows are shown on a terminal."""
     return out.for_people and out.file is None and sys.stdout.isatty()
 
 
@@ -493,7 +495,7 @@ class RowOptions(PrintedRows):
 
 @dataclass(frozen=True)
 class QueryLimits:
-    """Most time and disk that a question may take."""
+    """Limits for the time and disk space of a query."""
 
     timeout: Annotated[
         str | None,
@@ -516,12 +518,12 @@ class QueryLimits:
     ] = None
 
     def spill(self) -> int:
-        """Bound whatever is done from here on.
+        """Set the time limit; return the disk limit.
 
         Returns
         -------
         int
-            Most that a question may put on disk, in bytes; 0: what a store allows by itself.
+            Greatest disk space of a query, in bytes; 0 means the store's default.
         """
         spill = 0 if self.max_spill is None else bytes_of(self.max_spill, "--max-spill")
         if self.timeout is not None:
@@ -529,9 +531,9 @@ class QueryLimits:
         return spill
 
     def opened(self, store: Path, tables: Mapping[str, Path] | None = None) -> Store:
-        """Open a store within these bounds, with tables of the user's own.
+        """Open a store with these limits and user tables.
 
-        Rows of these that belong to no frame are told.
+        Rows without a matching frame are reported.
         """
         from sgstore.query import Store
 
@@ -545,12 +547,12 @@ class QueryLimits:
 
 @dataclass(frozen=True)
 class AskOptions(QueryLimits, RowOptions):
-    """Options of a verb that asks a store: format of the rows, their file, and limits."""
+    """Options of a verb with queries: format of the rows, their file, and limits."""
 
 
 @dataclass(frozen=True)
 class Question:
-    """A query: a text, a file, or a pattern of the library; and values for it."""
+    """A query: a text, a file, or a pattern of the library; with parameter values."""
 
     query: QueryText = None
     file: QueryFile = None
@@ -560,17 +562,17 @@ class Question:
     parameters: Parameters = None
 
     def __bool__(self) -> bool:
-        """Return true if something is asked."""
+        """True if a query is given."""
         return bool(self.query or self.file or self.name)
 
     def asked(self) -> tuple[str, Mapping[str, Any]]:
-        """The text of the query, and values that it does not hold yet."""
+        """Return the text of the query, and the values for its remaining parameters."""
         return asked_of(self.query, self.file, self.name, parameters_of(self.parameters))
 
 
 @dataclass(frozen=True)
 class Statements:
-    """Statements of the library and of the command line, which are asked together with files of them."""
+    """Statements of the library and of the command line, combined with those of files."""
 
     names: PatternNames = None
     texts: Annotated[
@@ -586,14 +588,15 @@ class Statements:
     ] = False
 
     def asked(self, files: Sequence[Path] | None) -> tuple[dict[str, list[str]], dict[str, Any]]:
-        """Texts of files, of the library and of the command line; and values that these do not hold yet.
+        """Return texts of files, library and command line; and the values for their remaining parameters.
 
         Returns
         -------
         asked : dict
-            What a pattern is called → texts: by its name in the library, else ``pattern``.
+            Name of a pattern → texts: its name in the library, else ``pattern``.
         values : dict
-            A pattern of the library takes the values of its own parameters; all the others belong to the texts.
+            Library patterns take the values of their own parameters; all others belong to the
+            texts.
         """
         from sgstore.lang.library import pattern_named
 
@@ -604,7 +607,7 @@ class Statements:
         taken = {name for one in found.values() for name in one.parameters}
         rest = {name: value for name, value in values.items() if name not in taken}
         if rest and not (files or texts):
-            found[next(iter(found))].written(**rest)  # which says what it would take
+            found[next(iter(found))].written(**rest)  # raises an error with the known parameters
         asked = {"pattern": [*map(text_of, files or ()), *texts]} if files or texts else {}
         for name, one in found.items():
             own = {key: value for key, value in values.items() if key in one.parameters}
@@ -630,7 +633,7 @@ class GraphOptions:
     ] = None
 
     def settings(self) -> Config | None:
-        """Settings of ``--config`` or ``--preset``; ``None`` if neither is given."""
+        """Return the settings of ``--config`` or ``--preset``, or ``None``."""
         from sgstore.config import load
         from sgstore.config import preset as preset_named
 
@@ -643,7 +646,7 @@ class GraphOptions:
 
 @dataclass(frozen=True)
 class ReadingOptions(GraphOptions):
-    """Options for a recording that is read: its road map, and the settings of the scene graphs."""
+    """Options for reading a recording: its road map, and the settings of the scene graphs."""
 
     road_map: Annotated[
         Path | None,
@@ -689,7 +692,7 @@ _ENDINGS: Final = {
 
 
 def form_of(form: Format, output: Path | None = None, *, as_json: bool) -> Format:
-    """Return the format by ``--format`` and ``--json``, or by the name of the file."""
+    """Return the format by ``--format`` and ``--json``, or by the file name."""
     if as_json and form not in {Format.table, Format.json}:
         raise typer.BadParameter(f"give one of --json and --format {form}")
     if as_json or form is not Format.table or output is None:
@@ -704,7 +707,7 @@ def form_of(form: Format, output: Path | None = None, *, as_json: bool) -> Forma
 
 
 def tables_of(given: list[str] | None) -> dict[str, Path]:
-    """``--with`` as files by the names of their tables: ``NAME=FILE``, or the name of the file."""
+    """Parse ``--with`` into files by table name: ``NAME=FILE``, or the name of the file."""
     tables: dict[str, Path] = {}
     for text in given or []:
         name, equals, path = text.partition("=")
@@ -719,7 +722,7 @@ def tables_of(given: list[str] | None) -> dict[str, Path]:
 
 
 def query_of(text: str | None, file: Path | None) -> str:
-    """The query of an argument, or of a file."""
+    """Return the query of an argument or of a file."""
     if (text is None) == (file is None):
         raise typer.BadParameter("give a query as an argument, or a file with -f FILE")
     return text if text is not None else text_of(file or Path("-"))
@@ -728,7 +731,7 @@ def query_of(text: str | None, file: Path | None) -> str:
 def asked_of(
     text: str | None, file: Path | None, name: str | None, values: Mapping[str, Any]
 ) -> tuple[str, Mapping[str, Any]]:
-    """The query as a text, from a file, or of the library by its name; and values that it does not hold yet."""
+    """Return a query (text, file, or library name), and the values for its remaining parameters."""
     if sum(source is not None for source in (text, file, name)) != 1:
         raise typer.BadParameter("give one of: a query as a text, a file with it, -p NAME")
     if name is None:
@@ -739,7 +742,7 @@ def asked_of(
 
 
 def text_of(file: Path) -> str:
-    """The text in a file; ``-`` is stdin."""
+    """Return the text in a file; ``-`` is stdin."""
     try:
         return sys.stdin.read() if str(file) == "-" else file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -749,12 +752,12 @@ def text_of(file: Path) -> str:
 
 
 def lines_of(file: Path) -> list[str]:
-    """The lines of a file that hold something."""
+    """Return the non-empty lines of a file."""
     return [line.strip() for line in text_of(file).splitlines() if line.strip()]
 
 
 def parameters_of(pairs: list[str] | None) -> dict[str, Any]:
-    """``NAME=VALUE`` as values: numbers, ``true`` and ``false``, lists as in JSON, all else as texts."""
+    """Parse ``NAME=VALUE``: numbers, ``true`` and ``false``, JSON lists, else texts."""
     values: dict[str, Any] = {}
     for pair in pairs or []:
         name, equals, value = pair.partition("=")
@@ -767,7 +770,7 @@ def parameters_of(pairs: list[str] | None) -> dict[str, Any]:
 
 
 def _listed(pair: str, value: str) -> Any:
-    import json  # few need it
+    import json  # rarely needed
 
     try:
         return json.loads(value)
@@ -792,12 +795,12 @@ _UNIT: Final = {"ms": 1e-3, "s": 1.0, "min": 60.0, None: 1.0}
 
 
 def jobs_of(number: int) -> int:
-    """``--jobs`` as a number of processes; 0 is one for each core."""
+    """Return the number of processes for ``--jobs``; 0 means one per core."""
     return number or os.cpu_count() or 1
 
 
 def seconds_of(text: str, option: str) -> float:
-    """A time such as ``2s`` in seconds."""
+    """Parse a time such as ``2s`` to seconds."""
     match = _TIME.fullmatch(text.strip())
     if match is None:
         raise typer.BadParameter(f"{option} {text!r}: expected a time such as 2s, 500ms or 1min")
@@ -808,7 +811,7 @@ _SIZE: Final = re.compile(r"(\d+(?:\.\d+)?)\s*([kMGT]?)B", re.IGNORECASE)
 
 
 def bytes_of(text: str, option: str) -> int:
-    """A size such as ``20GB`` in bytes."""
+    """Parse a size such as ``20GB`` to bytes."""
     match = _SIZE.fullmatch(text.strip())
     size = round(float(match[1]) * 1000 ** "_kmgt".find(match[2].lower() or "_")) if match else 0
     if match is None or not 1000 <= size < 1 << 62:
@@ -819,7 +822,7 @@ def bytes_of(text: str, option: str) -> int:
 def say_left_out(
     matches: Matches | Answer | ChosenFrames | UserStatement | PartedMatches | PartedRows,
 ) -> None:
-    """Say which traces cannot answer a query, and why, and what may be a mistake in it."""
+    """Report the traces that cannot answer a query, with reasons, and likely mistakes in it."""
     of: dict[str, list[str]] = {}
     for name, reason in matches.reasons.items():
         of.setdefault(reason, []).append(name)
@@ -829,7 +832,7 @@ def say_left_out(
 
 
 def say_scope(found: Mapping[str, Any], chosen: Format) -> None:
-    """Say in one line what settings left out of what is asked; as JSON where results are."""
+    """Report in one line what settings omitted; as JSON if the results are JSON."""
     from sgstore.store import scope_text
 
     if not found:
@@ -841,7 +844,7 @@ def say_scope(found: Mapping[str, Any], chosen: Format) -> None:
 
 
 def say_unknown(told: Iterable[tuple[str, str, str]]) -> None:
-    """Say what is unknown of which traces, and why: of names, traces and reasons; no reason, nothing to say."""
+    """Report unknown values by name, trace and reason; entries without a reason are skipped."""
     from sgstore.temporal import unknown_notes
 
     for note in unknown_notes((f"{name} is unknown", trace, why) for name, trace, why in told):
@@ -849,6 +852,6 @@ def say_unknown(told: Iterable[tuple[str, str, str]]) -> None:
 
 
 def say_notes(notes: Iterable[str]) -> None:
-    """Say what may be a mistake in a query."""
+    """Report likely mistakes in a query."""
     for note in notes:
         say(f"note: {note}")

@@ -1,6 +1,6 @@
 """Output of verbs: progress bars, tables, machine formats, and reports on recordings.
 
-The bar that long work shows, on a terminal and nowhere else.
+Progress bars appear only on a terminal.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def ingest_bar() -> Generator[Callable[[Progress], None] | None]:
-    """A function that shows the progress of an ingest on stderr; ``None`` where that is no terminal."""
+    """Yield a function that shows the progress of an ingest on stderr; ``None`` without a terminal."""
     if quiet() or not sys.stderr.isatty():
         yield None
         return
@@ -67,7 +67,7 @@ def ingest_bar() -> Generator[Callable[[Progress], None] | None]:
 
 @contextmanager
 def count_bar(what: str, things: str) -> Generator[Callable[[int, int], None] | None]:
-    """A function that shows how many of how many things are done; ``None`` where stderr is no terminal."""
+    """Yield a function that shows a progress count; ``None`` if stderr is not a terminal."""
     if quiet() or not sys.stderr.isatty():
         yield None
         return
@@ -88,9 +88,9 @@ def count_bar(what: str, things: str) -> Generator[Callable[[int, int], None] | 
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-# Rows for people and for machines: a table that fits the terminal, JSON, NDJSON, CSV, Parquet, Arrow ----
-# In JSON, 64-bit ids and times (``frame_id``, ``trace_id``, ``bucket`` and whatever ends in ``_ns``) are texts,
-# because many JSON readers round whole numbers beyond 2⁵³; so is any other whole number beyond that.
+# Rows as a table that fits the terminal, JSON, NDJSON, CSV, Parquet or Arrow. In JSON, 64-bit ids
+# and times (``frame_id``, ``trace_id``, ``bucket`` and names ending in ``_ns``) are texts, because
+# many JSON readers round integers beyond 2⁵³; so are other integers beyond that.
 
 
 class Format(StrEnum):
@@ -105,13 +105,13 @@ class Format(StrEnum):
 
 
 _KEYS: Final = frozenset({"frame", "from", "trace"})
-"""Columns by which a row is found again."""
+"""Columns that identify a row."""
 _PATHS: Final = frozenset({"file", "path", "uri"})
-"""Columns whose texts are told apart by their ends."""
+"""Columns whose texts differ at their ends."""
 _LEAST: Final = 8
-"""Letters that a column keeps."""
+"""Least width of a column in letters."""
 LONG_TABLE: Final = 20
-"""Rows from which on a table on a terminal has its total below."""
+"""Least number of rows of a terminal table with a total."""
 BINARY: Final = frozenset({Format.parquet, Format.arrow})
 _WITHOUT_NESTING: Final = frozenset({Format.csv, *BINARY})
 
@@ -128,23 +128,24 @@ def write_rows(
     output: Path | None = None,
     types: Sequence[str] | None = None,
 ) -> int:
-    """Print rows as they come, on stdout or into a file; memory does not grow with their number.
+    """Print rows as they arrive, to stdout or a file; memory does not grow with their number.
 
     Parameters
     ----------
     columns : sequence of str
     rows : iterable of sequences
-        Plain Python values; ``None`` is a missing one.
+        Plain Python values; ``None`` means a missing value.
     form : Format
     output : Path, optional
-        A file to write instead of stdout; Parquet and Arrow need one, unless stdout is a pipe or a file.
+        Output file instead of stdout; required for Parquet and Arrow, unless stdout is a pipe or a
+        file.
     types : sequence of str, optional
         The database's types of the columns, for Parquet and Arrow.
 
     Returns
     -------
     int
-        How many rows were written.
+        Number of written rows.
 
     Raises
     ------
@@ -164,7 +165,7 @@ def write_rows(
 
 
 def write_document(values: dict[str, Any], form: Format) -> None:
-    """Print one thing on stdout: its values one a line for people, else as one JSON document."""
+    """Print one object on stdout: one value per line as text, or one JSON document."""
     if form is Format.table:
         lines = [(name, _cell(_json_value(value, name))) for name, value in values.items()]
         width = max(len(name) for name, _ in lines)
@@ -175,7 +176,7 @@ def write_document(values: dict[str, Any], form: Format) -> None:
 
 @dataclass(slots=True)
 class _Manner:
-    """Whether remarks are told, and how many places asked for less or for more."""
+    """State of the options ``--quiet`` and ``--verbose``."""
 
     quiet: bool = False
     handler: Any = None
@@ -185,14 +186,14 @@ _manner = _Manner()
 
 
 def talk(*, quiet: bool, verbose: bool) -> None:
-    """Tell less, or more, from here on: what the words before and behind a verb say holds together.
+    """Set quiet or verbose output; options before and after a verb are combined.
 
     Parameters
     ----------
     quiet : bool
-        :func:`say` and bars of progress tell nothing; results and errors stay.
+        True to suppress :func:`say` and progress bars; results and errors stay.
     verbose : bool
-        What the library logs is told on stderr, with the seconds since the process began.
+        True to print the library's log on stderr, with the time since the process start.
     """
     _manner.quiet |= quiet
     if verbose and _manner.handler is None:
@@ -206,7 +207,7 @@ def talk(*, quiet: bool, verbose: bool) -> None:
 
 
 def talk_as_usual() -> None:
-    """End what :func:`talk` began."""
+    """Reset the settings of :func:`talk`."""
     handler, _manner.handler, _manner.quiet = _manner.handler, None, False
     if handler is not None:
         import logging
@@ -216,39 +217,39 @@ def talk_as_usual() -> None:
 
 
 def number_of(number: int, what: str, more: str = "s") -> str:
-    """So many things, in words; ``more`` is what the word has behind it if they are several."""
+    """Return a count with its noun; ``more`` is the plural suffix."""
     return f"{number:,} {what}{'' if number == 1 else more}"
 
 
 def say(message: str) -> None:
-    """Tell something that is neither a result nor an error, on stderr."""
+    """Print a remark, neither result nor error, on stderr."""
     if not _manner.quiet:
         complain(message)
 
 
 def say_json(found: Mapping[str, Any]) -> None:
-    """Tell the same as one line of JSON, for who reads results as JSON."""
+    """Print a remark as one line of JSON on stderr, for programs."""
     if not _manner.quiet:
         sys.stderr.write(f"{json.dumps(found, ensure_ascii=False)}\n")
 
 
 def complain(message: str) -> None:
-    """Tell an error, on stderr."""
+    """Print an error on stderr."""
     sys.stderr.write(f"sgstore: {without_controls(message)}\n")
 
 
 def quiet() -> bool:
-    """Return true if nothing but results and errors is told."""
+    """True if only results and errors are printed."""
     return _manner.quiet
 
 
 def write_error(about: dict[str, Any]) -> None:
-    """Tell an error as data: one line of JSON on stderr."""
+    """Print an error as one line of JSON on stderr."""
     sys.stderr.write(f"{json_text(_json_object(about))}\n")
 
 
 def write_text(text: str, output: Path | None = None) -> None:
-    """Print a text as it is, on stdout or into a file.
+    """Print a text literally, to stdout or a file.
 
     Raises
     ------
@@ -297,11 +298,11 @@ def _dumps(columns: Sequence[str], row: Sequence[Any]) -> str:
 
 
 _CONTROLS: Final = {code: f"\\u{code:04x}" for code in range(0x7F, 0xA0)}
-"""The characters that a terminal may take for orders and JSON leaves as they are."""
+"""Control characters for terminals that JSON does not escape."""
 
 
 def json_text(value: Any, indent: int | None = None) -> str:
-    """A value as JSON that can be shown in a terminal."""
+    """Return a value as JSON that is safe for a terminal."""
     text = json.dumps(value, ensure_ascii=False, indent=indent)
     return text if text.isprintable() else text.translate(_CONTROLS)
 
@@ -311,7 +312,7 @@ def _csv_cell(value: Any) -> Any:
 
 
 def _flat(value: Any) -> Any:
-    """Lists and objects as JSON, for forms that have none."""
+    """Convert lists and objects to JSON, for formats without nesting."""
     return json.dumps(_json_value(value), ensure_ascii=False) if _is_nested(value) else value
 
 
@@ -341,14 +342,14 @@ def _json_value(value: Any, name: str = "") -> Any:
 
 
 def write_binary(write: Callable[[Path], int], form: Format, output: Path | None) -> int:
-    """Write Parquet, or by way of it, so that memory stays bounded and types are those of the whole, Arrow.
+    """Write Parquet, or Arrow from a temporary Parquet file, with bounded memory and common types.
 
     Parameters
     ----------
     write : callable
-        Writes a Parquet file, and tells how many rows it has.
+        Function that writes a Parquet file, and returns its number of rows.
     form, output
-        As of :func:`write_rows`, which says what is raised, too.
+        As in :func:`write_rows`, with the same errors.
     """
     if form is Format.parquet and output is not None:
         return write(output)
@@ -375,7 +376,7 @@ def write_binary(write: Callable[[Path], int], form: Format, output: Path | None
 
 
 def _write_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], stream: TextIO) -> int:
-    """A table whose widths the first rows set, so that it can start before the last row is known."""
+    """Write a table with widths from the first rows, so that output starts early."""
     rows = iter(rows)
     first = [[_cell(value) for value in row] for row in islice(rows, ROWS_THAT_SET_WIDTHS)]
     if not first:
@@ -406,13 +407,13 @@ def _write_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], stream: 
 
 
 def _room(stream: TextIO) -> int | None:
-    """Columns of the terminal, or ``None`` where the table does not go to one."""
+    """Return the width of the terminal, or ``None`` for other outputs."""
     return shutil.get_terminal_size().columns if stream.isatty() else None
 
 
 @dataclass(slots=True)
 class _TerminalColumn:
-    """Column of a table on a terminal: its place in a row, its width, and how much of a cell is shown."""
+    """Column of a table on a terminal: index, width, and shortening."""
 
     place: int
     name: str
@@ -422,7 +423,7 @@ class _TerminalColumn:
     most: int = 0
 
     def text(self, cell: str) -> str:
-        """A cell as it is shown: of a path both ends, of other texts the beginning; numbers whole."""
+        """Return a cell as shown: paths keep both ends, other texts the beginning; numbers are never cut."""
         room = self.most or self.width
         if len(cell) > room and not (self.right or self.whole):
             end = (room - 1) * 2 // 3 if self.name in _PATHS else 0
@@ -437,10 +438,11 @@ def _terminal_line(cells: Sequence[str], layout: Sequence[_TerminalColumn]) -> s
 def _fitted(
     columns: Sequence[str], widths: Sequence[int], numeric: Sequence[bool], room: int
 ) -> tuple[list[int], list[int]]:
-    """The columns that are shown, and widths of all.
+    """Return the shown columns, and the widths of all.
 
-    Texts give way first, the widest of them, to 8 letters; then columns are left out, the last ones first; then
-    what a row is found by gives way. Numbers are whole: one that is cut is another number.
+    First the widest texts are shortened, down to 8 letters; then the last columns are omitted; then
+    the identifying columns are shortened. Numbers are never cut, because a cut number is a wrong
+    number.
     """
     widths, kept = list(widths), list(range(len(columns)))
     keys = {i for i, name in enumerate(columns) if name in _KEYS} or {0}
@@ -464,7 +466,7 @@ def _fitted(
 
 
 def _line(cells: Sequence[str], widths: Sequence[int], numeric: Sequence[bool]) -> str:
-    """A row as text, with cells that are whole: in a file or a pipe."""
+    """Return a row as text with complete cells, for a file or a pipe."""
     texts = (
         cell.rjust(width) if right else cell.ljust(width)
         for cell, width, right in zip(cells, widths, numeric, strict=True)
@@ -486,20 +488,20 @@ def _is_number(cell: str) -> bool:
     return not cell or (cell.lstrip("-")[:1].isdigit() and cell[-1:].isdigit() and " " not in cell)
 
 
-# What is known of a recording, for people: a line a fact, and below it what needs more than one ----
+# Report on a recording as text: one fact per line, then lists.
 
 _MANY: Final = 20
-"""Losses and warnings that are listed; the others are counted."""
+"""Greatest number of listed losses and warnings; further ones are counted."""
 
 
 def write_report(values: dict[str, Any]) -> None:
-    """Print what is known of a recording on stdout.
+    """Print a report on a recording on stdout.
 
     Parameters
     ----------
     values : dict
-        What :meth:`sgstore.store.StoredTrace.as_dict` with its report, or
-        :meth:`sgstore.ingest.Examination.as_dict` tells; what is missing or empty is left out.
+        Result of :meth:`sgstore.store.StoredTrace.as_dict` with its report, or of
+        :meth:`sgstore.ingest.Examination.as_dict`; missing and empty values are skipped.
     """
     facts = [(name, text) for name, text in _facts(values) if text]
     width = max((len(name) for name, _ in facts), default=0)
@@ -622,5 +624,5 @@ def _amount(size: int) -> str:
 
 
 def _shown(text: str) -> str:
-    """Texts come from files: what would move a terminal's cursor is not printed."""
+    """Replace unprintable characters, because texts from files could control the terminal."""
     return "".join(c if c.isprintable() else "�" for c in text)

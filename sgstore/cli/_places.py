@@ -1,4 +1,4 @@
-"""Collections that are named where a store is expected, and how verbs ask one."""
+"""Collections in place of a store, and their options for verbs."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 
 def url_of(store: Path) -> str | None:
-    """The place of a collection, if what is named as a store is one; else ``None``."""
+    """Return the place of a collection if the store argument names one, else ``None``."""
     if (url := url_named(store)) is not None:
         return url
-    with suppress(OSError, ValueError):  # what cannot be looked at is refused as a store
+    with suppress(OSError, ValueError):  # unreadable paths are rejected later as a store
         return str(store) if (store / COLLECTION_FILE).is_file() else None
     return None
 
@@ -35,7 +35,7 @@ COLLECTIONS: Final = "Collections"
 
 @dataclass(frozen=True)
 class CollectionOptions:
-    """Options for a collection that is asked where a store is expected."""
+    """Options for a collection in place of a store."""
 
     engine: Annotated[
         str,
@@ -59,7 +59,7 @@ class CollectionOptions:
     def collection_at(
         self, url: str, bounds: QueryLimits, tables: list[str] | None = None, *, safe: bool = False
     ) -> Generator[Collection]:
-        """Open a collection within bounds of time, with tables of the user's own."""
+        """Open a collection with a time limit and user tables."""
         from sgstore.collection import Collection
 
         if safe:
@@ -74,7 +74,7 @@ class CollectionOptions:
             yield whole
 
     def opened_at(self, place: Path, bounds: QueryLimits) -> Store | Collection:
-        """Open a store or a collection within bounds."""
+        """Open a store or a collection with limits."""
         if (url := url_of(place)) is None:
             return bounds.opened(place)
         with self.collection_at(url, bounds) as whole:
@@ -85,7 +85,7 @@ _asked: Final[list[Any]] = []  # Collection
 
 
 def note_asked(store: Store | Collection) -> None:
-    """Note what a verb asks: of a collection, some bundles may not answer."""
+    """Register the store of a verb: bundles of a collection may fail to answer."""
     if hasattr(store, "missing"):
         whole: Any = store
         _asked.append(whole)
@@ -97,7 +97,7 @@ def note_asked(store: Store | Collection) -> None:
 
 
 def with_missing(code: int) -> int:
-    """Say which bundles did not answer a verb, which ends with this exit code; the exit code then."""
+    """Report the bundles that did not answer; return the final exit code of a verb."""
     missing = {name: why for whole in _asked for name, why in whole.missing.items()}
     for bundle, why in missing.items():
         say(f"bundle {bundle[:12]}… did not answer: {why}")
@@ -105,5 +105,5 @@ def with_missing(code: int) -> int:
 
 
 def forget_asked() -> None:
-    """Forget what a verb asked, which is over."""
+    """Clear the registered stores after a verb."""
     _asked.clear()

@@ -1,4 +1,4 @@
-"""How critical it was, and test cases in an order: by risk, diversity, both, or known outcomes."""
+"""The verbs criticality and prioritize: recorded measures, and orders of test cases."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def criticality(
 
 @dataclass(frozen=True)
 class OrderOptions:
-    """Options for an order of cases: what comes first, and what a case is."""
+    """Options for an order of cases: the rule, and the unit of a case."""
 
     by: Annotated[
         Literal["risk", "diverse", "both", "learned"],
@@ -101,7 +101,7 @@ class OrderOptions:
     seed: Annotated[int, Option("--seed", min=0, max=(1 << 63) - 1, help="Random seed.")] = 0
 
     def spec(self) -> PrioritySpec:
-        """Make what the options say together."""
+        """Return the specification of these options."""
         from sgstore.selection import MEASURES, Budget, Priority, PrioritySpec, SelectionUnit
 
         return PrioritySpec(
@@ -118,7 +118,7 @@ class OrderOptions:
 
 @dataclass(frozen=True)
 class OutcomeOptions:
-    """Options for outcomes that are known: to learn from, and to rate an order by."""
+    """Options for known outcomes: for learning, and for rating an order."""
 
     outcomes: Annotated[
         Path | None,
@@ -150,7 +150,7 @@ class OutcomeOptions:
     ] = None
 
     def check(self, by: str) -> None:
-        """Refuse options that need others.
+        """Reject options without their required partner.
 
         Raises
         ------
@@ -195,7 +195,7 @@ def prioritize(
     from sgstore.selection import prioritize as put_in_order
 
     spec = order.spec()
-    if output is not None and output.suffix != ENDING:  # before anything is searched
+    if output is not None and output.suffix != ENDING:  # before the search starts
         raise typer.BadParameter(f"--output {output}: the name of a lock ends in {ENDING}")
     given.check(order.by)
     known = None if given.outcomes is None else read_outcomes(given.outcomes)
@@ -210,7 +210,7 @@ def prioritize(
         say(text)
     if known is not None:
         _fault_detection(found, known, given.picture)
-    rows = found.rows()  # the store is asked for them before there is a lock
+    rows = found.rows()  # the store is read before the lock is made
     if output is not None:
         values = parameters_of(parameters)
         with count_bar(output.name, "cases") as progress:
@@ -222,12 +222,12 @@ def prioritize(
                 progress=progress,
             )
         say_made(made, output)
-    # Last: who reads only the first rows has the lock all the same.
+    # Last, so that the lock exists even if the reader stops after the first rows.
     out.write(found.columns, rows, found.types)
 
 
 def _fault_detection(order: Prioritized, known: dict[str, bool], picture: Path | None) -> None:
-    """Say, and draw, how soon the failures come."""
+    """Report, and draw, how soon the order finds failures."""
     from sgstore.selection import failed_in_order, failure_curve, fault_detection
 
     failed = failed_in_order(order, known)

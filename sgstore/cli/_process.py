@@ -1,15 +1,17 @@
 """Signals, deadlines and standard streams of the process.
 
-How a run ends before it is done: by Ctrl-C, by a signal, or at its deadline. All three end it alike.
+A run can end early by Ctrl-C, by a signal, or at its deadline, with the same treatment.
 
-Each becomes a ``KeyboardInterrupt`` in the main thread, so that everything is undone on the way out: processes
-end, transactions are rolled back, and what was being written is removed. Here it is remembered which it was.
+Each becomes a ``KeyboardInterrupt`` in the main thread, so that everything is undone: processes
+end, transactions are rolled back, and unfinished files are removed. This module remembers the
+cause.
 
-An interruption that comes while Python runs a ``__del__`` or a callback of a weak reference is lost: Python
-reports it and goes on. :func:`_lost` hears of that and raises it again a moment later.
+An interruption during a ``__del__`` or a weak reference callback is lost: Python reports it and
+continues. :func:`_lost` catches the report and raises the interruption again a moment later.
 
-Python heeds a signal only between its own steps. One step of the database may take for ever, so the main thread
-does none itself, but waits for a thread that does: see ``interruptible`` of :mod:`sgstore.store._steps`.
+Python handles a signal only between its own steps. One step of the database can take very long;
+therefore the main thread only waits for a worker thread: see ``interruptible`` of
+:mod:`sgstore.store._steps`.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
 
 
 INTERRUPTED: Final = 128 + 2
-"""Exit code after Ctrl-C: 128 and the number of the signal."""
+"""Exit code after Ctrl-C: 128 plus the signal number."""
 
 _ENDS: Final = tuple(
     number for name in ("SIGTERM", "SIGHUP") if (number := getattr(signal, name, None)) is not None
@@ -40,7 +42,7 @@ _ENDS: Final = tuple(
 
 @dataclass(slots=True)
 class _RunEnd:
-    """State of the end of this process: its cause, and the earlier hook for lost errors."""
+    """End state of this process: its cause, and the previous hook for lost errors."""
 
     signal: int = 0
     deadline_s: float = 0.0
@@ -52,7 +54,7 @@ _run = _RunEnd()
 
 
 def heed_signals() -> None:
-    """Let signals end this process as Ctrl-C does; what its parent has it ignore (``nohup``) is ignored."""
+    """Handle signals like Ctrl-C, except those that the parent ignores (``nohup``)."""
     for number in _ENDS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _end)
@@ -60,17 +62,17 @@ def heed_signals() -> None:
 
 
 def ignore_signals() -> None:
-    """The run is over, and what is left to be done is done in a moment."""
+    """Ignore further signals during the final steps of a run."""
     for number in (signal.SIGINT, signal.SIGALRM, *_ENDS):
         signal.signal(number, signal.SIG_IGN)
-    # If an interruption came out of a text that was run as code, as libraries do that make classes, Python ends
-    # with SIGINT whatever the exit code is; unless another such text is run, and this is one.
+    # An interruption inside code run from a text, as in libraries that generate classes, makes
+    # Python end with SIGINT despite the exit code; running another such text, as here, resets this.
     namedtuple("_Nothing", ())  # pyright: ignore[reportUntypedNamedTuple]
 
 
 def _end(number: int, _frame: FrameType | None) -> None:
     _run.signal = number
-    for other in _ENDS:  # whoever asks twice does not get less of what is to be undone
+    for other in _ENDS:  # a second signal must not interrupt the cleanup
         signal.signal(other, signal.SIG_IGN)
     raise KeyboardInterrupt
 
@@ -81,7 +83,7 @@ def _hear_of_lost() -> None:
 
 
 def _lost(report: Any) -> None:
-    """Take what Python could not raise; an interruption among it is raised again."""
+    """Handle an error that Python could not raise; an interruption is raised again."""
     if not issubclass(report.exc_type, KeyboardInterrupt):
         _run.reported(report)
         return
@@ -95,7 +97,7 @@ def _again(_number: int, _frame: FrameType | None) -> None:
 
 
 def set_deadline(seconds: float) -> None:
-    """End what is running after so many seconds."""
+    """Set a deadline after which the run is interrupted; s."""
     clear_deadline()
     _run.deadline_s = seconds
     _hear_of_lost()
@@ -104,7 +106,7 @@ def set_deadline(seconds: float) -> None:
 
 
 def clear_deadline() -> None:
-    """There is none any more, and none has passed."""
+    """Remove the deadline and its state."""
     if _run.deadline_s:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
@@ -119,12 +121,12 @@ def _too_late(_number: int, _frame: FrameType | None) -> None:
 
 
 def was_ended() -> bool:
-    """Return true if a signal or the deadline has ended the run, even if its interruption was lost."""
+    """True if a signal or the deadline ended the run, even if its interruption was lost."""
     return bool(_run.signal) or _run.late
 
 
 def refuse_late() -> None:
-    """Raise what is said of a deadline that has passed; nothing if none has.
+    """Raise an error if the deadline has passed.
 
     Raises
     ------
@@ -138,25 +140,27 @@ def refuse_late() -> None:
 
 
 def exit_code() -> int:
-    """The exit code of a run that was ended."""
+    """Return the exit code of an interrupted run."""
     return 128 + _run.signal if _run.signal else INTERRUPTED
 
 
 def word() -> str:
-    """Name of what ended the run."""
+    """Return the name of the cause of an interruption."""
     return f"ended by {signal.Signals(_run.signal).name}" if _run.signal else "interrupted"
 
 
-# The streams of this process: what cannot be written is an error with a name, and never a traceback ----
+# Standard streams of this process: a failed write becomes an error with a message, never a
+# traceback.
 
 
 def take_streams() -> None:
-    """Put streams of ours in the place of Python's, whether these are open or not.
+    """Replace Python's standard streams, open or closed, by our own.
 
-    A full disk behind stdout is an :class:`~sgstore.errors.ExportError` then, and a reader that has gone away a
-    :class:`~sgstore.files.ReaderGoneError`. What stderr does not take is dropped: there is nobody to be told.
+    A full disk behind stdout raises :class:`~sgstore.errors.ExportError`, and a reader that has
+    exited raises :class:`~sgstore.files.ReaderGoneError`. Failed writes to stderr are dropped,
+    because there is no other output.
     """
-    if os.name != "posix":  # Python's own streams know how to speak to a console there
+    if os.name != "posix":  # elsewhere Python's streams handle the console
         return
     closed = [one is None for one in (sys.stdin, sys.stdout, sys.stderr)]
     if any(closed):
@@ -168,17 +172,15 @@ def take_streams() -> None:
 
 
 def _occupy() -> None:
-    """Let no file that is opened later become a standard stream, which anybody might write to."""
-    descriptor = os.open(
-        os.devnull, os.O_RDONLY
-    )  # so what is written to it fails, as to a closed one
+    """Fill closed descriptors, so that a later file never becomes a standard stream."""
+    descriptor = os.open(os.devnull, os.O_RDONLY)  # writes to it fail, as to a closed stream
     while descriptor < 3:
         descriptor = os.dup(descriptor)
     os.close(descriptor)
 
 
 def _stream(before: TextIO | None, descriptor: int, name: str, *, quiet: bool = False) -> TextIO:
-    told: Any = before  # what else it is says Python's documentation, and not its type
+    told: Any = before  # the real type differs from the declared one
     raw = Stream(descriptor, name, quiet=quiet, owned=False)
     strict = before is None or before.errors in {None, "strict"}
     at_once = bool(told and told.write_through)

@@ -109,7 +109,7 @@ def find(
         number = ask.write(*_as_shown(answer, answer.rows, ask.chosen))
         return _ended(number, ask, require=require)
     opened = ask.opened(store, tables_of(tables))
-    with opened.file.snapshot():  # it is opened once
+    with opened.file.snapshot():  # open the store once
         matches = opened.find(text, **values)
         if explain:
             typer.echo(matches.explain())
@@ -130,7 +130,7 @@ def find(
 
 
 def _returns_nothing(text: str) -> bool:
-    """Tell whether a query says nothing of its results: a row comes for each match and frame."""
+    """True if a query has no ``RETURN``: one row per match and frame."""
     from sgstore.lang import each_match, parse
     from sgstore.lang.syntax import MatchClause
 
@@ -139,7 +139,7 @@ def _returns_nothing(text: str) -> bool:
 
 
 def _write_stretches(intervals: Iterator[Interval], ask: AskOptions) -> int:
-    """Show stretches of frames, and then what all of them come to."""
+    """Print intervals, then their totals."""
     traces: set[str] = set()
     frames, seconds = 0, 0.0
 
@@ -171,7 +171,7 @@ def _found_in(
     explain: bool,
     require: bool,
 ) -> int:
-    """Print what a collection has for a query; the exit code."""
+    """Print the results of a collection for a query; return the exit code."""
     matches = whole.find(text, **values)
     if explain:
         typer.echo(matches.explain())
@@ -189,7 +189,7 @@ def _found_in(
 
 
 def _ended(number: int, ask: AskOptions, *, require: bool) -> int:
-    """Tell people that there are no rows; the exit code."""
+    """Report missing rows on a terminal; return the exit code."""
     if not number and ask.for_people:
         say("nothing matches")
     return NO_MATCH if require and not number else 0
@@ -198,7 +198,7 @@ def _ended(number: int, ask: AskOptions, *, require: bool) -> int:
 def _as_shown(
     answer: Matches | Answer | PartedMatches, rows: Iterable[tuple[Any, ...]], form: Format
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-    """Columns and rows as a form has them: names for people; graphs in JSON as networkx reads them."""
+    """Return columns and rows for a format: readable names in tables; graphs for networkx in JSON."""
     from sgstore.lang import for_people
 
     if form is Format.table:
@@ -209,7 +209,7 @@ def _as_shown(
 def _node_link(
     answer: Matches | Answer | PartedMatches, rows: Iterable[tuple[Any, ...]], form: Format
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-    """Rows that end in a graph: in JSON as networkx reads them."""
+    """Return rows with graphs at the end, in JSON as for networkx."""
     if form not in {Format.json, Format.ndjson}:
         return answer.columns, rows
     columns = ("directed", "multigraph", *answer.columns)
@@ -304,11 +304,11 @@ def like(
 
 
 _FEATURES_SHOWN: Final = 3
-"""Features of a row for people; the others are counted, and in the rows for programs."""
+"""Number of features shown per table row; further ones are counted, or complete in machine formats."""
 
 
 def _differing(features: dict[str, int]) -> str:
-    """Features with how often, as one text: the first, and how many more."""
+    """Return the first features with counts as text, and the number of others."""
     shown = [f"{n} x {text}" if n > 1 else text for text, n in features.items()]
     more = shown[_FEATURES_SHOWN:]
     return ", ".join([*shown[:_FEATURES_SHOWN], *([f"… {len(more)} more"] if more else [])])
@@ -401,7 +401,7 @@ def _sandbox(store: Path, bounds: QueryLimits, max_rows: int, tables: list[str] 
 
 
 def _say_all(answer: Answer) -> None:
-    """Say what an answer lacks."""
+    """Report omissions of a result."""
     say_left_out(answer)
     if answer.truncated:
         say(f"only the first {len(answer.rows)} rows; --max-rows sets how many")
@@ -559,7 +559,7 @@ def _check(store: Path, **options: Any) -> int:
 
 
 def _write_intervals(intervals: Iterator[Interval], ask: AskOptions) -> int:
-    """Intervals as rows; for people, with a name for each that takes part instead of its node id."""
+    """Write intervals as rows; tables have names of the participants instead of node ids."""
     from sgstore.matches import intervals_for_people
 
     if ask.for_people:
@@ -576,7 +576,7 @@ def _write_intervals(intervals: Iterator[Interval], ask: AskOptions) -> int:
 
 
 def _told(found: NamedPattern) -> dict[str, Any]:
-    """A pattern as data."""
+    """Return a pattern as data."""
     parameters = [
         {"name": p.name, "type": p.type, "default": p.default, "meaning": p.meaning}
         for p in found.parameters.values()
@@ -593,7 +593,7 @@ def _told(found: NamedPattern) -> dict[str, Any]:
 
 
 def _for_people(found: NamedPattern) -> str:
-    """A pattern as a query: with its parameters' defaults, everything about it as comments."""
+    """Return a pattern as a query with default parameters and explanatory comments."""
     head = [f"{found.name}: {found.sentence}", f"source: {found.source}"]
     head += [f"param {p.name} = {p.default}: {p.meaning}" for p in found.parameters.values()]
     head += ["", *found.example.splitlines()] if found.example else []

@@ -118,7 +118,7 @@ def ingest(
 
 
 def _told(outcomes: list[TraceOutcome], out: PrintedRows) -> int:
-    """Print what became of recordings; the exit code."""
+    """Print the status of recordings; return the exit code."""
     from sgstore.store import scope_of
 
     for outcome in outcomes:
@@ -140,7 +140,7 @@ def _with_scopes(
     reports: Iterable[Mapping[str, Any]],
     out: PrintedRows,
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-    """Columns and rows with the counts of what settings cut, where programs read them."""
+    """Add a column with counts of omissions by settings, for machine formats."""
     if out.chosen not in {Format.json, Format.ndjson}:
         return columns, rows
     scopes = (one.get("scope") for one in reports)
@@ -150,7 +150,7 @@ def _with_scopes(
 def _landed(
     store: Path, paths: list[Path], shard: str | None, how: dict[str, Any], *, alone: bool
 ) -> list[TraceOutcome]:
-    """Land a share of recordings in a collection; ``alone``: an option was given that is for a store."""
+    """Land a share of recordings in a collection; ``alone``: an option for stores was given."""
     if alone:
         raise typer.BadParameter("--force and --dry-run are for a store, not for a collection")
     from sgstore.collection import land
@@ -165,7 +165,7 @@ def _landed(
 
 
 def _names(traces: list[str]) -> list[str]:
-    """The names given, those on stdin in place of ``-``."""
+    """Return the given names, with names from stdin in place of ``-``."""
     return [name for one in traces for name in (lines_of(Path("-")) if one == "-" else [one])]
 
 
@@ -181,7 +181,7 @@ def _say_what_was_odd(outcome: TraceOutcome) -> None:
 
 
 def _no_kind(type_name: str) -> str:
-    """Advice about a type name that no mapping knows."""
+    """Return advice about a type name without a mapping."""
     name = json.dumps(type_name, ensure_ascii=False)
     return (
         "of which nothing says what kind it is; to say it, write into a file for --config:"
@@ -248,7 +248,7 @@ def info(
 
 
 def _tell_of_collection(url: str, names: list[str], out: PrintedRows) -> None:
-    """Print what the catalogue of a collection says of traces; without names of all."""
+    """Print the catalogue entries of traces; without names, of all."""
     from sgstore.collection import Collection
 
     whole = Collection(url)
@@ -272,7 +272,7 @@ def _tell_of_collection(url: str, names: list[str], out: PrintedRows) -> None:
 
 
 def _tell_all_of(file: StoreFile, names: list[str], out: PrintedRows) -> None:
-    """Print all that is known of traces: one as a document, several as rows."""
+    """Print all facts about traces: one as a document, several as rows."""
     with file.snapshot():
         found = [file.trace(name) for name in names]
         channels = [[asdict(one) for one in file.channels(trace.trace_id)] for trace in found]
@@ -379,7 +379,7 @@ def record(
 
 @contextmanager
 def _counter() -> Generator[Callable[[int, float], None] | None]:
-    """A line that counts frames on stderr; ``None`` where that is no terminal."""
+    """Yield a function that counts frames on stderr; ``None`` without a terminal."""
     if quiet() or not sys.stderr.isatty():
         yield None
         return

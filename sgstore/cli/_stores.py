@@ -218,7 +218,7 @@ def map_(
         (one.part, one.kind, one.count, None if one.length is None else round(one.length, 1))
         for one in summary(road_map)
     ]
-    if out.for_people:  # sentences have no room in a table
+    if out.for_people:  # a table has no room for sentences
         for _, text, _, _ in (row for row in rows if row[0] == "warning"):
             say(text)
         rows = [row for row in rows if row[0] != "warning"]
@@ -229,7 +229,7 @@ def map_(
 
 
 def _road_map(file: Path) -> RoadMap:
-    """The map in a file, or the one that a recording carries."""
+    """Return the road map in a file or a recording."""
     from sgstore.errors import MapError
     from sgstore.map_files import read_map_file
     from sgstore.opendrive import read_map
@@ -240,7 +240,7 @@ def _road_map(file: Path) -> RoadMap:
             start = stream.read(64)
     except OSError as error:
         raise MapError(f"{file}: {error.strerror or error}") from error
-    # Texts begin with a bracket, or the mark of their encoding; no recording does.
+    # Texts begin with a bracket, or a byte order mark; recordings do not.
     if start.lstrip()[:1] in {b"<", b"{"} or start[:2] in {b"\xff\xfe", b"\xfe\xff", b"\xef\xbb"}:
         return read_map_file(file)
     with open_trace(file) as trace:
