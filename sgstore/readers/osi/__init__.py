@@ -1,4 +1,4 @@
-"""sgstore.readers.osi."""
+"""Reader of ASAM OSI recordings."""
 
 import lazy_loader
 

@@ -1,9 +1,7 @@
-"""Single-channel OSI files (``.osi``, ``.osi.zst``).
+"""Reader of single-channel OSI files (``.osi``, ``.osi.zst``).
 
-The bytes of a single-channel OSI file, as they are or out of zstd, and where in the file they stand.
-
-A compressed file is decompressed block by block, and a block of zstd never becomes more than 128 KiB:
-so whatever a file claims, no more than that comes at once. What a whole file may become is bounded too.
+A compressed file is decompressed block by block. A zstd block has at most 128 KiB, so memory stays small for
+any file. The total decompressed size is limited, too.
 
 Source: zstd compression format (RFC 8878), sections 3.1.1 and 3.1.2.
 """
@@ -54,50 +52,50 @@ if TYPE_CHECKING:
 
 
 PREFIX: Final = struct.Struct("<I")
-"""Head of every message: how many bytes follow."""
+"""Head of every message: the number of following bytes."""
 MAX_MESSAGE: Final = 64 << 20
-"""Greatest size of a message; bytes."""
+"""Maximum size of a message; bytes."""
 MAX_RATIO: Final = 2000
-"""How many times larger a file may become that is decompressed."""
+"""Maximum compression ratio."""
 MAX_WINDOW: Final = 128 << 20
-"""Greatest window of a zstd frame (``zstd --long``); bytes."""
+"""Maximum window of a zstd frame (``zstd --long``); bytes."""
 
 ZSTD: Final = b"\x28\xb5\x2f\xfd"
 _ALWAYS: Final = 64 << 20
-"""What a file may become whatever its size; bytes."""
+"""Decompressed size that is always allowed; bytes."""
 _PIECE: Final = 1 << 20
 _FRAME_HEAD: Final = 18
-"""Greatest length of the head of a zstd frame; bytes."""
+"""Maximum length of the head of a zstd frame; bytes."""
 _SKIPPABLE: Final = range(0x184D2A50, 0x184D2A60)
 _LITERAL, _REPEATED, _COMPRESSED = 0, 1, 2
 
 
 def is_compressed(file: BinaryIO) -> bool:
-    """Return whether a file begins as zstd does."""
+    """True if a file starts with the magic number of zstd."""
     file.seek(0)
     magic = file.read(4)
     return magic == ZSTD or (len(magic) == 4 and PREFIX.unpack(magic)[0] in _SKIPPABLE)
 
 
 def pieces(file: BinaryIO, start: int = -1) -> Iterator[tuple[int, bytes]]:
-    """The content of a file, piece by piece; each with the place of the zstd frame that it is of.
+    """Yield the content of a file in pieces, each with the offset of its zstd frame.
 
     Parameters
     ----------
     file : file
     start : int
-        Where to begin: at the frame at this offset; -1: at the beginning.
+        Byte offset of the first frame to read; -1: the start of the file.
 
     Yields
     ------
     place : int
-        Byte offset of the zstd frame in the file; -1 where the file is not compressed.
+        Byte offset of the zstd frame in the file; -1 for an uncompressed file.
     content : bytes
 
     Raises
     ------
     TraceError
-        From here on the file cannot be decompressed, or it becomes too much.
+        The file cannot be decompressed from this point on, or the result is too large.
     """
     if start < 0 and not is_compressed(file):
         file.seek(0)
@@ -121,7 +119,7 @@ def pieces(file: BinaryIO, start: int = -1) -> Iterator[tuple[int, bytes]]:
 
 
 def _frame(file: BinaryIO, place: int) -> Iterator[bytes]:
-    """The blocks of a zstd frame; of one whose end is missing, those that are whole."""
+    """Yield the blocks of a zstd frame. Of a truncated frame, yield the complete blocks."""
     file.seek(place)
     head = file.read(_FRAME_HEAD)
     try:
@@ -143,28 +141,27 @@ def _frame(file: BinaryIO, place: int) -> Iterator[bytes]:
             yield decompressor.decompress(file.read(4))
     except READ_ERRORS as error:
         if len(head) < _FRAME_HEAD and not file.read(1):
-            return  # the file ends inside the head of a frame
+            return  # The file ends inside the head of a frame.
         raise TraceError(f"cannot be decompressed (zstd): {error}", offset=place) from error
 
 
 def read_message(path: Path, *, chunk_offset: int, offset: int, length: int) -> bytes:
-    """The data of one message, by its place.
+    """Return the data of one message by its position.
 
     Parameters
     ----------
     path : Path
     chunk_offset : int
-        Byte offset of the zstd frame that the message begins in, -1 where the file is not compressed.
+        Byte offset of the zstd frame with the start of the message, -1 for an uncompressed file.
     offset : int
-        Byte offset of the message's head in what that frame and the following become, or in the file.
+        Byte offset of the message's head in the decompressed data from this frame on, or in the file.
     length : int
         Bytes of its data.
 
     Raises
     ------
     TraceError
-        The file cannot be opened or decompressed, or there is no message of that length there: the file was
-        replaced.
+        The file cannot be opened or decompressed, or the message does not match, because the file was replaced.
     """
     missing = TraceError(
         f"no message of {length} bytes at {offset} there: the file was replaced", path=path
@@ -187,7 +184,7 @@ def read_message(path: Path, *, chunk_offset: int, offset: int, length: int) -> 
 
 
 def _cut(content: Iterator[tuple[int, bytes]], offset: int, length: int) -> bytes:
-    """``length`` bytes of a content from ``offset`` on."""
+    """Return ``length`` bytes of a content from ``offset`` on."""
     found = bytearray()
     position = 0
     for _, piece in content:
@@ -199,28 +196,28 @@ def _cut(content: Iterator[tuple[int, bytes]], offset: int, length: int) -> byte
     return bytes(found[:length])
 
 
-# Single-channel OSI files (``.osi``, ``.osi.zst``): messages one after another, each behind its length ----
-# Such a file has no channels, no schemas and no log times. It is given one channel; what its messages are
-# (ground truth or sensor views) is found out by reading the first ones as either, and a message's log time
-# is its own time. A length that cannot be is damage: the walk goes on where the next message begins just as
-# the first one does (with the version of OSI), and what lies between is a loss.
+# Single-channel OSI files (``.osi``, ``.osi.zst``): a sequence of messages, each after its length. Such a file
+# has no channels, schemas or log times. It gets one channel. The type of its messages (ground truth or sensor
+# views) is found by decoding the first ones as both. The log time of a message is its own time. An impossible
+# length is damage: reading continues at the next message with the same first bytes (the version of OSI), and
+# the bytes between are a loss.
 #
 # Source: open-simulation-interface 3.8.0, trace_file_formats.adoc (single-channel binary trace files).
 
 ENDINGS: Final = (".osi", ".osi.zst")
-"""How the names of such files end; nothing in them tells what they are."""
+"""Suffixes of such files. Their contents do not identify the format."""
 CHANNEL: Final = 1
-"""Id of the one channel."""
+"""Id of the only channel."""
 RUN_BYTES: Final = 4 << 20
-"""Messages that are handed on together have about this size at most; bytes."""
+"""Approximate maximum size of a run of messages; bytes."""
 
 _ENOUGH, _TRIED = 8, 1000
-"""Messages that are read to find out what they are: enough if they hold anything, and at most."""
+"""Number of messages decoded to find their type: enough if they are not empty, and the maximum."""
 _VERSION, _TIMESTAMP = 1, 2
 
 
 class OsiFile(MessageFile):
-    """A single-channel OSI file that is read once or more often, in the words of an MCAP file.
+    """Single-channel OSI file with the interface of an MCAP file, for one or more readings.
 
     Parameters
     ----------
@@ -229,11 +226,11 @@ class OsiFile(MessageFile):
     Attributes
     ----------
     path, size, mtime_ns
-        The file, its size in bytes, its time of change.
+        The file, its size in bytes, its modification time.
     schemas, channels : dict
-        The one schema and the one channel, whose topic is ``ground_truth`` or ``sensor_view``.
+        The only schema and the only channel, with the topic ``ground_truth`` or ``sensor_view``.
     counts : None
-        Nobody counted the messages.
+        The number of messages is unknown.
 
     Raises
     ------
@@ -272,15 +269,15 @@ class OsiFile(MessageFile):
         keep: Callable[[int], bool] | None = None,
         rank: Callable[[int], int] | None = None,
     ) -> Iterator[Messages]:
-        """All messages in file order; what cannot be read goes to ``report``.
+        """Yield all messages in file order. Unreadable parts are added to ``report``.
 
-        Nothing is kept: all messages are ground truth, which takes longer to decode than to decompress.
-        ``chunk_offset`` of a message is the place of the zstd frame that it begins in.
+        Messages are not cached: all are ground truth, which takes longer to decode than to decompress. The
+        ``chunk_offset`` of a message is the offset of the zstd frame with its start.
 
         Raises
         ------
         TraceError
-            The file cannot be read any more.
+            The file is no longer readable.
         """
         del keep, rank
         run = _MessageRun()
@@ -297,7 +294,7 @@ class OsiFile(MessageFile):
             yield run.messages()
 
     def _recognise(self) -> str:
-        """Recognise the type of the messages, and learn their common beginning."""
+        """Return the type of the messages, and store their common first bytes."""
         report = Findings()
         likeness = dict.fromkeys((GROUND_TRUTH, SENSOR_VIEW), 0)
         tried = 0
@@ -318,7 +315,7 @@ class OsiFile(MessageFile):
         raise TraceError(reason, path=self.path)
 
     def _messages(self, report: Findings) -> Iterator[tuple[int, int, bytes]]:
-        """Place of the zstd frame, offset in it, and data of every message."""
+        """Yield every message: offset of the zstd frame, offset in it, and data."""
         stream = _Stream(self._mark)
         content = pieces(self._file)
         while True:
@@ -337,7 +334,7 @@ class OsiFile(MessageFile):
 
 @dataclass(slots=True)
 class _MessageRun:
-    """Messages of one zstd frame, or of a file as it is, that are handed on together."""
+    """Run of messages of one zstd frame, or of an uncompressed file."""
 
     last_ns: int = 0
     place: int = -1
@@ -354,7 +351,7 @@ class _MessageRun:
         self.times.append(self.last_ns)
 
     def is_full(self, place: int) -> bool:
-        """Return whether a message of the zstd frame at a place has to go into another run."""
+        """True if a message of the zstd frame at ``place`` needs a new run."""
         return place != self.place or self.size > RUN_BYTES or len(self.held) >= RUN_MESSAGES
 
     def messages(self) -> Messages:
@@ -373,22 +370,24 @@ class _MessageRun:
 
 
 class _Stream:
-    """Cuts a content, which comes piece by piece, into messages. ``mark``: how they begin, if it is known."""
+    """Splitter of a stream of bytes into messages. ``mark`` contains their common first bytes, if known."""
 
     def __init__(self, mark: bytes) -> None:
         self._mark = mark
         self._buffer = bytearray()
-        self._start = 0  # of the buffer, in all that came
-        self._frames: list[tuple[int, int]] = []  # where in all that came a frame begins; its place
+        self._start = 0  # Position of the buffer in the stream.
+        self._frames: list[
+            tuple[int, int]
+        ] = []  # Start of each frame in the stream, and its file offset.
 
     def append(self, place: int, piece: bytes) -> None:
-        """One more piece, of the zstd frame at a place."""
+        """Add the next bytes, from the zstd frame at ``place``."""
         if not self._frames or self._frames[-1][1] != place:
             self._frames.append((self._start + len(self._buffer), place))
         self._buffer += piece
 
     def take(self, report: Findings, *, ends: bool) -> Iterator[tuple[int, int, bytes]]:
-        """The messages that are whole. ``ends``: no more pieces come."""
+        """Yield the complete messages. ``ends`` is true after the last bytes."""
         at = 0
         while (left := len(self._buffer) - at) >= PREFIX.size or (ends and left):
             length = PREFIX.unpack_from(self._buffer, at)[0] if left >= PREFIX.size else 0
@@ -399,10 +398,10 @@ class _Stream:
                 at = stop
                 continue
             if possible and not ends and stop > len(self._buffer):
-                break  # the rest of it is still to come
+                break  # The rest of the message has not arrived yet.
             resume = self._resume(at + 1)
             if resume is None and not ends and self._mark:
-                # Nothing in sight: what may yet be the beginning of a message stays, the rest is lost.
+                # Without a message in the buffer, keep the possible start of one; the rest is lost.
                 resume = max(at + 1, len(self._buffer) - PREFIX.size - len(self._mark))
             elif resume is None:
                 resume = len(self._buffer)
@@ -414,14 +413,14 @@ class _Stream:
             del self._frames[0]
 
     def _overruns(self, at: int, stop: int) -> bool:
-        """Return whether a message that ends here seems to swallow others: none begins here, but one before."""
+        """True if the length of a message seems wrong: another message starts inside, and none at its end."""
         following = self._buffer[stop + PREFIX.size : stop + PREFIX.size + len(self._mark)]
         if self._mark.startswith(following):
             return False
         return self._resume(at + 1, stop) is not None
 
     def _resume(self, start: int, stop: int | None = None) -> int | None:
-        """Place in the buffer, before ``stop``, at which the next message seems to begin."""
+        """Return the probable start of the next message in the buffer before ``stop``, or ``None``."""
         end = None if stop is None else stop - 1 + PREFIX.size + len(self._mark)
         while self._mark:
             found = self._buffer.find(self._mark, start + PREFIX.size, end)
@@ -450,7 +449,7 @@ class _Stream:
 
 
 def _lose(report: Findings, loss: Loss) -> None:
-    """Report a loss, as one with the loss before it where that is of the same kind and adjoins."""
+    """Report a loss. It is merged with an adjacent previous loss of the same kind."""
     last = report.losses[-1] if report.losses else None
     if last and last.messages == loss.messages == -1 and last.offset + last.bytes == loss.offset:
         report.losses[-1] = replace(last, bytes=last.bytes + loss.bytes)
@@ -462,7 +461,7 @@ def _lose(report: Findings, loss: Loss) -> None:
 
 
 def _beginning(data: bytes) -> bytes:
-    """Common beginning of a file's messages: version of OSI and tag of the next field; empty if without."""
+    """Return the common first bytes of the messages: OSI version and next tag; empty without a version."""
     try:
         number, wire, _start, stop = next(fields_of(data, 0, len(data)))
     except (ValueError, StopIteration):
@@ -471,9 +470,9 @@ def _beginning(data: bytes) -> bytes:
 
 
 def _likeness(name: str, data: bytes) -> int:
-    """Likeness of a message to a type: the number of things with a place or an id in it; -1: not of the type.
+    """Return how well a message fits a type: the number of objects with a position or an id; -1 if invalid.
 
-    A ground truth that is read as a sensor view, or the other way round, is malformed or holds nothing.
+    A ground truth decoded as a sensor view, or the other way round, is malformed or empty.
     """
     message, objects, bulbs = _classes_of(name)
     try:
@@ -499,7 +498,7 @@ def _things(placed: list[Any], lanes: Any) -> int:
 
 
 def time_of_bytes(data: bytes) -> int | None:
-    """The time of an OSI message in ns, or ``None`` where it has none that can be a log time."""
+    """Return the time of an OSI message; ns. ``None`` means without a valid time."""
     seconds, nanos = 0, 0
     try:
         for number, wire, start, stop in fields_of(data, 0, len(data)):
@@ -520,6 +519,6 @@ def time_of_bytes(data: bytes) -> int | None:
 
 
 def _number(content: bytes) -> int:
-    """A varint, as a number with a sign."""
+    """Return a protobuf varint as a signed number."""
     value = sum((byte & 0x7F) << 7 * i for i, byte in enumerate(content))
     return value - (1 << 64) if value >> 63 & 1 else value

@@ -1,14 +1,14 @@
-"""The lanes of OSI ground truth → text of a road map, for recordings that carry no OpenDRIVE.
+"""Conversion of the lanes in OSI ground truth into a road map, for recordings without OpenDRIVE.
 
-OSI tells lanes twice. *Logical* lanes have a border on each side with the length of a reference line at every
-point, the ends of the lanes that they touch, and rules for crossing; they are taken where a recording has
-them. *Physical* lanes have a centre line, boundaries in pieces, ids of neighbours and pairs of antecessor and
-successor; an intersection is mostly one area with the pairs that are ways through it. Left, right, antecessor
-and successor are those of the order in which a line's points stand, whichever way traffic runs. Where there is
-no centre line, it is the middle of the boundaries of both sides, and runs as these are to its left and right.
-Lanes that share a boundary lie side by side, unless they tell what does.
+OSI has two kinds of lanes. *Logical* lanes are used if the recording has them. They have a border on each side
+with the position along a reference line at every point, the connected lanes at both ends, and rules for
+crossing. *Physical* lanes have a centre line, boundaries in pieces, ids of neighbours, and pairs of antecessor
+and successor. An intersection is usually one area; its pairs are the ways through it. Left, right, antecessor
+and successor refer to the order of a line's points, independent of the traffic direction. A missing centre line
+is computed as the middle of the boundaries of both sides. Its direction follows from their sides. Lanes with a
+common boundary are neighbours, unless they list their neighbours.
 
-Static data may be told once and never again, in any message. A lane is told by the first message that has it.
+A message may contain static data only once in a recording. The first message with a lane defines the lane.
 
 Source: open-simulation-interface 3.8.0 (osi_lane.proto, osi_logicallane.proto).
 """
@@ -61,10 +61,10 @@ if TYPE_CHECKING:
 
 
 FIELDS: Final = ("lane", "lane_boundary", "logical_lane", "logical_lane_boundary")
-"""Fields of a ground truth that make up a map."""
+"""Fields of a ground truth that define the map."""
 
 OWN: Final = "osi:"
-"""Before the OSI id of a light or sign that refers to no map, as its name in the map of the lanes."""
+"""Prefix of the OSI id of a light or sign without a map reference, as its name in the map."""
 
 _PLACE: Final = dict.fromkeys(("x", "y", "z"))
 _ID: Final = {"value": None}
@@ -117,7 +117,7 @@ _GROUND_TRUTH: Final[dict[str, Any]] = {
 }
 _SENSOR_VIEW: Final = {"global_ground_truth": _GROUND_TRUTH}
 _MAY_LACK: Final = {"subtype", "source_reference", "physical_lane_reference"}
-"""Fields that older versions of OSI do not have, and that a lane is usable without."""
+"""Optional fields of a lane, missing in older versions of OSI."""
 
 _TYPES: Final = {
     "NORMAL": "driving",
@@ -132,7 +132,7 @@ _TYPES: Final = {
         )
     },
 }
-"""Words of ``Lane.Classification.Subtype`` and ``LogicalLane.Type`` → types of lanes as OpenDRIVE has them."""
+"""Values of ``Lane.Classification.Subtype`` and ``LogicalLane.Type`` → OpenDRIVE lane types."""
 
 _CROSSED: Final = {"TYPE_NO_LINE", "TYPE_DASHED_LINE", "TYPE_BOTTS_DOTS"}
 """Types of boundaries that traffic may cross."""
@@ -143,19 +143,19 @@ _RULES: Final = {
     "PASSING_RULE_DECREASING_T": (False, True),
     "PASSING_RULE_BOTH_ALLOWED": (True, True),
 }
-"""Rule → whether traffic may cross from right to left, and from left to right, along the reference line."""
+"""Rule → permission to cross from right to left, and from left to right, along the reference line."""
 
 _LONGEST: Final = 100
-"""Greatest length of the name of a road."""
+"""Maximum length of a road name; characters."""
 _JUMP: Final = 1e-3
-"""Least distance by which a border jumps; m."""
+"""Minimum distance of a jump in a border; m."""
 _FAR: Final = 1e8
-"""Greatest distance of a place from the origin; m."""
+"""Maximum distance of a point from the origin; m."""
 
 
 @dataclass(frozen=True, slots=True)
 class LaneSignal:
-    """A light or sign that is assigned to lanes.
+    """Traffic light or sign that is assigned to lanes.
 
     ``pose``: columns of :data:`sgstore.world.POSE`; ``lanes``: ids of physical or logical lanes.
     """
@@ -167,14 +167,14 @@ class LaneSignal:
 
 
 def _paths(fields: dict[str, Any]) -> Iterator[str]:
-    """Paths to all fields that a lane must have, with dots between the names."""
+    """Yield the dotted paths of all required fields of a lane."""
     for name, inner in fields.items():
         if name not in _MAY_LACK:
             yield from (f"{name}.{path}" for path in _paths(inner)) if inner else (name,)
 
 
 class OsiLanes:
-    """The lanes that messages tell, taken up one message after another.
+    """Collector of the lanes in messages.
 
     Parameters
     ----------
@@ -184,9 +184,9 @@ class OsiLanes:
     Attributes
     ----------
     warnings : list of str
-        What is odd.
+        Oddities without loss of data.
     lost : list of str
-        Which lanes cannot be used, and why, once the text was made.
+        Unusable lanes with the reasons; filled by :meth:`text`.
 
     Raises
     ------
@@ -214,7 +214,7 @@ class OsiLanes:
         self.lost: list[str] = []
 
     def take(self, data: bytes) -> None:
-        """Take up what a message tells of lanes that no message before it told."""
+        """Add the new lanes and boundaries of a message."""
         try:
             truth = ground_truth_of(self._class.FromString(data))
         except DECODE_ERRORS as error:
@@ -233,9 +233,9 @@ class OsiLanes:
                 self._told[name].setdefault(int(thing.id.value), thing)
 
     def text(self, signals: Iterable[LaneSignal] = ()) -> tuple[str, str]:
-        """The text of the road map, and what the recording calls the map; empty if it tells no lanes.
+        """Return the text of the road map, and the map's name in the recording; empty without lanes.
 
-        ``signals``: what applies to lanes; of those that are called alike the first one counts.
+        ``signals``: lights and signs of the lanes. Of signals with the same name, the first one counts.
 
         Raises
         ------
@@ -275,7 +275,7 @@ class OsiLanes:
         return lane_text(plain, [*self.warnings, *self.lost, *warnings], found), self._name()
 
     def _rows(self, lines: Sequence[LaneLine], plain: Sequence[PlainLane]) -> dict[int, list[int]]:
-        """Id of each lane → numbers of the plain lanes that it is."""
+        """Return the row numbers of the plain lanes for each lane id."""
         row_of = {lane.name: row for row, lane in enumerate(plain)}
         rows: dict[int, list[int]] = {}
         for line in lines:
@@ -303,14 +303,14 @@ class OsiLanes:
             return []
 
     def _name(self) -> str:
-        # Producers write the path of the file on their own machine: its last part is the map's name.
+        # Producers write a local file path; its last part is the name of the map.
         name = PurePosixPath(self._map.replace("\\", "/")).name
         name = name.removesuffix(".xodr")
         plain = name.isprintable() and 0 < len(name) <= 64 and not name.startswith("+proj")
         return f"{name}{OF_LANES}" if plain else ""
 
     def _place(self, points: Iterable[Any]) -> Floats:
-        """Points (n, 3) of a line."""
+        """Return the points of a line: (n, 3); m."""
         line = np.array([(p.x, p.y, p.z) for p in points], np.float64).reshape(-1, 3)
         self._points += len(line)
         if self._points > MAX_POINTS:
@@ -326,7 +326,7 @@ def _plain_signal(signal: LaneSignal, lanes: Iterable[int]) -> PlainSignal:
 
 
 class _LaneBoundaries:
-    """Boundaries by id, their points read once each."""
+    """Lane boundaries by id, each read once."""
 
     def __init__(
         self, told: dict[str, dict[int, Any]], place: Callable[[Iterable[Any]], Floats]
@@ -337,7 +337,7 @@ class _LaneBoundaries:
         self._logical: dict[int, tuple[Floats, Floats]] = {}
 
     def physical(self, idents: Iterable[Any]) -> tuple[Border, ...]:
-        """The borders with these ids; those that are missing are passed over."""
+        """Return the borders with these ids. Missing ids are skipped."""
         found: list[Border] = []
         for ident in map(_number, idents):
             boundary = self.told["lane_boundary"].get(ident)
@@ -350,7 +350,7 @@ class _LaneBoundaries:
         return tuple(found)
 
     def crossed(self, ident: int) -> bool | None:
-        """Return whether a physical boundary may be crossed; ``None``: that is not known."""
+        """True if traffic may cross a physical boundary. ``None`` means unknown."""
         boundary = self.told["lane_boundary"].get(ident)
         if boundary is None or not boundary.HasField("classification"):
             return None
@@ -358,7 +358,7 @@ class _LaneBoundaries:
         return None if kind in _UNKNOWN else kind in _CROSSED
 
     def logical(self, idents: Iterable[Any]) -> tuple[Floats, Floats, tuple[Border, ...]]:
-        """Points (n, 3) and their s (n,) of logical boundaries that follow one another, and each of them."""
+        """Return the points (n, 3) of consecutive logical boundaries, their s (n,), and the borders."""
         lines: list[Floats] = [np.zeros((0, 3))]
         places: list[Floats] = [np.zeros(0)]
         borders: list[Border] = []
@@ -381,11 +381,15 @@ class _LaneBoundaries:
         return points[order], s[order], tuple(borders)
 
     def _rule(self, boundary: Any) -> tuple[bool | None, bool | None]:
-        """Permission to cross a logical boundary to the left and right; else the type of its line counts."""
+        """Return the permissions to cross a logical boundary to the left and to the right.
+
+        Without a rule, the type of the physical line counts.
+        """
         rule = _RULES.get(enum_name(boundary, "passing_rule"))
         if rule is not None:
             return rule
-        # From right to left along the reference line: traffic from the right meets the first one.
+        # The order is from right to left along the reference line: traffic from the right reaches the first
+        # one.
         physical = [_number(ident) for ident in boundary.physical_boundary_id]
         if not physical:
             return None, None
@@ -406,7 +410,7 @@ def _is_area(lane: Any) -> bool:
 
 
 def _area(lane: Any, _borders: _LaneBoundaries) -> Area:
-    """An intersection as an area with ways through it."""
+    """Return an intersection as an area with ways through it."""
     return Area(
         str(lane.id.value),
         tuple(
@@ -418,7 +422,7 @@ def _area(lane: Any, _borders: _LaneBoundaries) -> Area:
 
 
 def _only_way(lane: Any, borders: _LaneBoundaries) -> LaneLine | None:
-    """An intersection that its boundaries tell as one lane; ``None``: it is an area, or nothing."""
+    """Return an intersection as a single lane, or ``None`` if its boundaries do not define one."""
     about = lane.classification
     if len(about.lane_pairing) > 1 or not about.left_lane_boundary_id:
         return None
@@ -457,13 +461,13 @@ def _physical_line(lane: Any, borders: _LaneBoundaries) -> LaneLine:
 
 
 def _word(message: Any, field: str) -> str:
-    """Part of a value's name behind ``TYPE_`` or ``SUBTYPE_``; empty if there is no such field."""
+    """Return an enumeration value without ``TYPE_`` or ``SUBTYPE_``; empty if the field is missing."""
     known = field in message.DESCRIPTOR.fields_by_name
     return enum_name(message, field).partition("_")[2] if known else ""
 
 
 def _type_of(kind: str, word: str) -> str:
-    """The type of a lane: by its subtype, else by whether it is for driving."""
+    """Return the type of a lane from its subtype, else ``driving`` or ``none``."""
     if word in _TYPES:
         return _TYPES[word]
     return "driving" if kind in {"TYPE_DRIVING", "TYPE_INTERSECTION"} else "none"
@@ -474,7 +478,7 @@ def _logical_line(lane: Any, borders: _LaneBoundaries) -> LaneLine:
     right, right_s, rights = borders.logical(lane.right_boundary_id)
     if len(left) < 2 or len(right) < 2:
         raise ValueError("it has no boundary with points on each side")
-    # A lane is where both borders are.
+    # A lane exists only where both borders exist.
     start, end = max(left_s[0], right_s[0]), min(left_s[-1], right_s[-1])
     start = max(start, lane.start_s) if lane.HasField("start_s") else start
     end = min(end, lane.end_s) if lane.HasField("end_s") else end
@@ -487,7 +491,7 @@ def _logical_line(lane: Any, borders: _LaneBoundaries) -> LaneLine:
         for side in ("left", "right")
     )
     jumps = np.abs(np.hstack(after) - np.hstack(before)).max(axis=1) > _JUMP
-    # Where a border jumps there are two cross sections, but none beyond the lane's own ends.
+    # At a jump of a border, there are two cross sections, but none outside the lane.
     early, late = np.ones(len(cuts), np.bool_), jumps.copy()
     early[0], late[-1] = not jumps[0], False
     one, other = (
@@ -521,7 +525,7 @@ def _logical_line(lane: Any, borders: _LaneBoundaries) -> LaneLine:
 
 
 def _at(line: Floats, s: Floats, cuts: Floats, side: Literal["left", "right"]) -> Floats:
-    """Points (n, 3) of a line at places; where it jumps, as it is before (``left``) or after (``right``)."""
+    """Return the points (n, 3) of a line at positions s. ``side`` selects the value at a jump."""
     at = np.searchsorted(s, cuts, side)
     at = np.minimum(at, len(s) - 1) if side == "left" else np.maximum(at - 1, 0)
     between = np.column_stack([np.interp(cuts, s, column) for column in line.T])
@@ -529,7 +533,7 @@ def _at(line: Floats, s: Floats, cuts: Floats, side: Literal["left", "right"]) -
 
 
 def _physical(lane: Any) -> set[int]:
-    """Ids of the physical lanes that a logical lane is made of."""
+    """Return the ids of the physical lanes of a logical lane."""
     return {_number(part.physical_lane_id) for part in getattr(lane, "physical_lane_reference", ())}
 
 
@@ -541,7 +545,7 @@ def _connections(connections: Iterable[Any]) -> tuple[Joint, ...]:
 
 
 def _source(lane: Any) -> dict[str, Any]:
-    """Road, section and number of a lane that was an OpenDRIVE lane; its section is the place where it begins.
+    """Return road, section and number of the OpenDRIVE lane behind a lane. The section is its start s.
 
     The identifiers are the road, the section's s and the lane, in this order; esmini writes ``road_id:1``.
     """
@@ -561,7 +565,7 @@ def _source(lane: Any) -> dict[str, Any]:
 
 
 def _sections_numbered(lines: Sequence[LaneLine]) -> list[LaneLine]:
-    """Lanes with sections counted from 0 in their roads instead of the places where they begin, and named."""
+    """Return the lanes with named roads and with sections numbered from 0 in each road."""
     starts: dict[str, set[float]] = {}
     for line in lines:
         if line.road:

@@ -1,15 +1,15 @@
-"""Moving objects, stationary objects and traffic lights of OSI as columns.
+"""Decoding of moving objects, stationary objects and traffic lights of OSI into columns.
 
-``osi3.MovingObject`` of many frames as columns, straight from their bytes.
+``osi3.MovingObject`` messages of many frames are decoded directly from their bytes.
 
-The numbers of an object are almost all doubles, and the objects of a frame mostly have the same fields: then
-the same bytes stand at the same places, and the numbers between them are columns of a matrix. So the layout
-of one object is learned, byte by byte, and all that agree with it in every byte that is no number are read at
-once; what is left over teaches the next layout. Reading the same numbers as attributes takes six times as long.
+Almost all numbers of an object are doubles, and the objects of a frame usually have the same fields. The same
+bytes are then at the same positions, and the numbers between them are columns of a matrix. The layout of one
+object is therefore learned byte by byte. All objects with the same non-number bytes are read at once. The
+remaining objects define the next layout. Reading the same numbers as attributes takes six times as long.
 
-A ground truth is parsed with its objects as bytes (:data:`sgstore.readers.osi._schema.OPAQUE`), so they may be
-malformed, whatever protobuf said to the message around them. An object whose layout is odd (a field that
-comes twice, a group) or never comes again is read by protobuf itself.
+A ground truth is parsed with its objects as bytes (:data:`sgstore.readers.osi._schema.OPAQUE`), so an object
+may be malformed inside a valid message. Objects with an unusual layout (a repeated field, a group) or a unique
+layout are decoded by protobuf itself.
 
 Source: protobuf encoding (protobuf.dev/programming-guides/encoding); osi_object.proto.
 """
@@ -58,11 +58,11 @@ BASE: Final = {
     "orientation_rate": ("yaw",),
     "dimension": ("length", "width", "height"),
 }
-"""Sub-messages of ``BaseMoving`` and what is read of them."""
+"""Sub-messages of ``BaseMoving`` and their used fields."""
 _INDICATORS: Final = {3: 0b01, 4: 0b10, 5: 0b11}
 """``IndicatorState`` LEFT, RIGHT, WARNING → bits ``light_left`` and ``light_right``."""
 _LIT: Final = 3
-"""Least value of ``BrakeLightState`` and ``GenericLightState`` that means that a light is on."""
+"""Minimum value of ``BrakeLightState`` and ``GenericLightState`` for an active light."""
 _LIGHTS: Final = {
     "indicator_state": 0,
     "brake_light_state": 2,
@@ -76,32 +76,31 @@ _LIGHTS: Final = {
 }
 """Fields of ``LightState`` → bit in :data:`sgstore.vocabulary.VEHICLE_LIGHTS`."""
 _STATES: Final = 64
-"""More than any state of a light has; states above are not known to the recording's version of OSI."""
+"""Upper limit of light states. Greater states are unknown to the recording's version of OSI."""
 
 _DOUBLE: Final = 9
-"""A double and its tag, which is one byte for fields up to 15; bytes."""
+"""Size of a double and its tag, which has one byte for fields up to 15; bytes."""
 _VARINT, _FIXED64, _BYTES, _GROUP, _GROUP_END = 0, 1, 2, 3, 4
 _ROUNDS: Final = 64
-"""Layouts that are tried for the objects of one length in a block; what is left is read one by one."""
+"""Maximum number of layouts tried per object length in a block. The remaining objects are read one by one."""
 _MOST_LAYOUTS: Final = 256
-"""Layouts that are remembered for objects of one length; then they are forgotten and learned anew."""
+"""Maximum number of stored layouts per object length. Then all are dropped and learned again."""
 
 Tree = dict[int, "Tree | int | str | NDArray[np.int64]"]
-"""Fields that are read: number → those within, or the column of a double, or what states of a light mean, or
-``type`` and ``vehicle``, the two fields that say what the object is."""
+"""Used fields: number → its fields, the column of a double, the meanings of light states, or ``type`` and
+``vehicle``, the two fields with the type of the object."""
 TYPES: Final = 1 << 10
-"""More than any type of a vehicle; the code of an object is its type times this, and that of the vehicle."""
+"""Upper limit of vehicle types. The code of an object is its type times this, plus the vehicle type."""
 
 
 @dataclass(slots=True)
 class _ObjectLayout:
-    """Places of the fields in serialised objects of one shape.
+    """Byte positions of the fields in serialised objects with the same layout.
 
-    ``compared``, ``mask``, ``expected``: places of all bytes that are no numbers, which of their bits count,
-    and what those are. ``runs``: first column, place and number of doubles that follow one another. ``zero``:
-    columns of sub-messages that are there but leave the number out. ``lights``: where states of lights stand,
-    and what they mean. ``types``: where types stand, and by what they count in the code of an object.
-    ``parts``: which sub-messages of the base there are.
+    ``compared``, ``mask``, ``expected``: positions of all bytes outside numbers, their relevant bits, and the
+    values. ``runs``: first column, position and number of adjacent doubles. ``zero``: columns of present
+    sub-messages without the number. ``lights``: positions of light states, and their meanings. ``types``:
+    positions of types, and their factors in the code of an object. ``parts``: sub-messages present in the base.
     """
 
     compared: Ints
@@ -114,13 +113,13 @@ class _ObjectLayout:
     parts: set[str]
 
     def agree(self, objects: Bytes) -> Bools:
-        """Mask of the objects, as rows of bytes, that have this layout."""
+        """Return a mask of the objects with this layout; each object is a row of bytes."""
         return ((objects[:, self.compared] & self.mask) == self.expected).all(axis=1)
 
 
 @dataclass(slots=True)
 class _Learned:
-    """Findings of a walk through an object; see :class:`_ObjectLayout`."""
+    """Intermediate results of a walk through an object; see :class:`_ObjectLayout`."""
 
     mask: Bytes
     doubles: dict[int, int] = field(default_factory=dict[int, int])
@@ -131,7 +130,7 @@ class _Learned:
 
 
 class MovingObjects:
-    """Reads serialised moving objects.
+    """Decoder of serialised moving objects.
 
     Parameters
     ----------
@@ -146,20 +145,19 @@ class MovingObjects:
         self._layouts: dict[int, list[_ObjectLayout]] = {}
 
     def read(self, objects: list[bytes]) -> tuple[Floats, Bools, Ints, Ints]:
-        """The numbers of serialised objects.
+        """Return the numbers of serialised objects as columns.
 
         Returns
         -------
         values : (n, 16) float64
-            Columns :data:`sgstore.world.POSE`; NaN where the sub-message is missing, 0 where only
-            the number is.
+            Columns :data:`sgstore.world.POSE`; NaN if the sub-message is missing, 0 if only the number is
+            missing.
         usable : (n,) bool
-            Whether there is a position on earth, and an orientation that is a number if there is one. What is
-            malformed is not usable.
+            True with a valid position, and a valid orientation or none. False for a malformed object.
         lights : (n,) int64
-            Mask of :data:`sgstore.vocabulary.VEHICLE_LIGHTS`; -1 if the object tells nothing of its lights.
+            Mask of :data:`sgstore.vocabulary.VEHICLE_LIGHTS`; -1 if the object does not contain light states.
         codes : (n,) int64
-            What each object is, as :func:`code_of` has it.
+            Type code of each object, as in :func:`code_of`.
         """
         values = np.full((len(objects), len(POSE)), np.nan)
         usable = np.zeros(len(objects), np.bool_)
@@ -178,7 +176,7 @@ class MovingObjects:
     def _read_alike(
         self, rows: NDArray[np.intp], content: Bytes, columns: tuple[Floats, Bools, Ints, Ints]
     ) -> list[int]:
-        """Read objects of one length, and return the rows of those that are left over."""
+        """Read objects of one length. Return the rows of the remaining objects."""
         values, usable, lights, codes = columns
         odd: list[int] = []
         for _ in range(_ROUNDS):
@@ -200,7 +198,7 @@ class MovingObjects:
         return [*odd, *rows.tolist()]
 
     def _trees(self, found: Any) -> tuple[dict[str, Any], Tree]:
-        """Descriptors of the sub-messages of the base, and which fields to read."""
+        """Return the descriptors of the sub-messages of the base, and the fields to read."""
         base = found.fields_by_name["base"]
         parts: dict[str, Any] = {}
         inner: Tree = {}
@@ -238,7 +236,10 @@ class MovingObjects:
         return parts, tree
 
     def _layout_of(self, content: Bytes) -> _ObjectLayout | None:
-        """The layout of an object, learned if it is a new one; ``None`` if it has none."""
+        """Return the layout of an object, and learn a new one.
+
+        ``None`` means that the object has no fixed layout.
+        """
         layouts = self._layouts.setdefault(len(content), [])
         for layout in layouts:
             if layout.agree(content[None])[0]:
@@ -286,7 +287,7 @@ class MovingObjects:
             ):
                 raise ValueError(f"field {number} of wire type {wire}: no layout that others share")
             seen.add(number)
-            # Of a number of variable length only that each of its bytes is followed by another, or not.
+            # For a varint, compare only the bit that marks the last byte.
             found.mask[at:end] = 0x80 if wire == _VARINT else 0
             if isinstance(known, dict) and wire == _BYTES:
                 found.mask[at:end] = 0xFF
@@ -302,7 +303,7 @@ class MovingObjects:
                 found.types.append((at, end, TYPES if known == "type" else 1))
 
     def _read_one(self, content: bytes) -> tuple[Floats, bool, int, int]:
-        """Read an object as protobuf does; what is malformed is not usable."""
+        """Decode an object with protobuf. A malformed object is unusable."""
         values = np.full(len(POSE), np.nan)
         try:
             thing = self._message.FromString(content)
@@ -329,7 +330,7 @@ _TARGETS: Final = {
 
 
 def _meanings(told: Any, bit: int) -> NDArray[np.int64]:
-    """Bits that each state of a light adds to the mask; -1 for states that the recording's OSI has not."""
+    """Return the mask bits for each state of a light; -1 for states unknown to the recording's OSI version."""
     table = np.full(_STATES, -1, np.int64)
     for state in told.enum_type.values_by_number if told.enum_type is not None else ():
         if 0 <= state < _STATES:
@@ -350,7 +351,7 @@ def _numbers(layout: _ObjectLayout, content: Bytes) -> tuple[Floats, Bools]:
 
 
 def _runs(doubles: dict[int, int]) -> list[tuple[int, int, int]]:
-    """Doubles by column → place, as runs of columns that stand behind one another, a tag between two."""
+    """Return the positions of doubles as runs of adjacent columns, with one tag byte between two doubles."""
     runs: list[tuple[int, int, int]] = []
     for column, place in sorted(doubles.items()):
         if runs and (column, place) == (sum(runs[-1][::2]), runs[-1][1] + _DOUBLE * runs[-1][2]):
@@ -383,7 +384,7 @@ def _codes(layout: _ObjectLayout, content: Bytes) -> Ints:
 
 
 def _whole(content: Bytes, start: int, stop: int) -> NDArray[np.uint64]:
-    """Numbers of variable length, one in each row."""
+    """Return the varint in each row."""
     found = np.zeros(len(content), np.uint64)
     for place in range(stop - 1, start - 1, -1):
         found = found << np.uint64(7) | (content[:, place] & 0x7F).astype(np.uint64)
@@ -391,14 +392,14 @@ def _whole(content: Bytes, start: int, stop: int) -> NDArray[np.uint64]:
 
 
 def code_of(thing: Any) -> int:
-    """What a ``MovingObject`` is, as a number: its type, and that of its class of vehicles."""
+    """Return the code of a ``MovingObject``, composed of its type and its vehicle type."""
     vehicle = getattr(getattr(thing, "vehicle_classification", None), "type", 0)
     told = (part if 0 <= part < TYPES else TYPES - 1 for part in (thing.type, vehicle))
     return next(told) * TYPES + next(told)
 
 
 def light_bits(thing: Any) -> int:
-    """Mask of :data:`sgstore.vocabulary.VEHICLE_LIGHTS` for a ``MovingObject``; -1 if it tells of none."""
+    """Return the light mask of a ``MovingObject`` (bits of ``VEHICLE_LIGHTS``); -1 without light states."""
     state = getattr(getattr(thing, "vehicle_classification", None), "light_state", None)
     if state is None or not state.ListFields():
         return -1
@@ -408,10 +409,9 @@ def light_bits(thing: Any) -> int:
     return bits
 
 
-# What stands still in an OSI recording: stationary objects and traffic signs, wherever they are told ----
-# Producers tell them once, with the first message, or in every one, or as the ego comes near. What stands,
-# stood there before it was told: so all of them are gathered before frames are read, and hold for the whole
-# trace.
+# Static objects of an OSI recording: stationary objects and traffic signs. Producers write them in the first
+# message, in every message, or when the ego comes near. A static object exists also before its first message.
+# All static objects are therefore collected before the frames, and are valid for the whole trace.
 #
 # Source: open-simulation-interface 3.8.0 (osi_object.proto, osi_trafficsign.proto).
 
@@ -419,10 +419,10 @@ _FIELDS: Final = {
     "stationary_object": ("stationary", "unknown"),
     "traffic_sign": ("sign", "sign"),
 }
-"""Fields of a ground truth → prefix of their types in ``vocabulary.toml``, kind of what that does not map."""
+"""Field of a ground truth → prefix of its types in ``vocabulary.toml``, and kind of unmapped types."""
 UNTOLD: Final = frozenset({"TYPE_UNKNOWN", "TYPE_OTHER"})
 _UNITS: Final = {"UNIT_MILE_PER_HOUR": " mph"}
-"""What is said behind the value of a speed limit, by its unit; km/h go without saying."""
+"""Text after the value of a speed limit, by unit; km/h has none."""
 _MAP_OBJECT: Final = re.compile(r"<object\s([^<>]*)>")
 _MAP_ATTRIBUTE: Final = re.compile(r"""(\w+)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
 
@@ -440,19 +440,19 @@ class _Static:
 
 @dataclass(slots=True)
 class Statics:
-    """The static things of a recording, in the order in which they were told.
+    """Static objects of a recording, in the order of their first message.
 
     Attributes
     ----------
     unplaced : dict
-        What has no usable pose or cannot be read, in words → log time at which it was told.
+        Description of each unreadable object or object without a usable pose → its log time.
     """
 
     unplaced: dict[str, int] = field(default_factory=dict[str, int])
     _found: dict[tuple[str, int], _Static] = field(default_factory=dict)  # pyright: ignore[reportUnknownVariableType]
 
     def look(self, told: Mapping[str, Any], log_time_ns: int) -> None:
-        """Take note of what a ground truth tells; ``told``: its static things by their field."""
+        """Add the static objects of a ground truth. ``told`` contains the objects by field."""
         for name in _FIELDS:
             for thing in told.get(name, ()):
                 key = (name, thing.id.value)
@@ -465,14 +465,14 @@ class Statics:
                     self.unplaced.setdefault(words, log_time_ns)
 
     def enter(self, roster: EntityTable, map_text: str) -> None:
-        """Enter them all. Objects of the map whose kind is not told are what the map says that they are."""
+        """Add all static objects to the entity table. Objects without a kind get the kind in the map."""
         kinds: dict[str, str] | None = None
         for thing in self._found.values():
             meaning = thing.meaning
             if meaning.kind == "unknown" and not meaning.subkind and thing.map_ref:
                 kinds = kinds_of_map(map_text) if kinds is None else kinds
                 kind = kinds.get(thing.map_ref, "unknown")
-                # What only a map has, such as paint on the road, is a thing like any other here.
+                # A kind that exists only in maps, such as paint on the road, becomes a prop.
                 entity = kind in ENTITY_KINDS
                 meaning = TypeMeaning(kind) if entity else TypeMeaning("prop", subkind=kind)
             roster.enter(thing.ident, meaning, thing.type_name, thing.map_ref, thing.pose)
@@ -505,7 +505,7 @@ class Statics:
         )
 
     def signals(self) -> list[LaneSignal]:
-        """The signs that are assigned to lanes."""
+        """Return the signs that are assigned to lanes."""
         return [
             LaneSignal(thing.map_ref, thing.meaning.kind, thing.pose, thing.lanes)
             for thing in self._found.values()
@@ -514,7 +514,7 @@ class Statics:
 
 
 def _with_value(meaning: TypeMeaning, classification: Any) -> TypeMeaning:
-    """A speed limit whose subkind ends with its value: ``50``, ``zone 30``, ``35 mph``."""
+    """Return the meaning of a speed limit sign, with its value in the subkind: ``50``, ``35 mph``."""
     if not has_field(type(classification), "value.value") or not classification.value.value > 0:
         return meaning
     value = classification.value
@@ -523,9 +523,9 @@ def _with_value(meaning: TypeMeaning, classification: Any) -> TypeMeaning:
     return replace(meaning, subkind=" ".join(word for word in words if word))
 
 
-@lru_cache(maxsize=1)  # a recording is read twice and more
+@lru_cache(maxsize=1)  # A recording is read at least twice.
 def kinds_of_map(text: str) -> dict[str, str]:
-    """Id of each object in an OpenDRIVE text → its kind."""
+    """Return the kind of each object in an OpenDRIVE text by object id."""
     kinds: dict[str, str] = {}
     for match in _MAP_OBJECT.finditer(text):
         told = {name: a or b for name, a, b in _MAP_ATTRIBUTE.findall(match[1])}
@@ -534,16 +534,15 @@ def kinds_of_map(text: str) -> dict[str, str]:
     return kinds
 
 
-# Traffic lights of OSI: bulbs, which are what OSI has, gathered into heads, which are what people see ----
-# OSI writes one ``TrafficLight`` message for each bulb. Bulbs belong to one head if they refer to the
-# same OpenDRIVE signal, or else stand one above another: the same place in the plane and the same
-# direction, to a centimetre. A head shows what its lit bulbs show, and goes on showing it while frames
-# say nothing of it.
+# Traffic lights of OSI: bulbs, grouped into heads. OSI has one ``TrafficLight`` message per bulb. Bulbs belong
+# to one head if they refer to the same OpenDRIVE signal. Without a reference, they belong to one head if they
+# are above each other: the same direction and position in the plane, to a centimetre. The state of a head is
+# that of its lit bulbs. Without new messages, it keeps its state.
 #
 # Source: open-simulation-interface 3.8.0, osi_trafficlight.proto (the numbers of colours and modes).
 
 SAME_PLACE: Final = 0.01
-"""Greatest distance, in each axis, and greatest turn between the bulbs of one head; m, rad."""
+"""Maximum distance in each axis, and maximum rotation, between the bulbs of one head; m, rad."""
 
 _RED, _YELLOW, _GREEN, _FLASHING, _OTHER = 1, 2, 4, 8, 16
 _COLOUR: Final = {2: _RED, 3: _YELLOW, 4: _GREEN}
@@ -569,7 +568,7 @@ _SUBKINDS: Final = {
 
 
 def lit(mode: int, colour: int) -> int:
-    """State of a bulb as a bit, by the numbers of its mode and colour; 0 if it is off."""
+    """Return the state of a bulb as a bit, from its mode and colour numbers; 0 if it is off."""
     if mode == _MODE_OFF:
         return 0
     if mode == _MODE_FLASHING:
@@ -578,10 +577,11 @@ def lit(mode: int, colour: int) -> int:
 
 
 def shown(bulbs: Iterable[int]) -> int:
-    """Code of :data:`sgstore.vocabulary.LIGHT_STATES` that lit bulbs make together.
+    """Return the code of the light state that lit bulbs show together.
 
-    Flashing wins over all; red with yellow is ``red_yellow``; of other colours that are lit together the
-    most restrictive one counts (a red light with a green arrow is red). Nothing lit is ``off``.
+    The codes are those of :data:`sgstore.vocabulary.LIGHT_STATES`. Flashing has priority. Red with yellow is
+    ``red_yellow``. For other combinations, the most restrictive colour counts (a red light with a green arrow
+    is red). Without a lit bulb, the state is ``off``.
     """
     together = 0
     for bulb in bulbs:
@@ -604,7 +604,7 @@ class _Head:
     top: float = -math.inf
 
     def join(self, pose: tuple[float, ...]) -> None:
-        """Grow to hold another bulb."""
+        """Extend the head by another bulb."""
         _x, _y, z, *rest = pose
         if math.isnan(z):
             return
@@ -618,21 +618,21 @@ class _Head:
 
 
 class TrafficLights:
-    """The traffic lights of a trace.
+    """Traffic lights of a trace, with their bulbs grouped into heads.
 
     Parameters
     ----------
     roster : EntityTable
-        Takes up each head as an entity of kind ``traffic_light``; its ident is the id of its first bulb.
+        Receives each head as an entity of kind ``traffic_light``; its ident is the id of its first bulb.
     message : type or None
-        Class of the bulbs; ``None``: the recording's version of OSI has none that could be read.
+        Class of the bulbs. ``None`` means that the recording's OSI version has no readable class.
     names : mapping, optional
-        First bulb of a head that refers to no map → name of the signal that it is in the map of the lanes.
+        First bulb of a head without a map reference → name of its signal in the map of the lanes.
 
     Attributes
     ----------
     unreadable : int
-        Bulbs that are malformed.
+        Number of malformed bulbs.
     """
 
     def __init__(
@@ -657,11 +657,11 @@ class TrafficLights:
 
     @property
     def unplaced(self) -> int:
-        """Heads that have neither a position nor a reference to the map."""
+        """Number of heads without a position and without a map reference."""
         return len(self._heads) - len(self._rows[0])
 
     def update(self, words: list[bytes]) -> None:
-        """Take up what the bulbs of a ground truth say; of the others the last word stands."""
+        """Update the states of the bulbs in a ground truth. Other bulbs keep their states."""
         if words == self._words or self._class is None:
             return
         news = set(words).difference(self._words)
@@ -675,7 +675,7 @@ class TrafficLights:
         try:
             bulb = message.FromString(word)
             head = self._head_of.get(bulb.id.value) or self._enter(bulb)
-        except DECODE_ERRORS:  # whatever else is in the message is read all the same
+        except DECODE_ERRORS:  # The rest of the message is still read.
             self.unreadable += 1
             return
         classification = bulb.classification
@@ -683,7 +683,7 @@ class TrafficLights:
         head.bulbs[bulb.id.value] = 0 if out else lit(classification.mode, classification.color)
 
     def signals(self) -> dict[int, LaneSignal]:
-        """First bulb of each head that is assigned to lanes → the signal that it is."""
+        """Return the signal of each head with assigned lanes, by the id of its first bulb."""
         return {
             head.first: LaneSignal(
                 head.map_ref or f"{OWN}{head.first}",
@@ -696,7 +696,7 @@ class TrafficLights:
         }
 
     def rows(self) -> tuple[Ints, Floats, Ints]:
-        """Rows of the heads that have a place: node ids, columns :data:`POSE`, states."""
+        """Return the rows of all heads with a position: node ids, columns :data:`POSE`, states."""
         return self._rows
 
     def _fill(self) -> None:
@@ -708,7 +708,7 @@ class TrafficLights:
         )
 
     def _enter(self, bulb: Any) -> _Head:
-        """The head that a bulb belongs to, which may be a new one."""
+        """Return the head of a bulb; it may be new."""
         ident = bulb.id.value
         pose = static_pose(bulb.base) or (NAN,) * 16
         ref, lanes = map_ref(bulb), assigned_lanes(bulb.classification)
@@ -729,7 +729,7 @@ class TrafficLights:
         return head
 
     def _beside(self, pose: tuple[float, ...]) -> _Head | None:
-        """The head at the place of a pose, if there is one."""
+        """Return the head at the position of a pose, or ``None``."""
         if math.isnan(pose[0]):
             return None
         column, line = _cell(pose)

@@ -1,11 +1,9 @@
-"""Message classes and fields of ASAM OSI.
+"""Message classes of ASAM OSI, reduced to the fields that the reader needs.
 
-Which fields of OSI are read; what is not read is not parsed.
-
-A ground truth is mostly lanes and boundaries, and a sensor view may carry whole pictures. Fields that
-nobody here reads are taken out of the descriptors, so that protobuf keeps their bytes as they are: it
-parses a static-heavy message several times faster, and a message made of a hundred million empty points
-costs no more than its own size. What is read is bounded by number before it is parsed.
+A ground truth consists mostly of lanes and boundaries, and a sensor view may contain whole pictures. Unused
+fields are removed from the descriptors, so that protobuf does not parse their bytes. Messages with much static
+data are then parsed several times faster, and a message of a hundred million empty points needs no more memory
+than its own size. The number of parts to parse is limited before the parsing.
 """
 
 from __future__ import annotations
@@ -31,21 +29,21 @@ if TYPE_CHECKING:
 
 
 MAX_GROUND_TRUTH: Final = 32 << 20
-"""Greatest size of a ground truth; bytes. One with all lanes of a town takes 1.4 MB."""
+"""Maximum size of a ground truth; bytes. One with all lanes of a town has 1.4 MB."""
 MAX_OBJECTS: Final = 100_000
-"""Greatest number of objects (vehicles, lights, lanes, …) of a ground truth."""
+"""Maximum number of objects (vehicles, lights, lanes, …) in a ground truth."""
 MAX_STATICS: Final = 16 << 20
-"""Greatest size of the stationary objects, signs and lights of a ground truth together; bytes. What is read of
-them is parsed to the last part, and a part may be two bytes long."""
+"""Maximum total size of the stationary objects, signs and lights in a ground truth; bytes. They are parsed
+completely, and a part may have only two bytes."""
 MAX_OBJECT: Final = 4 << 20
-"""Greatest size of a moving object; bytes."""
+"""Maximum size of a moving object; bytes."""
 MAX_REFERENCES: Final = 1000
-"""Greatest number of source references of an object, and of identifiers in one."""
+"""Maximum number of source references of an object, and of identifiers in a reference."""
 SMALL: Final = 64 << 10
-"""A message up to this size cannot hold so many that it mattered; bytes."""
+"""Messages up to this size need no check of the number of objects; bytes."""
 
 OPAQUE: Final = "opaque"
-"""Mark of a field of messages that is read as bytes, one for each message."""
+"""Mark of a message field that is read as bytes, one item per message."""
 
 _VECTOR: Final = dict.fromkeys(("x", "y", "z"))
 _ANGLES: Final = dict.fromkeys(("roll", "pitch", "yaw"))
@@ -84,7 +82,7 @@ MOVING_OBJECT_FIELDS: Final[dict[str, Any]] = {
     "vehicle_classification": {"type": None, "light_state": _LIGHT_STATE, "role": None},
     **_REFERENCES,
 }
-"""Fields of ``osi3.MovingObject`` that are read."""
+"""Used fields of ``osi3.MovingObject``."""
 
 TRAFFIC_LIGHT_FIELDS: Final[dict[str, Any]] = {
     **_ID,
@@ -95,7 +93,7 @@ TRAFFIC_LIGHT_FIELDS: Final[dict[str, Any]] = {
     },
     **_REFERENCES,
 }
-"""Fields of ``osi3.TrafficLight`` that are read."""
+"""Used fields of ``osi3.TrafficLight``."""
 
 GROUND_TRUTH_FIELDS: Final[dict[str, Any]] = {
     "timestamp": _TIME,
@@ -128,7 +126,7 @@ GROUND_TRUTH_FIELDS: Final[dict[str, Any]] = {
     "logical_lane_boundary": _ID,
     "logical_lane": _ID,
 }
-"""Fields of ``osi3.GroundTruth`` that are read, and theirs; ``None``: as it is; :data:`OPAQUE`: as bytes."""
+"""Used fields of ``osi3.GroundTruth`` and their fields. ``None``: all fields; :data:`OPAQUE`: as bytes."""
 
 HOST_DATA_FIELDS: Final[dict[str, Any]] = {
     "host_vehicle_id": {"value": None},
@@ -147,15 +145,15 @@ SENSOR_VIEW_FIELDS: Final[dict[str, Any]] = {
 def prune(
     files: list[descriptor_pb2.FileDescriptorProto], roots: dict[str, dict[str, Any]]
 ) -> None:
-    """Take the fields that are not read out of the descriptors of message types.
+    """Remove the unused fields from the descriptors of message types.
 
     Parameters
     ----------
     files : list of FileDescriptorProto
-        Changed.
+        Modified in place.
     roots : dict
-        Full names of types → the fields to be read → those of their messages. Of a type that is met in
-        several places all are kept that one of them reads.
+        Full names of types → the fields to read → the fields of their messages. A type that is used in several
+        places keeps the fields of all of them.
     """
     types = {
         name: message
@@ -185,7 +183,7 @@ def prune(
 
 
 def _named(messages: Any, prefix: str) -> Iterator[tuple[str, Any]]:
-    """Message types with their full names, those within others too."""
+    """Yield message types with their full names, including nested types."""
     for message in messages:
         name = prefix + message.name
         yield name, message
@@ -193,19 +191,19 @@ def _named(messages: Any, prefix: str) -> Iterator[tuple[str, Any]]:
 
 
 def check_size(data: bytes, truth: int) -> None:
-    """Refuse a message whose ground truth is too large, or of too many parts, to be parsed.
+    """Raise if the ground truth of a message is too large, or has too many parts to parse.
 
     Parameters
     ----------
     data : bytes
         The message.
     truth : int
-        Number of the field that is the ground truth; 0: the message is it.
+        Field number of the ground truth; 0: the message itself is the ground truth.
 
     Raises
     ------
     ValueError
-        It is too large, or malformed.
+        The ground truth is too large or malformed.
     """
     if len(data) <= SMALL:
         return
@@ -238,7 +236,7 @@ _STATICS: Final = frozenset({4, 6, 7})
 
 
 def fields_of(data: bytes, position: int, stop: int) -> Iterator[tuple[int, int, int, int]]:
-    """Fields of a protobuf message: number, wire type, where the content begins, where it ends.
+    """Yield the fields of a protobuf message: number, wire type, start and end of the content.
 
     Raises
     ------
@@ -272,16 +270,16 @@ def fields_of(data: bytes, position: int, stop: int) -> Iterator[tuple[int, int,
 
 
 _WIDTHS: Final = {1: 8, 3: 0, 4: 0, 5: 4}
-"""Bytes of a content by its wire type; those of a group are fields of their own."""
+"""Size of a content by wire type; bytes. The parts of a group are separate fields."""
 
 
 def _varint(data: bytes, position: int, stop: int) -> tuple[int, int]:
-    """A number of variable length, and where it ends.
+    """Return a protobuf varint, and the position after it.
 
     Raises
     ------
     ValueError
-        It does not end.
+        The number does not end.
     """
     value, shift = 0, 0
     while position < stop and shift < 70:
@@ -294,10 +292,10 @@ def _varint(data: bytes, position: int, stop: int) -> tuple[int, int]:
     raise ValueError("a number that does not end")
 
 
-# Descriptors of ASAM OSI's message types, for recordings that bring none of their own -----------
-# An MCAP file carries the descriptors of its messages, and those count. A single-channel file (``.osi``)
-# carries none: its messages are read by what ``osi_types.toml`` says. Numbers of fields never change
-# between versions of OSI, so files of every version can be read by them.
+# Descriptors of ASAM OSI's message types, for recordings without descriptors. An MCAP file contains the
+# descriptors of its messages, which have priority. A single-channel file (``.osi``) has none; its messages are
+# read with ``osi_types.toml``. Field numbers never change between versions of OSI, so this works for files of
+# every version.
 
 _FIELD: Final = descriptor_pb2.FieldDescriptorProto
 _SCALARS: Final = {
@@ -315,12 +313,12 @@ _SCALARS: Final = {
 
 @cache
 def descriptors() -> bytes:
-    """A serialised ``FileDescriptorSet`` with ``osi3.GroundTruth``, ``osi3.SensorView`` and what they need."""
+    """Return a serialised ``FileDescriptorSet`` of ``osi3.GroundTruth`` and ``osi3.SensorView``."""
     text = resources.files("sgstore.readers").joinpath("osi_types.toml").read_text(encoding="utf-8")
     tables = tomllib.loads(text)
     file = descriptor_pb2.FileDescriptorProto(name="osi3.proto", package="osi3", syntax="proto2")
     types: dict[str, descriptor_pb2.DescriptorProto] = {}
-    for name in sorted(tables["messages"]):  # an outer type comes before those within it
+    for name in sorted(tables["messages"]):  # An outer type comes before its nested types.
         outer, _, last = name.rpartition(".")
         siblings = types[outer].nested_type if outer else file.message_type
         types[name] = siblings.add(name=last)
@@ -332,7 +330,7 @@ def descriptors() -> bytes:
             label, _, number = item.partition("=")
             enum.value.add(name=label, number=int(number))
         if len({value.number for value in enum.value}) == len(enum.value):
-            enum.ClearField("options")  # protobuf refuses leave for aliases where there are none
+            enum.ClearField("options")  # Protobuf rejects the option allow_alias without aliases.
     for name, items in tables["messages"].items():
         add_fields(types[name], items, tables["enums"], "osi3")
     return descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
@@ -345,7 +343,7 @@ def add_fields(
     package: str,
     elsewhere: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
-    """Give a message type its fields.
+    """Add fields to a message type.
 
     Parameters
     ----------
@@ -353,9 +351,9 @@ def add_fields(
     fields : str
         ``name=number:type`` for each, with * if it is repeated.
     enums : container of str
-        Which types are enumerations.
+        Names of the enumeration types.
     package : str
-        Where types are defined, unless ``elsewhere`` names another package for them.
+        Package of the types, unless ``elsewhere`` contains another one for a type.
     """
     for item in fields.split():
         label, _, rest = item.partition("=")
@@ -370,10 +368,10 @@ def add_fields(
             field.type_name = f".{elsewhere.get(kind, package)}.{kind}"
 
 
-# Message classes of ASAM OSI, made from the descriptors that a recording carries ----------------
-# Each recording has a pool of its own: what one file defines is never seen by another. The classes are
-# those of the file's own version of OSI; what every version has is asked for once, when a file is opened,
-# and what only some have is looked up with a default.
+# Message classes of ASAM OSI, built from the descriptors in a recording. Each recording has its own pool, so
+# definitions never mix between files. The classes belong to the file's version of OSI. Fields that every
+# version has are checked once, at the opening of a file. Fields that only some versions have are read with a
+# default.
 #
 # Source: open-simulation-interface 3.8.0 (osi_groundtruth.proto, osi_object.proto, osi_common.proto).
 
@@ -385,11 +383,11 @@ TRAFFIC_LIGHT: Final = "osi3.TrafficLight"
 ROAD_MAP: Final = "osi3.MapAsamOpenDrive"
 
 MAX_DESCRIPTORS: Final = 4 << 20
-"""Greatest size of the descriptors of a message type; bytes. Those of OSI 3.8 take 60 kB."""
+"""Maximum size of the descriptors of a message type; bytes. Those of OSI 3.8 have 60 kB."""
 
 DECODE_ERRORS: Final = (
     DecodeError,
-    AttributeError,  # a descriptor that lacks a field, or has another thing in its place
+    AttributeError,  # A descriptor lacks a field, or has another type in its place.
     TypeError,
     ValueError,
     LookupError,
@@ -397,11 +395,11 @@ DECODE_ERRORS: Final = (
     RecursionError,
     MemoryError,
 )
-"""What reading a message raises if it, or the descriptors it came with, are not what they seem."""
+"""Exceptions for malformed messages or descriptors."""
 
 NO_VECTOR: Final = (NAN, NAN, NAN)
 LATEST_NS: Final = 1 << 62
-"""Bound of times that are believed; ns."""
+"""Limit of valid times; ns."""
 _GROUND_TRUTH_NEEDS: Final = ("timestamp.seconds", "moving_object")
 _MOVING_OBJECT_NEEDS: Final = (
     "id.value",
@@ -435,14 +433,14 @@ _NEEDS: Final = {
 
 
 def message_class(schema: Schema, fields: dict[str, Any] | None = None) -> type[Any]:
-    """The class of the messages of a schema.
+    """Return the message class for a schema.
 
     Parameters
     ----------
     schema : Schema
     fields : dict, optional
-        Which fields to read instead of those of frames, as :func:`~sgstore.readers.osi._schema.prune` has them;
-        any of them may be missing.
+        Fields to read instead of those of frames, as in :func:`~sgstore.readers.osi._schema.prune`; each of
+        them may be missing.
 
     Raises
     ------
@@ -472,7 +470,7 @@ def message_class(schema: Schema, fields: dict[str, Any] | None = None) -> type[
 def _add(
     pool: descriptor_pool.DescriptorPool, files: dict[str, descriptor_pb2.FileDescriptorProto]
 ) -> None:
-    """Add files to a pool, each after those that it imports; a file set may have them in any order."""
+    """Add files to a descriptor pool in the order of their imports."""
     own = descriptor_pb2.DESCRIPTOR
     if own.name not in files:
         files[own.name] = descriptor_pb2.FileDescriptorProto.FromString(own.serialized_pb)
@@ -498,7 +496,9 @@ def _require(found: Descriptor, paths: tuple[str, ...]) -> None:
 
 
 def object_class(message: type[Any]) -> type[Any]:
-    """The class of the moving objects in the messages of a class, which has them as bytes.
+    """Return the class of moving objects that belongs to a message class.
+
+    Messages contain these objects as bytes.
 
     Raises
     ------
@@ -516,9 +516,9 @@ def object_class(message: type[Any]) -> type[Any]:
 
 
 def light_class(message: type[Any]) -> type[Any] | None:
-    """The class of the traffic lights in the messages of a class, which has them as bytes.
+    """Return the class of traffic lights that belongs to a message class, or ``None`` if it is unreadable.
 
-    ``None`` where it has none that could be read.
+    Messages contain these lights as bytes.
     """
     try:
         found = message.DESCRIPTOR.file.pool.FindMessageTypeByName(TRAFFIC_LIGHT)
@@ -529,12 +529,12 @@ def light_class(message: type[Any]) -> type[Any] | None:
 
 
 def lights_of(ground: Any) -> list[bytes]:
-    """The traffic lights of a ground truth, serialised."""
+    """Return the serialised traffic lights of a ground truth."""
     return list(getattr(ground, "traffic_light", ()))
 
 
 def has_field(message: type[Any], path: str) -> bool:
-    """Return whether a message class has a field, given as a path of names with dots between."""
+    """True if a message class has the field at a dotted path."""
     try:
         _require(message.DESCRIPTOR, (path,))
     except KeyError:
@@ -543,12 +543,12 @@ def has_field(message: type[Any], path: str) -> bool:
 
 
 def parse(message: type[Any], data: bytes) -> tuple[Any, Any, list[bytes]]:
-    """A message of the leading channel, its ground truth, and the moving objects of that.
+    """Parse a message of the leading channel. Return it, its ground truth, and its moving objects.
 
     Raises
     ------
     Exception
-        One of :data:`DECODE_ERRORS`. Of objects there are not too many to be looked at.
+        One of :data:`DECODE_ERRORS`; also for too many objects.
     """
     truth = _truth_in(message)
     check_size(data, truth)
@@ -561,7 +561,7 @@ def parse(message: type[Any], data: bytes) -> tuple[Any, Any, list[bytes]]:
 
 
 def time_of(message: Any, ground: Any) -> int | None:
-    """The time that a message says it is of, in ns; ``None`` if it says none that can be."""
+    """Return the time stamp of a message; ns. ``None`` means without a valid time stamp."""
     for part in (ground, message):
         if part.HasField("timestamp"):
             time_ns = part.timestamp.seconds * 1_000_000_000 + part.timestamp.nanos
@@ -572,20 +572,20 @@ def time_of(message: Any, ground: Any) -> int | None:
 
 @lru_cache(maxsize=64)
 def _truth_in(message: type[Any]) -> int:
-    """Number of the field that is the ground truth in messages of a class; 0: they are it."""
+    """Return the field number of the ground truth in a message class; 0 if the message is the ground truth."""
     truth = message.DESCRIPTOR.fields_by_name.get("global_ground_truth")
     return truth.number if truth is not None else 0
 
 
 def ground_truth_of(message: Any) -> Any:
-    """The ground truth in a message, which may be one itself."""
+    """Return the ground truth in a message, or the message itself if it is one."""
     return message.global_ground_truth if hasattr(message, "global_ground_truth") else message
 
 
 def enum_name(message: Any, field: str) -> str:
-    """The name of an enumeration's value in a message: ``TYPE_CAR``.
+    """Return the name of an enumeration value in a message, such as ``TYPE_CAR``.
 
-    A value that the file's own version of OSI does not know is kept by its number: ``TYPE_213``.
+    A value unknown to the file's version of OSI keeps its number: ``TYPE_213``.
     """
     number = getattr(message, field)
     names, place = _values_of(type(message), field)
@@ -600,20 +600,20 @@ def enum_name(message: Any, field: str) -> str:
 
 @lru_cache(maxsize=256)
 def _values_of(message: type[Any], field: str) -> tuple[dict[int, str], int]:
-    """Names of the values that a field of a message class may have, by number; and the field's own number."""
+    """Return the value names of an enumeration field by number, and the field number."""
     descriptor = message.DESCRIPTOR.fields_by_name[field]
     names = descriptor.enum_type.values_by_number
-    # Asked one by one: of several names of a number it is the first that counts.
+    # Read one by one: if a number has several names, the first one counts.
     return {number: str(names[number].name) for number in names}, descriptor.number
 
 
 def identifiers(thing: Any) -> list[tuple[str, str]]:
-    """Source references of an object: (type of the source, identifier), in the order they stand.
+    """Return the source references of an object in order: (type of the source, identifier).
 
     Raises
     ------
     ValueError
-        There are more than any object has.
+        There are too many references.
     """
     references = getattr(thing, "source_reference", ())
     most = max([len(references), *(len(one.identifier) for one in references[:MAX_REFERENCES])])
@@ -627,10 +627,10 @@ def identifiers(thing: Any) -> list[tuple[str, str]]:
 
 
 def map_ref(thing: Any) -> str:
-    """Id of the OpenDRIVE signal or object that an object refers to, or the empty string.
+    """Return the id of the OpenDRIVE signal or object that an object refers to, or an empty string.
 
-    esmini writes ``traffic_light_id:3``, ``traffic_sign_id:3`` and ``object_id:3``; a bare identifier is
-    taken as it is.
+    esmini writes ``traffic_light_id:3``, ``traffic_sign_id:3`` and ``object_id:3``. A plain identifier is
+    returned unchanged.
     """
     for source, identifier in identifiers(thing):
         key, colon, value = identifier.partition(":")
@@ -640,12 +640,12 @@ def map_ref(thing: Any) -> str:
 
 
 def assigned_lanes(classification: Any) -> list[int]:
-    """Ids of the physical and logical lanes that a light or sign is told to apply to.
+    """Return the ids of the physical and logical lanes that a light or sign is assigned to.
 
     Raises
     ------
     ValueError
-        There are more than any has.
+        There are too many lanes.
     """
     physical = getattr(classification, "assigned_lane_id", ())
     logical = getattr(classification, "logical_lane_assignment", ())
@@ -659,9 +659,9 @@ def assigned_lanes(classification: Any) -> list[int]:
 
 
 def static_pose(base: Any) -> tuple[float, ...] | None:
-    """Pose and size of what does not move: the columns of :data:`sgstore.world.POSE`.
+    """Return the pose and size of a static object, or ``None`` without a usable position.
 
-    Without an orientation or dimension those are NaN. ``None`` if there is no usable position.
+    The columns are those of :data:`sgstore.world.POSE`. A missing orientation or dimension is NaN.
     """
     place, turn, size = base.position, base.orientation, base.dimension
     position = (place.x, place.y, place.z)

@@ -1,13 +1,11 @@
-"""The first pass over an OSI recording: actors, ego and map.
+"""First reading of an OSI recording: moving objects, ego and map.
 
-Who is in an OSI recording: the moving objects by id and by name, and which of them is the ego.
+The id of an object is a number from the simulator, which often changes between runs. Users know an object by
+its name in the scenario. If the recording contains a unique name, it becomes the entity's ident; otherwise, the
+number does.
 
-An object's own id is a number that the simulator chose, and often another one in the next run. The scenario's
-name of it, where a recording tells it, is what people know it by: it becomes the entity's ident if no other
-object of the recording bears it, and the number otherwise.
-
-Names stand in ``source_reference``: ``entity_name:cutter`` as esmini and others write, or bare, behind the word
-that says what the entity is to OpenSCENARIO (``Vehicle``, ``cutter``).
+Names are in ``source_reference``: ``entity_name:cutter`` as written by esmini and others, or a plain name after
+the OpenSCENARIO type of the entity (``Vehicle``, ``cutter``).
 """
 
 from __future__ import annotations
@@ -51,18 +49,18 @@ if TYPE_CHECKING:
 
 
 LISTED: Final = 20
-"""Objects that an error lists by name."""
+"""Maximum number of objects listed in an error."""
 
 EGO_NAMES: Final = frozenset({"ego", "hero", "host", "ego_vehicle", "host_vehicle"})
-"""What the ego is called where no host vehicle is told, in lower case."""
+"""Usual names of the ego in lower case, for recordings without a host vehicle id."""
 
 _SORTS: Final = frozenset({"Vehicle", "Pedestrian", "MiscObject", "ExternalObjectReference"})
-"""Sorts of entities in OpenSCENARIO, which are no names (ASAM OpenSCENARIO XML 1.3, ``EntityObject``)."""
+"""Entity types of OpenSCENARIO, which are not names (ASAM OpenSCENARIO XML 1.3, ``EntityObject``)."""
 _MOST_HOSTS: Final = 100
 
 
 def names_of(moving_object: Any) -> list[str]:
-    """Names of a moving object, the proper one first: ``X`` of ``entity_name:X``, then bare identifiers."""
+    """Return the names of a moving object: first from ``entity_name:X``, then plain identifiers."""
     parts = [text.partition(":") for _, text in identifiers(moving_object)]
     named = [value for key, _, value in parts if key == "entity_name" and value]
     bare = [key for key, colon, _ in parts if key and not colon and key not in _SORTS]
@@ -72,19 +70,19 @@ def names_of(moving_object: Any) -> list[str]:
 def _names_or_none(moving_object: Any) -> list[str]:
     try:
         return names_of(moving_object)
-    except ValueError:  # references without end: then it is known by its number
+    except ValueError:  # It has too many references; its number becomes the name.
         return []
 
 
 def hosts_of(message: Any) -> list[int]:
-    """Ids that a message gives to the host vehicle, the most telling first; 0 is one too."""
+    """Return the host vehicle ids in a message, most reliable first. 0 is a valid id."""
     told = [getattr(message, part) if part else message for part in _telling(type(message))]
     return [part.host_vehicle_id.value for part in told if part.HasField("host_vehicle_id")]
 
 
 @lru_cache(maxsize=64)
 def _telling(message: type[Any]) -> tuple[str, ...]:
-    """Parts of messages of a class that may name the host vehicle; empty: the message itself."""
+    """Return the parts of a message class that can contain the host vehicle id; empty means the message."""
     inner = [
         (part, found.message_type)
         for part in ("global_ground_truth", "host_vehicle_data")
@@ -98,34 +96,34 @@ def _telling(message: type[Any]) -> tuple[str, ...]:
 
 
 def keys_of(objects: list[bytes], last: list[bytes]) -> list[bytes]:
-    """The beginning of each serialised object, up to where its id ends if it begins with it.
+    """Return the first bytes of each serialised object: its id field, if the object starts with it.
 
-    Where the objects are those of ``last``, keys that this has returned, it returns that very list.
+    If the objects match ``last``, an earlier result of this function, the same list is returned.
     """
     if len(objects) == len(last) and all(map(bytes.startswith, objects, last)):
         return last
     try:
         return [content[: content[1] + 2] for content in objects]
-    except IndexError:  # one that is shorter than that
+    except IndexError:  # An object is too short.
         return [content[: content[1] + 2] if len(content) > 1 else content for content in objects]
 
 
 def is_key(key: bytes, thing: Any) -> bool:
-    """Return whether the beginning of a serialised object is its id and nothing else."""
+    """True if the first bytes of a serialised object are exactly its id."""
     ident = thing.id.SerializeToString()
     return len(ident) < 0x80 and key == b"\x0a" + bytes([len(ident)]) + ident
 
 
 @dataclass(slots=True)
 class Cast:
-    """The moving objects of a recording.
+    """Moving objects of a recording, with their names.
 
     Attributes
     ----------
     names : dict
-        Id → names, the name proper first.
+        Id → names, the proper name first.
     hosts : dict
-        Ids that were given to the host vehicle, in order.
+        Host vehicle ids, in order.
     """
 
     names: dict[int, list[str]] = field(default_factory=dict[int, list[str]])
@@ -134,7 +132,7 @@ class Cast:
     _last: list[bytes] = field(default_factory=list[bytes])
 
     def look(self, message: Any, contents: list[bytes], objects: type[Any]) -> None:
-        """Take note of the objects in a message.
+        """Add the objects in a message.
 
         Parameters
         ----------
@@ -157,7 +155,7 @@ class Cast:
                 continue
             try:
                 thing = objects.FromString(content)
-            except DECODE_ERRORS:  # counted as a loss when the frames are read
+            except DECODE_ERRORS:  # Counted as a loss during the reading of the frames.
                 continue
             if thing.id.value not in self.names:
                 self.names[thing.id.value] = _names_or_none(thing)
@@ -165,7 +163,7 @@ class Cast:
                 self._keys.add(key)
 
     def idents(self) -> dict[int, str]:
-        """Id → ident: the name proper where nothing else bears it, else the number."""
+        """Return the ident of each id: the proper name if it is unique, else the number."""
         numbers = {str(number) for number in self.names}
         bearers: dict[str, int] = {}
         for names in self.names.values():
@@ -179,19 +177,19 @@ class Cast:
         }
 
     def ego(self, wanted: str, notes: list[str]) -> int | None:
-        """The id of the ego, or ``None``.
+        """Return the id of the ego, or ``None``.
 
         Parameters
         ----------
         wanted : str
-            Id or name that the user gave; empty: the host vehicle, else what is called as egos are.
+            Id or name from the user; empty: the host vehicle, else an object with a usual name of egos.
         notes : list of str
-            Takes up what is odd.
+            Receives warnings.
 
         Raises
         ------
         TraceError
-            Nothing bears the name that the user gave, or several things do.
+            The given name does not exist, or is ambiguous.
         """
         if wanted:
             return self._named(wanted)
@@ -234,10 +232,10 @@ class Cast:
         )
 
 
-# The first reading of an OSI recording: what must be known before its frames can be read --------
-# The map may stand behind the frames, static data may come once and never again, and the ego is known by
-# an id that has to name something. So every ground truth message is looked at once when a recording is
-# opened: which channel leads, which messages later ones depend on, who and what is in it.
+# First reading of an OSI recording, which collects the facts needed for its frames. The map may come after the
+# frames, static data may occur only once, and the ego id must belong to an object. Every ground truth message
+# is therefore examined once at the opening of a recording. The results are the leading channel, the messages
+# that later ones depend on, and the objects.
 
 STATIC_FIELDS: Final = (
     "stationary_object",
@@ -249,15 +247,15 @@ STATIC_FIELDS: Final = (
     "logical_lane_boundary",
     "logical_lane",
 )
-"""Fields of a ground truth whose objects do not change, so that a producer may write them only once."""
+"""Fields of a ground truth with constant objects, which a producer may write only once."""
 
 
 @dataclass(slots=True)
 class _Latch:
-    """Messages of a channel on which later ones depend, because they do not repeat their contents.
+    """Messages of a channel that later messages depend on, because their contents are not repeated.
 
-    A static object is told by the first message that has it; if every later one has it too, none
-    depends on the first. A light's state is told by the last message before one that lacks the light.
+    A static object is defined by the first message that contains it. If all later messages contain it, too,
+    none depends on the first. A light's state is defined by the last message before one without the light.
     """
 
     fields: tuple[str, ...]
@@ -271,12 +269,12 @@ class _Latch:
     refs: dict[Ref, None] = field(default_factory=dict[Ref, None])
 
     def look(self, told: Mapping[str, Any], words: list[bytes], ref: Ref) -> bool:
-        """Take note of a message; whether it tells of a lane or boundary that none before it told of.
+        """Examine a message. Return True if it contains a new lane or boundary.
 
         Parameters
         ----------
         told : mapping
-            Its static things by their field.
+            Its static objects by field.
         words : list of bytes
             Its traffic lights.
         ref : Ref
@@ -290,7 +288,7 @@ class _Latch:
             new = {item for item in items if item not in self.told_by}
             self.repeated = (self.repeated - gone) | new
             self.told_by.update(dict.fromkeys(new, ref))
-        # Ids of the lights in a message; those that stand in it as in the last one are not read again.
+        # Ids of the lights in a message; unchanged lights are not read again.
         if words != self.spoken:
             known = self.words
             self.words = {word: known.get(word) or self._ident(word) for word in words}
@@ -304,16 +302,16 @@ class _Latch:
     def _ident(self, word: bytes) -> int | None:
         try:
             return None if self.bulb is None else int(self.bulb.FromString(word).id.value)
-        except DECODE_ERRORS:  # said when the frames are read
+        except DECODE_ERRORS:  # Reported during the reading of the frames.
             return None
 
 
 @dataclass(slots=True, kw_only=True)
 class OsiLead(Lead):
-    """A channel that may lead: its message class, and what its messages depend on.
+    """Candidate channel with its message class and the messages that later ones depend on.
 
-    ``objects``: class of its moving objects. ``latch``: its messages on which others depend. ``lanes``: what
-    they tell of roads; ``None`` if that cannot be read. The weight of a frame is 1 if it has moving objects.
+    ``objects``: class of its moving objects. ``latch``: its messages that others depend on. ``lanes``: its
+    lanes; ``None`` if they are unreadable. The weight of a frame is 1 if it has moving objects.
     """
 
     schema: str
@@ -324,7 +322,7 @@ class OsiLead(Lead):
 
 
 def schema_name(recording: Recording, channel: int) -> str:
-    """Name of a channel's schema if its messages are protobuf, else the empty string."""
+    """Return the schema name of a channel with protobuf messages, else an empty string."""
     record = recording.channels[channel]
     schema = recording.schemas.get(record.schema_id)
     protobuf = schema is not None and "protobuf" in {schema.encoding, record.message_encoding}
@@ -332,22 +330,22 @@ def schema_name(recording: Recording, channel: int) -> str:
 
 
 class OsiSurvey(Survey[OsiLead]):
-    """Findings of the first reading of a recording.
+    """First reading of an OSI recording.
 
-    Its map is OpenDRIVE; in a recording that carries none, the lanes of its ground truth.
+    The map is OpenDRIVE if the recording contains it. Otherwise, it is made of the lanes in the ground truth.
 
     Attributes
     ----------
     hosts : dict
-        Channel id → class of the messages, of the channels with data of the host vehicle.
+        Channel id → message class, for channels with data of the host vehicle.
     cast : Cast
         The moving objects.
     statics : Statics
-        What stands still.
+        The static objects.
     ego : int or None
         Id of the ego.
     signals : dict
-        First bulb of each traffic light that is assigned to lanes → the signal of the map of its lanes.
+        First bulb of each traffic light with assigned lanes → its signal in the map of the lanes.
     """
 
     def __init__(self, recording: Recording, wanted: str) -> None:
@@ -359,14 +357,14 @@ class OsiSurvey(Survey[OsiLead]):
         self.signals: dict[int, LaneSignal] = {}
         self._maps: dict[int, type[Any]] = {}
         self._map_refs: list[Ref] = []
-        self._lights: dict[int, TrafficLights] = {}  # as messages of each channel are to be read
+        self._lights: dict[int, TrafficLights] = {}  # By channel.
 
     def rank(self, lead: OsiLead) -> tuple[int, ...]:
-        """Order by frames with moving objects: of split channels the one that moves leads."""
+        """Return the sort key of a candidate: first the number of frames with moving objects."""
         return lead.weight, lead.frames, lead.schema == GROUND_TRUTH
 
     def read(self) -> Self:
-        """Read the recording from end to end, and make a map of its lanes if it has no other."""
+        """Read the whole recording. Without an OpenDRIVE map, make a map of its lanes."""
         super().read()
         if not self.map_text:
             leading = self.first_lead()
@@ -375,7 +373,7 @@ class OsiSurvey(Survey[OsiLead]):
         return self
 
     def no_frames(self) -> str:
-        """The reason why no channel leads."""
+        """Return the reason for a recording without a leading channel."""
         topics = [repr(self.topic(channel)) for channel in self.leads]
         where = ", ".join(topics) or "the channels of its schema"
         return f"no ground truth message can be read from {where}"
@@ -386,14 +384,14 @@ class OsiSurvey(Survey[OsiLead]):
         return "" if self.ego is None else self.cast.idents()[self.ego]
 
     def role(self, channel: int) -> str:
-        """The role of a channel; one of them may carry maps."""
+        """Return the role of a channel, ``map`` for a channel with OpenDRIVE messages."""
         is_map = channel != self.leading and schema_name(self.recording, channel) == ROAD_MAP
         return "map" if is_map else super().role(channel)
 
     def context(self) -> set[Ref]:
-        """Messages that later ones depend on.
+        """Return the messages that later messages depend on.
 
-        Of a channel beside the leading one it is whatever tells of static things for the first time.
+        For other channels than the leading one, these are the first messages with each static object.
         """
         refs = {*self._map_refs, *super().context()}
         for channel, other in self.leads.items():
@@ -402,14 +400,12 @@ class OsiSurvey(Survey[OsiLead]):
                 refs.update(other.latch.told_by.values())
         return refs
 
-    # Channels ----------------------------------------------------------------------------------------
-
     def keeps(self, channel: int) -> bool:
-        """Return whether the frames need the messages of a channel."""
+        """True if the reading of the frames needs the messages of a channel again."""
         return schema_name(self.recording, channel) in {GROUND_TRUTH, SENSOR_VIEW, HOST_DATA}
 
     def meet(self, channel: int) -> bool:
-        """Return whether a channel may lead or carries maps; make ready for one that is met first."""
+        """True if a channel contains frames or maps. A new channel is prepared for reading."""
         if channel in self.leads or channel in self._maps:
             return True
         name = schema_name(self.recording, channel)
@@ -418,7 +414,7 @@ class OsiSurvey(Survey[OsiLead]):
         schema = self.recording.schemas[self.recording.channels[channel].schema_id]
         message = message_class(schema)
         if name == HOST_DATA:
-            self.hosts[channel] = message  # a message of its own, too, that belongs to a frame
+            self.hosts[channel] = message  # A separate message that belongs to a frame.
         elif name == ROAD_MAP:
             self._maps[channel] = message
         else:
@@ -444,10 +440,8 @@ class OsiSurvey(Survey[OsiLead]):
             stamps=self.shared_stamps(channel, Stamps(logged=self.recording.has_log_times)),
         )
 
-    # One message -------------------------------------------------------------------------------------
-
     def look(self, run: Messages, row: int) -> None:
-        """Look at a message of a map, or at a frame."""
+        """Examine a map message or a frame."""
         channel = int(run.channel[row])
         if channel in self._maps:
             self._look_at_map(self._maps[channel], run, row)
@@ -466,7 +460,7 @@ class OsiSurvey(Survey[OsiLead]):
             self.notes.append("the recording carries more than one road map; the first one counts")
         elif text and not self.map_text:
             self.map_text = text
-            # Producers write the path of the file on their own machine: its last part is the map's name.
+            # Producers write a local file path; its last part is the name of the map.
             self.map_name = PurePosixPath(name.replace("\\", "/")).name
 
     def _look_at_frame(self, lead: OsiLead, run: Messages, row: int) -> None:
@@ -484,12 +478,12 @@ class OsiSurvey(Survey[OsiLead]):
             if told:
                 self.statics.look(told, int(run.log_time_ns[row]))
             self.cast.look(message, objects, lead.objects)
-        except DECODE_ERRORS:  # counted as a loss when the frames are read
+        except DECODE_ERRORS:  # Counted as a loss during the reading of the frames.
             return
         self.count(run, row, len(objects) > 0)
 
     def _make_map_of_lanes(self, leading: int) -> None:
-        """Make the map of the lanes, those of the leading channel before those of others."""
+        """Make the map of the lanes. Lanes of the leading channel have priority."""
         for _, lead in sorted(self.leads.items(), key=lambda item: item[0] != leading):
             if lead.lanes is None:
                 continue

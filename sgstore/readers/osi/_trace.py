@@ -1,10 +1,10 @@
-"""Recordings of ASAM OSI: ``osi3.GroundTruth`` and ``osi3.SensorView`` messages in MCAP.
+"""Reader of ASAM OSI recordings: ``osi3.GroundTruth`` and ``osi3.SensorView`` messages in MCAP.
 
-They are recognised by the schema of a channel and by nothing else: topics are free, and most files lack
-the metadata that the standard asks for. A frame is one message of the leading channel, in file order. The
-road map is that of an ``osi3.MapAsamOpenDrive`` message, as omega-prime records it, or one of the lanes.
+A recording is recognised only by the schemas of its channels: topics are arbitrary, and most files lack the
+standard metadata. A frame is one message of the leading channel, in file order. The road map is that of an
+``osi3.MapAsamOpenDrive`` message, as recorded by omega-prime, or is made of the lanes.
 
-Weather and light of OSI ground truth: events of the report, at the beginning and whenever they change.
+Weather and light in the ground truth become events of the report, at the start and at every change.
 
 Source: open-simulation-interface 3.8.0 (osi_environment.proto); omega-prime specification.
 """
@@ -51,19 +51,20 @@ _CLASSES: Final = (
     ("fog", "fog"),
     ("illumination", "ambient_illumination"),
 )
-"""Word of an event → field whose value is a class."""
+"""Name in an event → field with its class."""
 
 
 class Environment:
-    """The conditions of a trace.
+    """Environmental conditions of a trace, reported as events.
 
     Parameters
     ----------
     message : type
-        Class of the messages of the leading channel, which have the conditions as bytes.
+        Class of the messages of the leading channel, which contain the conditions as bytes.
     roster : EntityTable
-        Takes up an event of kind ``environment`` whenever a class of conditions changes; its ``detail`` is
-        such as ``precipitation=light, fog=mist, illumination=level5, clouds=six_oktas, time_of_day=13:05:00``.
+        Receives an event of kind ``environment`` at every change of a class of conditions. Its ``detail`` is,
+        for example, ``precipitation=light, fog=mist, illumination=level5, clouds=six_oktas,
+        time_of_day=13:05:00``.
     """
 
     def __init__(self, message: type[Any], roster: EntityTable) -> None:
@@ -78,7 +79,7 @@ class Environment:
             self._class = None
 
     def look(self, ground: Any, time_ns: int, log_time_ns: int, seq: int) -> None:
-        """Take note of what a ground truth says; what it does not say goes on."""
+        """Update the conditions from a ground truth. Missing conditions keep their values."""
         told = getattr(ground, "environmental_conditions", b"")
         if not told or told == self._told or self._class is None:
             return
@@ -86,7 +87,7 @@ class Environment:
         try:
             conditions: Any = self._class.FromString(told)
             state, more = classes_of(conditions), numbers_of(conditions)
-        except DECODE_ERRORS:  # whatever else is in the message is read all the same
+        except DECODE_ERRORS:  # The rest of the message is still read.
             self._unread += 1
             return
         if state == self._state or not state:
@@ -96,14 +97,14 @@ class Environment:
         self._roster.happen(Event("environment", time_ns, log_time_ns, seq, detail=detail))
 
     def settle(self) -> None:
-        """Say what could not be read."""
+        """Add a warning about unreadable conditions."""
         if self._unread:
             words = f"weather and light cannot be read where they changed {self._unread} times"
             self._roster.report.warnings.append(words)
 
 
 def classes_of(conditions: Any) -> str:
-    """The classes that are told: ``precipitation=light, fog=mist``."""
+    """Return the known classes of conditions, such as ``precipitation=light, fog=mist``."""
     told = [(word, _class(conditions, field)) for word, field in _CLASSES]
     if "clouds" in conditions.DESCRIPTOR.fields_by_name and conditions.HasField("clouds"):
         told.append(("clouds", _class(conditions.clouds, "fractional_cloud_cover")))
@@ -111,7 +112,7 @@ def classes_of(conditions: Any) -> str:
 
 
 def numbers_of(conditions: Any) -> list[str]:
-    """Time of day and temperature, where they are told."""
+    """Return time of day and temperature, if known."""
     told: list[str] = []
     if conditions.HasField("time_of_day"):
         minutes, seconds = divmod(conditions.time_of_day.seconds_since_midnight % 86_400, 60)
@@ -122,7 +123,7 @@ def numbers_of(conditions: Any) -> list[str]:
 
 
 def _class(message: Any, field: str) -> str:
-    """A value of an enumeration in lower case, without what all values begin with; empty if it is unknown."""
+    """Return an enumeration value in lower case without its common prefix; empty if unknown."""
     told = message.DESCRIPTOR.fields_by_name.get(field)
     if told is None or told.enum_type is None or not message.HasField(field):
         return ""
@@ -134,32 +135,32 @@ def _class(message: Any, field: str) -> str:
     return str(names[number].name).removeprefix(prefix).lower()
 
 
-# OSI messages → frames: moving objects as rows, static things as entities, lights carried forward ----
-# * A moving object becomes a row. OSI's position is the centre of the box, its axes and units are ours. A
-#   sub-message that is missing (velocity, acceleration, …) is missing; a number that is missing in a
-#   sub-message is 0, because producers leave zeros out.
-# * What stands still is entered with the first frame, wherever it is told.
-# * Traffic lights become one entity for each head, with a row in every frame.
-# * A ground truth may be split: over messages of one time on one channel, or over channels. What other channels
-#   tell at the time of a frame of the leading channel belongs to that frame.
+# OSI messages → frames: moving objects as rows, static objects as entities, lights with their last state.
+# * A moving object becomes a row. OSI's position is the centre of the box; its axes and units equal those of
+#   sgstore. A missing sub-message (velocity, acceleration, …) means unknown. A missing number in a sub-message
+#   is 0, because producers omit zeros.
+# * Static objects are added with the first frame, for any position in the file.
+# * Traffic lights become one entity per head, with a row in every frame.
+# * A ground truth may be split over messages of one time on one channel, or over channels. Messages of other
+#   channels with the time of a frame belong to this frame.
 #
 # Source: open-simulation-interface 3.8.0 (osi_object.proto, osi_hostvehicledata.proto).
 
 NO_EGO: Final = "no host vehicle is among the moving objects: there is no ego unless one is named"
-"""What a report says of it."""
+"""Warning in a report without an ego."""
 
 _VEHICLE: Final = 2
-"""``MovingObject.TYPE_VEHICLE``: what it is stands in ``vehicle_classification.type``."""
+"""``MovingObject.TYPE_VEHICLE``; ``vehicle_classification.type`` contains the vehicle type."""
 _UNSET: Final = "TYPE_UNKNOWN"
 _HEADING: Final = POSE.index("heading")
 _UNKNOWN: Final = -2
 _MOST_AHEAD: Final = 16
-"""Times ahead of the leading channel whose messages on other channels are kept until it gets there."""
+"""Maximum number of buffered times of other channels that are ahead of the leading channel."""
 
 
 @dataclass(slots=True)
 class OsiRawFrame:
-    """A frame whose objects are still bytes.
+    """Frame whose objects are not decoded yet.
 
     Attributes
     ----------
@@ -167,11 +168,11 @@ class OsiRawFrame:
     heads : tuple of arrays
         Rows of the traffic lights: node ids, columns, states.
     controls : tuple of float
-        As :class:`~sgstore.readers._blocks.FrameRows` has them.
+        As in :class:`~sgstore.readers._blocks.FrameRows`.
     own : tuple of float
-        Those that its own messages tell.
+        Controls in its own messages.
     nodes : list of int
-        Node id of each moving object; none comes twice.
+        Node id of each moving object, without duplicates.
     objects : list of bytes
         The moving objects.
     """
@@ -186,14 +187,14 @@ class OsiRawFrame:
 
 
 class OsiDecoder(MessageDecoder[OsiRawFrame]):
-    """Messages of ground truth → frames, with what must be remembered from one to the next.
+    """Converter of ground truth messages into frames.
 
     Parameters
     ----------
     survey : OsiSurvey
-        What the first reading found.
+        Result of the first reading.
     report : TraceReport
-        Takes up what cannot be used.
+        Receives losses and warnings.
     """
 
     def __init__(self, survey: OsiSurvey, report: TraceReport) -> None:
@@ -211,7 +212,7 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
         self._aside: dict[int, int] = {}
         self._controls = NO_INPUTS
         lead = survey.leads[survey.leading]
-        self._class = lead.objects  # the numbers of fields are those of every version
+        self._class = lead.objects  # Field numbers are the same in every version.
         self._objects = MovingObjects(self._class)
         self._codes: dict[int, int] = {}
         self._kinds: dict[int, str] = {}
@@ -225,7 +226,7 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
         self._stamps = lead.stamps.reading()
 
     def decode(self, run: Messages, row: int) -> OsiRawFrame | None:
-        """The frame that a message begins, if it begins one; what else it says is taken up."""
+        """Return the frame that a message starts, or ``None``. Other contents of the message are stored."""
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
         if channel in self._leading:
             self._stamps.next()
@@ -253,7 +254,7 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
         return None
 
     def settle(self) -> None:
-        """Report what could not be used, once all frames are read."""
+        """Report the losses, after all frames are read."""
         self._untimed = self._stamps.untimed
         self._environment.settle()
         warn = self._report.warnings.append
@@ -275,7 +276,7 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
             self._warn_of_egos(NO_EGO)
 
     def complete(self, frames: list[OsiRawFrame]) -> list[FrameRows]:
-        """Frames with their numbers, read for all of them at once."""
+        """Return the frames with their numbers, decoded for all frames at once."""
         objects = [content for frame in frames for content in frame.objects]
         values, usable, lights, codes = self._objects.read(objects)
         turned = usable & (np.abs(values[:, _HEADING]) > math.pi)
@@ -308,7 +309,7 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
     def _other_kinds(
         self, frames: list[OsiRawFrame], node: Ints, codes: Ints, objects: list[bytes]
     ) -> dict[int, dict[int, Called]]:
-        """Frame → node id → what its object is, where that is of another kind than what was entered."""
+        """Return, by frame and node id, the types of objects whose kind differs from the first one."""
         entered = np.full(self.roster.size, -1, np.int64)
         entered[[*self._codes]] = [*self._codes.values()]
         rows = np.flatnonzero((codes >= 0) & (codes != entered[node]))
@@ -326,12 +327,10 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
                 found.setdefault(frame, {})[number] = called
         return found
 
-    # One message ---------------------------------------------------------------------------------------
-
     def _frame(
         self, told: tuple[Any, Any, list[bytes]], time_ns: int, log_time: int, channel: int
     ) -> OsiRawFrame | None:
-        """A frame, unless the message goes on with the last one, or another channel tells the same time."""
+        """Return a new frame, or ``None`` if the message continues the last frame."""
         message, ground, contents = told
         nodes, objects = self._met(contents, log_time)
         last, before, self._told_by = self._open, self._told_by, channel
@@ -359,7 +358,7 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
     def _join(
         self, frame: OsiRawFrame, message: Any, nodes: list[int], objects: list[bytes]
     ) -> None:
-        """Add to a frame what it does not have yet."""
+        """Add the missing objects and facts of a message to a frame."""
         if not frame.nodes:
             frame.nodes, frame.objects = nodes, objects
         else:
@@ -380,14 +379,14 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
         )
 
     def _take_controls(self, data: Any, log_time: int) -> None:
-        """Take the controls of the host: they are of the last frame if they were logged with it."""
+        """Store the controls of the host vehicle. With equal log time, they belong to the last frame."""
         self._controls = told = controls_of(data)
         last = self._open
         if last is not None and log_time == last.log_time_ns:
             last.controls = _first_told(last.own, told)
 
     def _take_aside(self, told: tuple[Any, Any, list[bytes]], time_ns: int) -> None:
-        """Take a message of another channel: it tells of the last frame, of one to come, or of none."""
+        """Assign a message of another channel to the last frame, a later frame or no frame."""
         message, ground, contents = told
         last = self._open
         self._lights.update(lights_of(ground))
@@ -404,18 +403,16 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
             self._leave_aside(contents)
 
     def _leave_aside(self, contents: list[bytes]) -> None:
-        """Count objects at a time for which there is no frame."""
+        """Count objects at a time without a frame."""
         for content in contents:
             with suppress(*DECODE_ERRORS):
                 ident = int(self._class.FromString(content).id.value)
                 self._aside[ident] = self._aside.get(ident, 0) + 1
 
-    # Entities ------------------------------------------------------------------------------------------
-
     def _met(self, objects: list[bytes], log_time: int) -> tuple[list[int], list[bytes]]:
-        """Node ids of serialised objects, and the objects; without those that cannot be read or come twice."""
+        """Return the node ids of serialised objects, without unreadable and duplicate ones, and the objects."""
         keys = keys_of(objects, self._last_keys)
-        if keys is self._last_keys:  # the same objects as in the last frame, in the same order
+        if keys is self._last_keys:  # The same objects as in the last frame, in the same order.
             return self._last_nodes.copy(), objects
         nodes = [self._keys.get(key, _UNKNOWN) for key in keys]
         known = _UNKNOWN not in nodes
@@ -435,7 +432,10 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
         return list(rows), [objects[row] for row in rows.values()]
 
     def _node_of(self, content: bytes, key: bytes, log_time: int) -> int:
-        """The node of an object whose beginning is not known, entered if it is new; -1 if it is malformed."""
+        """Return the node id of an object with unknown first bytes; -1 if it is malformed.
+
+        A new object is added.
+        """
         try:
             thing = self._class.FromString(content)
         except DECODE_ERRORS as error:
@@ -450,7 +450,7 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
         return node
 
     def _enter(self, thing: Any) -> int:
-        """Enter a moving object that is seen for the first time."""
+        """Add a new moving object, and return its node id."""
         meaning, type_name = self._called(thing)
         if meaning.kind == "vehicle" and not meaning.subkind:
             self.roster.count_unknown(type_name)
@@ -460,7 +460,7 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
         return node
 
     def _trailer(self, thing: Any) -> str:
-        """The id of the trailer that a vehicle pulls, or the empty string."""
+        """Return the id of the trailer of a vehicle, or an empty string."""
         vehicle = getattr(thing, "vehicle_classification", None)
         if vehicle is None or not has_field(type(vehicle), "trailer_id"):
             return ""
@@ -470,9 +470,9 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
         return self._idents.get(number, str(number))
 
     def _called(self, thing: Any) -> Called:
-        """What a moving object is, and its type.
+        """Return the meaning and type name of a moving object.
 
-        Its class counts if it is said to be a vehicle, or if nothing is said of what it is.
+        Its vehicle type counts if the object is a vehicle or has no type.
         """
         meanings = type_meanings()
         type_name = enum_name(thing, "type")
@@ -497,13 +497,11 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
             self._unusable.add(words, log_time)
 
     def _number(self, node: int) -> int:
-        """The recording's own id of a moving object."""
+        """Return the recording's own id of a moving object."""
         return next(ident for ident, known in self._nodes.items() if known == node)
 
-    # Rows ----------------------------------------------------------------------------------------------
-
     def _usable(self, frame: FrameRows, usable: Bools, ego: int) -> FrameRows:
-        """A frame without the rows that cannot be used."""
+        """Return a frame without its unusable rows."""
         for node in frame.node[~usable].tolist():
             words = f"moving object {self._number(node)} has no usable pose"
             self._unusable.add(words, frame.log_time_ns)
@@ -519,10 +517,10 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
 
 
 def controls_of(data: Any) -> tuple[float, ...]:
-    """Controls (:data:`sgstore.world.INPUTS`) in an ``osi3.HostVehicleData``; NaN what it does not tell.
+    """Return the control inputs in an ``osi3.HostVehicleData``; NaN for missing ones.
 
-    The angle of a steering wheel is no normalised steer, and how far the wheel turns is not told; nor has OSI a
-    hand brake: these are always NaN.
+    The columns are :data:`sgstore.world.INPUTS`. Steering is always NaN, because the angle of the steering
+    wheel is not normalised and its range is unknown. The hand brake is always NaN, because OSI has none.
     """
     return (
         NAN,
@@ -534,7 +532,7 @@ def controls_of(data: Any) -> tuple[float, ...]:
 
 
 def _first_told(*controls: tuple[float, ...]) -> tuple[float, ...]:
-    """The first known value of each control."""
+    """Return the first known value of each control."""
     return tuple(
         next((value for value in values if not math.isnan(value)), NAN)
         for values in zip(*controls, strict=True)
@@ -547,31 +545,28 @@ def _number(message: Any, part: str, name: str) -> float:
     return float(getattr(inner, name)) if told else NAN
 
 
-# The recording ------------------------------------------------------------------------------------
-
-
 class OsiTrace(SurveyedTrace[OsiSurvey]):
-    """A recording of OSI ground truth.
+    """Recording of OSI ground truth.
 
     Parameters
     ----------
     recording : Recording
     ego : str
-        Id or name (``entity_name`` of a source reference) of the ego; empty: the host vehicle, else what is
-        called as egos are.
+        Id or name (``entity_name`` of a source reference) of the ego; empty: the host vehicle, else an object
+        with a usual name of egos.
     digest : str
-        SHA-256 of the file, if it is known; else the file is hashed.
+        SHA-256 of the file if known; empty: the file is hashed.
 
     Attributes
     ----------
     info : TraceInfo
     report : TraceReport
-        Filled while blocks are read.
+        Filled during the reading of blocks.
 
     Raises
     ------
     TraceError
-        The schema is malformed, no frame can be read, or nothing bears the name given for the ego.
+        The schema is malformed, no frame can be read, or the given ego does not exist.
     """
 
     name: ClassVar[str] = "osi"
@@ -581,11 +576,11 @@ class OsiTrace(SurveyedTrace[OsiSurvey]):
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:
-        """Return whether one of the channels carries OSI ground truth."""
+        """True if a channel contains OSI ground truth."""
         names = {schema_name(recording, channel) for channel in recording.channels}
         return bool(names & {GROUND_TRUTH, SENSOR_VIEW})
 
     def decoder(self, report: TraceReport) -> OsiDecoder:
-        """A decoder that has read nothing yet."""
+        """Return a new decoder."""
         self._survey.tell(report)
         return OsiDecoder(self._survey, report)
