@@ -1,7 +1,7 @@
 """Temporal formulas (LTLf with past and bounds), evaluated over whole traces or frame by frame.
 
-Both engines give the same answers: :func:`evaluate` at all frames of a trace at once,
-:class:`OnlineFormula` as the frames come, each as soon as it is known.
+Both engines return the same results: :func:`evaluate` for all frames of a trace at once, :class:`OnlineFormula`
+frame by frame, as early as possible.
 """
 
 import lazy_loader

@@ -1,8 +1,8 @@
 """Online monitor of one ``CHECK``, frame by frame.
 
-A check has a state for each binding, shared by all bindings in the same state. A state is made once and is
-compared by identity. What follows a state and a letter is remembered, where time does not matter in it, so most
-bindings of most checks take one look into a table a frame.
+Each binding of a check has a state. Bindings in the same state share one object, so states compare by identity.
+If time does not matter, the successor of a state and a letter is cached. So most bindings need one table lookup
+per frame.
 """
 
 from __future__ import annotations
@@ -94,17 +94,17 @@ class ObligationState:
     Attributes
     ----------
     word : str
-        ``begins``: the formula is asked from the next frame on; ``open``; ``broken``; ``kept``: it is true,
-        whatever comes.
+        ``begins``: evaluation starts at the next frame; ``open``; ``broken``; ``kept``: true for any later
+        frames.
     past : Past
     duties : Duties
     timeless : bool
-        Whether no time is kept in it.
+        True if the state contains no times.
     following : dict of int to ObligationStep
-        What is remembered of steps, by letter.
+        Cached transitions by letter.
     staying : dict of int to (int, int, int, int)
-        Of letters that change nothing: the guards that are true, the last time (ns) and number of a frame
-        of which that is known, and with which tolerance of times (ns).
+        Letters without effect: true guards, last time (ns) and number of a frame with this property, and time
+        tolerance (ns).
     """
 
     __slots__ = ("__weakref__", "duties", "following", "past", "staying", "timeless", "word")
@@ -152,9 +152,9 @@ class ObligationStep:
     ----------
     state : ObligationState
     started, ended : bool
-        Whether a violation begins, or ends, with this frame.
+        True if a violation begins, or ends, with this frame.
     guards : int
-        Which guards are true in this frame, a bit each.
+        True guards of this frame, one bit each.
     """
 
     state: ObligationState
@@ -170,18 +170,18 @@ class Automaton:
     ----------
     formula : Formula
     reset : Formula, optional
-        Looks at nothing later than the frame.
+        Reset condition; it does not depend on later frames.
     guards : sequence of Formula
-        Of single frames.
+        Guards; conditions of single frames.
     bits : mapping of str to int
-        The bit of each proposition in letters.
+        Proposition → its bit in letters.
 
     Attributes
     ----------
     begun : ObligationState
-        Before the first frame.
+        State before the first frame.
     mask : int
-        The bits that matter.
+        Relevant bits of letters.
     """
 
     def __init__(
@@ -220,10 +220,10 @@ class Automaton:
         ----------
         state : ObligationState
         letter : int
-            The propositions that are true, a bit each; no others than those of :attr:`mask`.
+            True propositions, one bit each, within :attr:`mask`.
         tick : Tick
         seen : dict
-            What this frame has made of other states already; it is kept by whoever tells frames.
+            Cache of transitions in this frame, provided by the caller.
         """
         found = state.following.get(letter) or seen.get((state, letter))
         if found is None and letter in state.staying:
@@ -353,18 +353,17 @@ class _CheckEntry:
     ----------
     state : ObligationState
     counted : int
-        Guards that were true in some frame, a bit each.
+        Guards that were true in some frame, one bit each.
     since : FrameTime or None
-        From when on the check is violated.
+        Start of the current violation.
     over : tuple of (Moment, FrameTime)
-        Violations that have ended.
+        Ended violations.
     memory : Memory
-        What values over time need of former frames.
+        Memory of the time functions.
     final : bool
-        Whether no frame changes it any more.
+        True if no later frame can change the entry.
     doubt : Doubt or None
-        What the other evaluation knows, as if no unknown condition were in favour of the check; ``None``: the
-        same.
+        Second evaluation, in which unknown conditions count against the check. ``None`` means no difference.
     """
 
     state: ObligationState
@@ -385,11 +384,11 @@ class Doubt:
     state : ObligationState
     counted : int
     violated : bool
-        Whether the check was violated in it.
+        True if this evaluation had a violation.
     name : str
-        The unknown proposition.
+        Unknown proposition.
     at : FrameTime
-        The frame in which it was unknown.
+        Frame with the unknown value.
     """
 
     state: ObligationState
@@ -417,17 +416,16 @@ class CheckMonitor:
     ----------
     check : BoundCheck
     questions : QueryCache
-        What is asked of each frame; those of the check become part of them.
+        Query cache; the queries of the check are added.
     pulse : StreamClock
-        Told of each frame before this is.
+        Clock, updated with each frame before this object.
     compat : bool
-        Whether the check is violated in each frame with which the trace, if it ended there, would violate it;
-        as SGSM reports it.
+        True for SGSM mode: the check is violated in a frame if the trace would violate it by ending there.
 
     Raises
     ------
     QueryError
-        What is to be known at once depends on later frames.
+        A value that is needed at once depends on later frames.
     """
 
     def __init__(
@@ -704,7 +702,7 @@ class CheckMonitor:
     def _levels(self, *, doubted: bool = False, waiting: bool = False) -> list[Level]:
         """Return the bindings of each quantifier.
 
-        ``doubted``: those of the other evaluation; ``waiting``: with those that ``FORSOME`` may be about later.
+        ``doubted``: use the second evaluation. ``waiting``: add future bindings of ``FORSOME``.
         """
         domains = {n: np.array(sorted(met), np.int64) for n, met in self._domains.items()}
         domains = newcomers(self._check, domains) if waiting else domains

@@ -1,12 +1,12 @@
 """Plans of checks, with rules for absent entities and unknown values.
 
-A check is evaluated twice by the evaluators of two-valued formulas: once as if all unknown conditions were in
-its favour, and once as if none were. In the formula an unknown condition is a proposition of its own. Its name
-ends in ``+`` where it counts in the first evaluation, and in ``-`` where it counts in the second.
+A check has two two-valued evaluations: unknown conditions count for the check in the first, and against it in
+the second. In the formula, an unknown condition is a separate proposition. Its name ends in ``+`` for the first
+evaluation, and in ``-`` for the second.
 
-A condition on an entity that is not in the frame, or on a value without a past, does not decide. It counts as
-true for a variable of ``FORALL``, and as false for one of ``FORSOME``; under ``NOT`` the other way round. A
-condition is asked as the frames in which it is true. Where absence counts as true, its contrary is asked.
+A condition on an absent entity, or on a value without a past, does not decide. It counts as true for a variable
+of ``FORALL``, and as false for a variable of ``FORSOME``; under ``NOT``, the reverse applies. A query returns
+the frames in which a condition is true. If absence counts as true, the negated condition is queried.
 """
 
 from __future__ import annotations
@@ -75,9 +75,9 @@ class Reading:
     unknown : str
         When an unknown condition counts as true: ``+``, ``-``, always (``*``) or never (empty).
     positive : bool
-        Whether the place is under an even number of negations.
+        True under an even number of negations.
     absent : bool or None
-        What a condition on an absent entity counts as; ``None``: as its quantifier says.
+        Truth value of a condition on an absent entity. ``None`` means that its quantifier decides.
     """
 
     unknown: str
@@ -116,14 +116,14 @@ class CheckPlan(Plan):
         Quantifiers, outermost first: ``FORALL``, ``FORSOME``, or ``false`` if conditions on absent entities
         are false, with their variables. The ego is a variable of the first.
     doubts : dict of str to Bound
-        By the name of an unknown proposition (without its sign) the condition that is unknown.
+        Name of an unknown proposition (without its sign) → unknown condition.
     states : dict of str to (Ask or None, str or None)
-        By the name of the signal of a :data:`STATE`, the signal of the value itself (``None``: a constant), and
-        the atom that says where it is unknown.
+        Name of the signal of a :data:`STATE` → signal of the value (``None``: a constant), and the atom of its
+        unknown frames.
     meanings : dict of str to Bound
-        Conditions of the query, by the names of propositions that stand for a part of them.
+        Proposition for a part of a condition → whole condition.
     limit : float or None
-        How far from the ego somebody is at most who is there; m.
+        Largest distance of a present entity from the ego; m.
     """
 
     words: tuple[tuple[str, frozenset[str]], ...] = ()

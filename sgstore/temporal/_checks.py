@@ -1,6 +1,6 @@
 """Evaluation of ``CHECK`` over a store: verdicts, violations and quantifiers.
 
-A trace that lacks what a check needs has the verdict ``unknown``, with the reason.
+If a trace lacks data for a check, the verdict is ``unknown``, with the reason.
 """
 
 from __future__ import annotations
@@ -102,9 +102,9 @@ class Level:
     word : str
         ``FORALL`` or ``FORSOME``.
     bindings : (B, n) int64
-        Of the variables of this quantifier and of those before it.
+        Bindings of the variables of this quantifier and of those before it.
     parents : (B,) int64
-        The binding of the quantifiers before that each goes on from.
+        Index of the outer binding that each binding extends.
     """
 
     word: str
@@ -130,17 +130,17 @@ def levels_of(
     ----------
     quantifiers : sequence of BoundQuantifier
     domains : mapping of str to (E,) int64
-        The entities that each variable may be.
+        Variable → its possible entities.
     apart : (A,) int64, optional
-        What no variable may be, since different variables are different entities; ``None``: variables may be
-        the same.
+        Entities that no variable may be, because different variables are different entities. ``None`` means
+        that variables may be equal.
     counts : function
-        Of a quantifier, the variables so far and bindings of these: which of them count.
+        Function from a quantifier, the variables so far and their bindings to a mask of the valid bindings.
 
     Raises
     ------
     QueryError
-        They are too many to be worked on.
+        The check has too many bindings.
     """
     variables: tuple[str, ...] = ()
     bindings, levels = np.zeros((1, 0), np.int64), list[Level]()
@@ -184,12 +184,12 @@ def waits_for_newcomers(
     ----------
     check : BoundCheck
     levels : sequence of Level
-        The bindings that it is about so far.
+        Current bindings of the check.
     wider : sequence of Level
-        The same with newcomers, and with those of which ``WHERE`` was not true yet.
+        Current bindings plus newcomers, and plus entities for which ``WHERE`` was not yet true.
     codes : (B,) int8
-        What is known of the last ones of ``wider``. The wait for them has no bound, so what already holds of
-        them is pending only if all that is due is.
+        Verdict codes of the last level of ``wider``. The wait for newcomers is unbounded, so ``HOLDS`` counts
+        as pending only with ``end`` = ``pending``.
     """
     known = set(map(tuple, innermost(levels).tolist()))
     late = np.array([tuple(row) not in known for row in innermost(wider).tolist()], np.bool_)
@@ -212,9 +212,9 @@ def folded_values(levels: Sequence[Level], values: Array, most: int = 1) -> list
     ----------
     levels : sequence of Level
     values : (B, …) bool or int8
-        Of the bindings of the last level; without quantifiers (1, …).
+        Values of the bindings of the last level; without quantifiers (1, …).
     most : int
-        The greatest value: that of ``FORALL`` over nothing. That of ``FORSOME`` is 0.
+        Largest value: the result of ``FORALL`` without bindings. The result of ``FORSOME`` is 0.
     """
     found = [values]
     for number in range(len(levels) - 1, -1, -1):
@@ -234,7 +234,7 @@ def folded_margins(levels: Sequence[Level], values: Floats) -> tuple[float, int 
     ----------
     levels : sequence of Level
     values : (B,) float64
-        Of the bindings of the last level.
+        Margins of the bindings of the last level.
     """
     if not levels:
         return float(values[0]), 0
@@ -267,7 +267,7 @@ class Witness:
         Their names.
     holds : bool
     violations : tuple of Interval
-        Where the check is violated for them.
+        Violations of the check by these entities.
     """
 
     nodes: Mapping[str, int]
@@ -282,7 +282,7 @@ def unknown_notes(told: Iterable[tuple[str, str, str]]) -> list[str]:
     Parameters
     ----------
     told : iterable of (subject, trace, reason)
-        Such as ``near is unknown``, ``cut_in_1``, ``it has no ego``; without a reason there is nothing to say.
+        Such as ``near is unknown``, ``cut_in_1``, ``it has no ego``. Entries without a reason are ignored.
     """
     grouped: dict[tuple[str, str], list[str]] = {}
     for subject, trace, reason in told:
@@ -314,21 +314,21 @@ class Verdict:
     check, trace : str
         Their names.
     verdict : str
-        ``true`` or ``false``, if that holds whatever is unknown; ``pending``, if something is still due at the
+        ``true`` or ``false``, if independent of unknown values; ``pending``, if an obligation is open at the
         end of the recording; else ``unknown``.
     first_violation : Interval or None
-        The first of the violations.
+        First violation, or ``None``.
     violations : tuple of Interval
-        In order; of a check with quantifiers those of all its witnesses.
+        Violations in order; with quantifiers, the violations of all witnesses.
     witnesses : tuple of Witness
     status : (F,) int8 or None
-        If asked for: what was known at each frame, as places in :data:`sgstore.temporal._verdicts.STATUS`.
+        If requested: status of each frame, as indices in :data:`sgstore.temporal._verdicts.STATUS`.
     reason : str
-        Why the verdict is ``unknown``; else empty.
+        Reason of an ``unknown`` verdict; else empty.
     robustness : Robustness or None
-        By how much the check is met, if it asks for that by ``ROBUSTNESS``.
+        Robustness of the check, if it has ``ROBUSTNESS``.
     absent_frames : int
-        Of a ``true`` verdict: the number of frames in which an entity that the check is about is absent.
+        For a ``true`` verdict: number of frames with an absent entity of the check.
     """
 
     check: str
@@ -396,9 +396,9 @@ def verdict_columns(*, margin: bool = False, returned: Sequence[str] = ()) -> tu
     Parameters
     ----------
     margin : bool
-        Whether a check has ``ROBUSTNESS``.
+        True if a check has ``ROBUSTNESS``.
     returned : sequence of str
-        What checks return of violations.
+        Names of the values that checks return for violations.
     """
     return (*_COLUMNS, *returned, *(_MARGIN_COLUMNS if margin else ()))
 
@@ -484,13 +484,13 @@ def verdict_of(
     verdict : Verdict
     levels : sequence of Level
     codes : (B,) int8
-        What is known of the bindings of the last level, from :data:`VIOLATED` to :data:`HOLDS`.
+        Verdict codes of the bindings of the last level, from :data:`VIOLATED` to :data:`HOLDS`.
     names : mapping of str to mapping of int to str
-        Names of the entities that each variable may be.
+        Variable → names of its possible entities.
     violations : function
-        Those of a binding of the last level, given its row and the names of its entities.
+        Function from the row of a last-level binding and its entity names to its violations.
     last : Interval
-        The last frame: what is violated where no binding tells it.
+        Last frame: the violation if no binding has one.
     """
     if not levels:
         return replace(verdict, violations=violations(0, {}))
@@ -519,15 +519,15 @@ class CheckRun:
     ----------
     file : StoreFile
     catalog : function
-        Gives what the store holds.
+        Function that returns the catalog of the store.
     text : str
         ``CHECK`` statements, with the predicates that they need.
     parameters : mapping of str to value
     sgsm_compat : bool
-        Whether a trace violates a check if any of its beginnings would, as SGSM reports, and not only if it
-        does itself. Violations are then the frames that such beginnings end with.
+        True for SGSM mode: a trace violates a check if any prefix of it does. Violations are then the last
+        frames of such prefixes.
     status : bool
-        Whether the status at each frame is told.
+        True to also return the status of each frame.
 
     Raises
     ------
@@ -625,7 +625,7 @@ class CheckRun:
         Yields
         ------
         frame_ids : (F,) int64
-            Of a trace that can answer.
+            Frame ids of an answerable trace.
         margins : (F,) or (1,) float64
         """
         with self._file.snapshot():
@@ -653,7 +653,7 @@ class Judged:
         From :data:`VIOLATED` to :data:`HOLDS`.
     told : list of (violations, status)
     in_gap : (B,) bool
-        Whether it depends on what happened in a gap.
+        True if the verdict depends on events in a gap.
     """
 
     codes: Codes
@@ -671,12 +671,12 @@ class StoreCheck:
     Parameters
     ----------
     file : StoreFile
-        It stays as it is while this is used.
+        Store; it must not change during use.
     one : CheckInCatalog
     compat, status : bool
-        As ``sgsm_compat`` and ``status`` of :class:`CheckRun`.
+        See ``sgsm_compat`` and ``status`` of :class:`CheckRun`.
     margins : bool
-        Whether :meth:`margins` will be asked.
+        True if :meth:`margins` will be called.
     """
 
     def __init__(
@@ -764,9 +764,10 @@ class StoreCheck:
         Parameters
         ----------
         trace : TraceReader
-            Those frames.
+            Selected frames.
         present : mapping of str to str
-            What :meth:`watched` gave before the trace was read: who is in none of the frames is not in it.
+            Result of :meth:`watched` from before the trace was read. Entities that are absent from all frames
+            are left out.
         """
         everybody = self._people.get(trace.trace_id, {})
         here = dict(everybody)
@@ -942,8 +943,8 @@ class StoreCheck:
     def margins(self, trace: TraceReader) -> Floats:
         """Return the margins of the check on a trace. NaN means that only unknown numbers decide.
 
-        Of a check that says what is ``ALWAYS`` true, of everybody: (F,), that of each frame. What is not known
-        of somebody, or in some frame, does not count. Of any other check: (1,), that of the whole trace.
+        For an ``ALWAYS`` check over all entities: shape (F,), the margin of each frame. Unknown entities and
+        frames are ignored. For any other check: shape (1,), the margin of the whole trace.
         """
         each, quantity = self._lasting is not None, self._ranked
         assert quantity is not None  # noqa: S101 - who asks has asked for margins
@@ -1027,7 +1028,7 @@ class StoreCheck:
     def _alike(self, trace: TraceReader, bindings: Keys) -> tuple[Keys, Ints]:
         """Group bindings with equal truth values in all frames. One evaluation per group is enough.
 
-        Returns one binding of each sort, and the sort of each binding.
+        Return one binding per group, and the group of each binding.
         """
         if not len(bindings):
             return bindings, np.zeros(0, np.int64)

@@ -1,7 +1,7 @@
 """Online monitor of a step expression: ``A THEN (B | C)``, ``(A THEN B){2,3}``.
 
-It stands for several sequences. Of all their matches that begin in one run of one step, with one binding, one
-counts: so a match is told as soon as no sequence can bring forth a better one.
+An expression stands for several sequences. Among all matches that begin in one run of one step with one
+binding, only the best one counts. So a match is reported as soon as no sequence can produce a better one.
 """
 
 from __future__ import annotations

@@ -48,18 +48,18 @@ class FollowedMatch:
     Parameters
     ----------
     query : Query
-        As the monitor has bound it.
+        Pattern, bound by the monitor.
     nodes : mapping of str to int
 
     Attributes
     ----------
     begun, seen : int
-        First and last frame that was looked at; -1: none was.
+        First and last evaluated frame; -1: none.
 
     Raises
     ------
     QueryNameError
-        The pattern has no such variable.
+        The pattern lacks a variable of the binding.
     """
 
     def __init__(self, query: Query, nodes: Mapping[str, int]) -> None:
@@ -109,14 +109,14 @@ class FollowedCurve:
     Parameters
     ----------
     attribute : str
-        As the views ``nodes`` and ``pairs`` call it.
+        Column of the view ``nodes`` or ``pairs``.
     node : int
     other : int, optional
 
     Raises
     ------
     StoreError
-        There is no such number.
+        The attribute does not exist or is not a number.
     """
 
     def __init__(self, attribute: str, node: int, other: int | None) -> None:
@@ -152,7 +152,7 @@ class RecentGraphs:
     """Most recent graphs of a run. Followed matches and curves are updated with each new graph.
 
     Memory is bounded: at most :data:`MOST_EDGES` edges, or one graph, and :data:`MOST_FOLLOWED` matches and
-    curves. For one thread at a time.
+    curves. The object is not thread-safe.
     """
 
     def __init__(self) -> None:
@@ -177,7 +177,7 @@ class RecentGraphs:
         Raises
         ------
         StoreError
-            It is not.
+            The frame is no longer stored.
         """
         for view in self._views:
             if view.frame["seq"] == seq:

@@ -1,8 +1,8 @@
 """Temporal formulas over named propositions, for the offline and the online engine.
 
-Time is pointwise over frames. A formula is true or false at a frame of a finite trace: ``NEXT`` is false at
-the last frame and ``WEAKNEXT`` true, ``PREVIOUS`` is false at the first (LTLf). Bounds of time compare time
-stamps, both ends included; bounds in frames compare numbers of frames.
+The semantics is pointwise over frames. A formula is true or false at each frame of a finite trace: ``NEXT`` is
+false at the last frame and ``WEAKNEXT`` true, ``PREVIOUS`` is false at the first (LTLf). Time bounds compare
+timestamps, both ends included; frame bounds compare frame numbers.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Bound:
     Attributes
     ----------
     low, high : int
-        Nanoseconds, or frames; ``high`` is ``None`` if it looks as far as the trace goes.
+        Nanoseconds or frames. ``high`` is ``None`` for an unlimited range.
     frames : bool
     """
 
@@ -301,17 +301,17 @@ class Term:
     word : str
         ``true``, ``false``, ``duty``, ``not``, ``and``, ``or``.
     operands : tuple
-        Terms; of a duty the formula, from where its bound counts (``None``: that has not begun), and whether
-        it is met where no frame follows.
+        Operand terms. For a duty: the formula, the start of its bound (``None``: not begun), and its value if
+        no frame follows.
     timed : bool
-        Whether a duty in it counts from some frame on.
+        True if a duty in the term has a begun bound.
     sense : int
-        Of two terms of the same :attr:`shape`, the one all of whose bounds begin no later makes the other true
-        (1), or the one all of whose bounds begin no earlier (-1); 0: that tells nothing.
+        Implication between terms of the same :attr:`shape`: earlier bounds imply later ones (1), later imply
+        earlier (-1), or no implication (0).
     shape : object
-        What it is but for where its bounds begin.
+        Structure of the term without the starts of its bounds.
     begins : tuple of int
-        Where they do.
+        Starts of the bounds.
     """
 
     __slots__ = ("__weakref__", "begins", "operands", "sense", "shape", "timed", "word")
@@ -372,7 +372,7 @@ class Term:
 def may_end(term: Term, tick: Tick) -> bool:  # noqa: PLR0911 - a case each
     """True if the term is true or still open when this frame is the last.
 
-    An operator that looks ahead is due if its bound is not over, and so is ``NEXT``. One without an upper bound
+    A forward operator is open if its bound is not over, and so is ``NEXT``. An operator without an upper bound
     has failed.
     """
     match term.word:
@@ -422,7 +422,7 @@ class Terms:
     def duty(self, formula: Formula, since: int | None, *, weak: bool) -> Term:
         """Return the obligation on the next frame. ``since`` is the start of its bound, if begun.
 
-        The formula is told by identity: equal parts of a formula are to be one object.
+        Formulas compare by identity, so equal parts must be one object.
         """
         return self._made("duty", (formula, since, weak), (id(formula), since, weak))
 
@@ -437,8 +437,8 @@ class Terms:
     def joined(self, word: str, terms: Iterable[Term]) -> Term:
         """Return the conjunction or disjunction of terms, without redundant terms.
 
-        Something and its contrary are left to be told by the frames that follow: verdicts over columns
-        (:mod:`sgstore.temporal._verdicts`) do not look for them either, and both are to know the same.
+        A term and its negation are not simplified; later frames decide them. The offline verdicts
+        (:mod:`sgstore.temporal._verdicts`) do the same, and both must agree.
         """
         neutral, absorbing = (self.true, self.false) if word == "and" else (self.false, self.true)
         parts: dict[int, Term] = {}
@@ -460,7 +460,7 @@ class Terms:
 def least(terms: Iterable[Term], word: str = "and") -> list[Term]:
     """Remove redundant terms from a conjunction or disjunction.
 
-    So what an ``ALWAYS`` owes since many frames is owed once.
+    So a repeated obligation of an ``ALWAYS`` is stored once.
     """
     kept: list[Term] = []
     best: dict[Any, Term] = {}
@@ -496,14 +496,14 @@ class Progression:
     Attributes
     ----------
     formula : Formula
-        The same, equal parts being one object.
+        Formula in which equal parts are one object.
     names : tuple of str
-        Its propositions, in alphabetical order.
+        Propositions in alphabetical order.
     terms : Terms
     past : tuple of Formula
-        Operators of the past, parts first.
+        Past operators, parts first.
     begun : Past
-        What they keep before the first frame.
+        Memory of the past operators before the first frame.
     """
 
     def __init__(self, formula: Formula) -> None:
@@ -543,7 +543,7 @@ class Tick:
     number : int
         From 0.
     tolerance : int
-        Times that differ by no more are the same; ns.
+        Time tolerance for equality; ns.
     """
 
     time: int
@@ -568,9 +568,9 @@ class ProgressionFrame:
     ----------
     progression : Progression
     past : Past
-        As the frame before left it.
+        Memory after the previous frame.
     letter : mapping of str to bool
-        The propositions.
+        Truth values of the propositions.
     tick : Tick
     """
 

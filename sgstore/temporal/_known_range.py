@@ -49,7 +49,7 @@ def short_ranges(file: StoreFile, catalog: Catalog, check: BoundCheck) -> Mappin
     ----------
     file : StoreFile
     catalog : Catalog
-        That the check was bound to.
+        Catalog of the bound check.
     check : BoundCheck
     """
     if not check.world or check.unknown_is_false:
@@ -119,15 +119,15 @@ class SeenRange:
     Attributes
     ----------
     known : float
-        The distance; m.
+        Known distance; m.
     cut : bool
-        Whether something was told that lies beyond it.
+        True if entities beyond the distance were cut off.
     fastest : float
-        The greatest speed so far; m/s.
+        Highest speed so far; m/s.
     labels : tuple of str
-        Of what settings keep; empty: everything.
+        Labels that the settings keep; empty: all.
     excluded : frozenset of str
-        Kinds of what was told and is not kept.
+        Kinds that the settings excluded.
     """
 
     known: float

@@ -1,10 +1,10 @@
 """Aggregates over the frames of a match: minimum, maximum, mean, first, and their times.
 
-Over columns a match is a row of bindings and the frames from one to another; frame by frame a :class:`Fold` is
-what is known of such a stretch, and two that follow one another are joined.
+Offline, a match is a row of bindings and a frame interval. Online, a :class:`Fold` is the aggregate of an
+interval, and consecutive ones are combined.
 
-Values that are not known do not count, except that the first and the last are those of the first and the last
-frame, known or not. Sums are rounded once, so that it makes no difference how they are put together.
+Unknown values are ignored, except for ``first`` and ``last``: they are the values of the first and last frame,
+even if unknown. Sums are rounded once, so the order of the additions does not matter.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ class ReturnedValues:
     ----------
     columns : sequence of ReturnColumn
     word : str
-        What stands for a value of one frame: ``first`` of the match, or ``last``.
+        Default aggregate of a single-frame value: ``first`` or ``last``.
 
     Attributes
     ----------
     parts : tuple of OverMatch
-        What they are made of, each once. Those of one frame are of the steps :data:`AT_FRAME`.
+        Distinct parts of the values. Single-frame parts have the steps :data:`AT_FRAME`.
     """
 
     def __init__(self, columns: Sequence[b.ReturnColumn], word: str) -> None:
@@ -69,9 +69,9 @@ class ReturnedValues:
         Parameters
         ----------
         part : function
-            The value of a part.
+            Function that returns the value of a part.
         seconds : function, optional
-            The time of a step.
+            Function that returns the time of a step.
         """
 
         def known(value: b.Bound) -> b.Bound:
@@ -103,9 +103,9 @@ class Stretches:
     Attributes
     ----------
     rows : (M,) int64
-        The row of the binding of each in a column of values.
+        Row of each interval's binding in the value columns.
     first, last : (M,) int64
-        The frames; no stretch is empty.
+        First and last frames. No interval is empty.
     """
 
     rows: Ints
@@ -122,7 +122,7 @@ class Stretches:
         column : Column
             (B, F), or of length 1 in an axis.
         at : Column, optional
-            Of ``argmin`` and ``argmax``: what is told of the frame that they find.
+            For ``argmin`` and ``argmax``: the value to return at the found frame.
         """
         if not len(self.rows):
             return np.zeros(0, np.object_)
@@ -147,9 +147,9 @@ def over_rows(word: str, column: Column, starts: Ints, at: Column | None = None)
     column : Column
         (R,), or (1, R).
     starts : (M,) int64
-        The first row of each part; the next part begins where it ends, and none is empty.
+        First row of each group. Groups are consecutive and not empty.
     at : Column, optional
-        Of ``argmin`` and ``argmax``: what is told of the row that they find.
+        For ``argmin`` and ``argmax``: the value to return at the found row.
 
     Returns
     -------
@@ -231,17 +231,17 @@ class Fold:
     Attributes
     ----------
     start, end : int
-        Numbers of its frames; in others between them, and beside them, it was not known.
+        First and last frame number with a known value.
     first, last : object
-        The value in the first and in the last of them.
+        Values in the first and the last of these frames.
     best : float
-        The least value; of ``max`` and ``argmax`` the greatest one with its sign changed.
+        Minimum; for ``max`` and ``argmax``, the negated maximum.
     at : object
-        What is told of the first frame in which it was so.
+        Value to return at the first frame of the best value.
     total : int
-        The sum, in units of the smallest number there is.
+        Sum, as a multiple of the smallest positive float.
     count : int
-        How many values are in it.
+        Number of values in the sum.
     """
 
     start: int

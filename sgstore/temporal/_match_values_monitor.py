@@ -1,8 +1,7 @@
 """Online aggregates over matches, frame by frame.
 
-Of each value that a match may be asked for, the frames since the first one that is still needed are kept as few
-stretches: those between frames at which a match may begin or end are joined, so what is kept grows with the
-matches that are open, and not with the time that they have been.
+The history of a value begins at the first frame that a match may still need. Frames between possible match ends
+are merged. So the memory grows with the number of open matches, not with their duration.
 """
 
 from __future__ import annotations
@@ -105,13 +104,13 @@ class MatchValues:
     ----------
     parts : iterable of OverMatch
     plan : function
-        Makes a plan without questions, for the nodes and edges of the matches.
+        Function that returns an empty plan for the nodes and edges of the matches.
     questions : QueryCache
-        What is asked of each frame; those of the values become part of them.
+        Query cache; the queries of the values are added.
     pulse : StreamClock
-        Told of each frame before this is.
+        Clock, updated with each frame before this object.
     bridge : bool
-        Whether gaps do not matter.
+        True to ignore gaps.
 
     Raises
     ------
@@ -158,9 +157,9 @@ class MatchValues:
         ----------
         part : OverMatch
         binding : mapping of str to int or None
-            ``None``: any node that was never told of.
+            ``None`` means a node without known values.
         span : (int, int)
-            Numbers of its first and its last frame.
+            First and last frame number.
         """
         return self._courses[_anywhere(part)].value(binding, span)
 

@@ -78,8 +78,8 @@ def _has_braces(query: Query) -> bool:
 class TemporalMatches(Matches):
     """Matches of a single-frame or multi-frame query; see :class:`sgstore.matches.Matches`.
 
-    A match of a sequence is told once: its frame is that in which its last step is found, its interval goes
-    from the frame of its first step to that one (to the end of its run, if the last step has a duration).
+    A match of a sequence is reported once, at the frame of its last step. Its interval begins at the frame of
+    the first step and ends there (or at the end of the run, if the last step has a duration).
     """
 
     @property

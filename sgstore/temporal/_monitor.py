@@ -71,15 +71,15 @@ class FrameSource:
     name : str
     road_map : RoadMap or None
     frames : iterator of Frame
-        Of a running simulator it does not end.
+        Frames; endless for a running simulator.
     warnings : list of str
-        What is odd; more comes while frames are read.
+        Anomalies; the list grows while frames are read.
     losses : list of str
-        What could not be read.
+        Unreadable data.
     live : bool
-        Whether frames come in their time.
+        True if frames arrive in real time.
     cameras : Cameras, optional
-        They know the pictures of the frames that were read.
+        Camera pictures of the frames read so far.
     """
 
     name: str
@@ -107,18 +107,18 @@ def opened(
     source : str
     config : Config
     road_map : Path, optional
-        For a recording that carries no map of its own, as ingest takes it.
+        Road map for a recording without a map, as for ingest.
     ego : str
-        Id, role or name of the ego; empty: as the recording says.
+        Id, role or name of the ego; empty: ego of the recording.
     sensors : sequence of Sensor
-        Of a running simulator: attached to the ego while it is open; what its cameras see can be asked for.
+        For a running simulator: sensors attached to the ego. Their camera pictures are available.
 
     Raises
     ------
     TraceError
-        It cannot be read, there is no server, or no ego to carry sensors.
+        The recording is not readable, the server is missing, or no ego exists for the sensors.
     MapError
-        The map cannot be read.
+        The map is not readable.
     """
     if source.startswith(LIVE):
         with _live(source, ego, sensors) as told:
@@ -207,37 +207,37 @@ class Monitor:
     road_map : RoadMap, optional
     config : Config, optional
     on_event : callable, optional
-        Is told every event as soon as it is known.
+        Called with every event, as early as possible.
     parameters : mapping of str to value, optional
         Values of ``$name``.
     trace : str
-        What the trace is called in verdicts.
+        Name of the trace in verdicts.
     period_s : float, optional
-        Time between two frames, from which gaps are told; by default the median of those seen.
+        Time between frames, used to detect gaps; default: median of the frames seen; s.
     called : str or sequence of str
-        What a pattern is called in events; of several each has a number as well, or a name of its own.
+        Name of a pattern in events. Several patterns get numbers, or a name each.
     sgsm_compat : bool
-        Whether a check is violated in each frame with which the trace, if it ended there, would violate it; as
-        :meth:`sgstore.query.Store.check` has it. Nothing resets such a violation.
+        True for SGSM mode, as in :meth:`sgstore.query.Store.check`: a check is violated in a frame if the trace
+        would violate it by ending there. Such a violation has no reset.
     on_step : callable, optional
-        Is told of every frame, after its events: when it was, and its graphs, one for each of :attr:`egos`.
+        Called after the events of each frame, with its time and its graphs, one for each of :attr:`egos`.
 
     Attributes
     ----------
     generator : SceneGraphGenerator
-        What makes the graphs; its last ones are those of the last step.
+        Generator of the graphs. It holds the graphs of the last step.
     names : tuple of str
-        Of the checks and patterns.
+        Names of the checks and patterns.
 
     Raises
     ------
     QueryError
-        The text has no meaning, or is about what cannot be known while a trace goes on; it says where.
+        The text is invalid, or needs data that are unavailable online. The message gives the place.
 
     Notes
     -----
-    A check that names a relation which the graphs cannot have (of lanes, without a map) has the verdict
-    ``unknown``, a pattern none.
+    If the graphs cannot have a relation (such as a lane relation without a map), a check that uses it has the
+    verdict ``unknown``, and a pattern has no matches.
     """
 
     def __init__(  # noqa: PLR0913 - most have names
@@ -314,8 +314,7 @@ class Monitor:
         Raises
         ------
         ValueError
-            The frame contradicts itself, as :meth:`sgstore.sgg.SceneGraphGenerator.steps` says; it is as if it
-            had not been given.
+            The frame is inconsistent; see :meth:`sgstore.sgg.SceneGraphGenerator.steps`. It is ignored.
         """
         with GcPaused():  # the graphs are let go within
             return self._step(frame)
@@ -331,9 +330,9 @@ class Monitor:
         Parameters
         ----------
         graphs : sequence of SceneGraph
-            One for each of :attr:`egos`.
+            One graph for each of :attr:`egos`.
         classed : bool
-            Whether they are the last ones of :attr:`generator`, which can then be asked for their classes.
+            True for the last graphs of :attr:`generator`, which can then return their classes.
         """
         here, people = self._ask(graphs, classed=classed)
         events = self._tell(here, people)
@@ -399,7 +398,7 @@ class Monitor:
 
         ``true``, ``false``, ``presumably_true``, ``presumably_false``.
 
-        The latter are what the verdict would be if the trace ended now. ``unknown``: it cannot be told.
+        The ``presumably`` values are the verdicts if the trace ended now. The status can also be ``unknown``.
         """
         known = {
             watch.name: "unknown" if waiting.reason else watch.status()
@@ -423,7 +422,7 @@ class Monitor:
         ----------
         frames : iterable of Frame
         duration_s : float, optional
-            How much simulation time is watched; by default all.
+            Simulation time to process; s. Default: all frames.
         """
         try:
             for frame in frames:
@@ -466,7 +465,7 @@ class _PendingEvents:
     Attributes
     ----------
     reason : str
-        The needs that the trace has not met, as text. Nothing is needed of what was never there.
+        Missing data of the trace as text. Entities that never appear need no data.
     """
 
     def __init__(self, needs: Iterable[Need]) -> None:

@@ -1,7 +1,7 @@
 """Relations and signals of whole traces, read from the store.
 
-A relation has, for each binding, the frames of one trace in which something holds; many bindings are looked up
-at a time.
+A relation holds, for each binding, the frames of one trace in which a condition is true. Lookups process many
+bindings at once.
 """
 
 from __future__ import annotations
@@ -58,13 +58,13 @@ class TimedRelation:
     Attributes
     ----------
     keys : (K, n) int64
-        The bindings, each once, in ascending order.
+        Distinct bindings in ascending order.
     starts : (K + 1,) int64
-        Where the frames of each begin.
+        Start of each binding's frames.
     frames : (R,) int64
         Numbers of frames, ascending for each binding.
     values : tuple of (R,) arrays
-        What was asked of each match; masked where it is unknown.
+        Queried values of each match; unknown values are masked.
     """
 
     keys: Keys
@@ -156,7 +156,7 @@ def refuse_many(bindings: int, told: str) -> None:
     Raises
     ------
     QueryError
-        It says what they were to be of.
+        The message names the nodes.
     """
     if bindings > MOST_BINDINGS:
         raise QueryError(
@@ -204,7 +204,7 @@ class TraceReader:
     trace_id : int
     name : str
     frame_ids, numbers, times, log_times : (F,) int64
-        Of its frames: ids, numbers (``seq``), simulation times and log times; ns.
+        Frame ids, frame numbers (``seq``), simulation times and log times (ns).
     start : int
         Simulation time from which seconds are counted; ns.
     clock : Clock
@@ -255,10 +255,10 @@ class PlanValues(SignalValues):
     plan : Plan
     trace : TraceReader
     variables : tuple of str
-        What the columns of the bindings are.
+        Variables of the binding columns.
     bindings : (B, n) int64
     counted : str
-        Of a check: the sign of the unknown propositions that are true; the others are false.
+        For a check: sign of the unknown propositions that count as true.
     """
 
     def __init__(
@@ -365,27 +365,27 @@ def traces(
 ) -> Iterator[TraceReader]:
     """Yield the answerable traces of a query in catalog order, with the queried relations.
 
-    They are read a few at a time, the more the fewer rows they have, so that memory does not grow with a store.
-    Traces that have too many rows together are read again, half of them at a time.
+    Traces are read in small groups, so memory does not grow with the store. If a group has too many rows, its
+    halves are read again.
 
     Parameters
     ----------
     file : StoreFile
-        It stays as it is while this runs.
+        Store; it must not change during the iteration.
     catalog : Catalog
     whole : Query
-        Says which traces are asked.
+        Query that selects the traces.
     asks : mapping of str to Ask
         By name.
     gaps : str
-        Whether a gap ends a run: ``break``, ``bridge``.
+        Effect of a gap on a run: ``break`` or ``bridge``.
     within : Window, optional
         Buckets of whole traces; by default all.
 
     Raises
     ------
     QueryError
-        What is asked holds for too many nodes in too many frames of one trace.
+        A query has too many matches in one trace.
     """
     asked = [one for one in extents(catalog) if within is None or one[0] in within]
     steps = Windows(asked, whole_traces=True)
@@ -411,7 +411,7 @@ def read(
     Raises
     ------
     TooMuchError
-        They are more than memory may hold.
+        The rows exceed the memory limit.
     """
     about = chosen_traces(file, whole, catalog)
     found = _clocks(about, frame_times(file, window), gaps)
@@ -537,12 +537,12 @@ def arrays_of(
 ) -> tuple[Ints, Keys, list[Any]]:
     """Return the rows of a pattern's matches, unsorted: frame ids, bindings, and values.
 
-    Of a signal the relations of its edges come behind the nodes.
+    For a signal, the relations of its edges follow the nodes.
 
     Raises
     ------
     TooMuchError
-        They are more than so many.
+        The number of rows exceeds ``most``.
     """
     bound = {*ask.variables, *ask.edges}
     statement = relation(ask.query, catalog, window, values, bound, most + 1)
@@ -607,8 +607,8 @@ def _by_trace(ids: Ints) -> Iterable[tuple[int, slice]]:
 def ascending(times: Ints) -> Ints:
     """Return strictly ascending times. Repeated times and backward jumps are corrected.
 
-    A time that is equal to the one before counts as a nanosecond later. Behind a jump back all times are later
-    by so much that :data:`sgstore.world.JUMP_NS` lie between: the jump is a gap, which no bound of time spans.
+    A repeated time becomes a nanosecond later. After a backward jump, all times are shifted by
+    :data:`sgstore.world.JUMP_NS` after the last one. So the jump is a gap that no time bound spans.
     """
     steps = np.diff(times, prepend=times[:1])
     if np.any(steps < 0):

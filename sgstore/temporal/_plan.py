@@ -1,6 +1,6 @@
 """Evaluation plans: temporal expressions as formulas over atoms, and their text.
 
-A :class:`Plan` has all that an expression, or several of one statement, need of single frames, once each:
+A :class:`Plan` contains all single-frame data that the expressions of a statement need, without duplicates:
 
 * an **atom** is a condition on one frame. It has free variables (keys of nodes) and is a query of its own:
   its matches say in which frames, and for which entities, it is true. A store answers it by SQL; in memory
@@ -14,15 +14,14 @@ A :class:`Plan` has all that an expression, or several of one statement, need of
 
 In a :class:`~sgstore.temporal._formula.Formula` of the plan, a proposition is the name of an atom or of a test.
 
-In steps and values an atom that is NULL is false, and so is one that speaks of an entity that is absent.
-Logic outside of atoms has two values. Which part of a condition becomes an atom is chosen for speed: its value
-is that of its smallest conditions, each being true or false. Checks have plans of their own
+In steps and values, a NULL atom is false, and so is an atom on an absent entity. Logic outside of atoms is
+two-valued. The split of a condition into atoms only affects speed, not its value. Checks have special plans
 (:mod:`sgstore.temporal._check_plan`).
 
-For whoever evaluates a plan frame by frame (a monitor): for each frame, ask each atom for its matches, project
-them to ``variables``, and step a formula for each binding with ``letter[name] = projection in matches``. Of an
-entity that was never seen all atoms are false that have it among their variables, so one engine that has seen
-none can be copied when it comes. Values of signals at former frames are kept as far back as ``delta`` looks.
+A monitor evaluates a plan frame by frame. It queries the matches of each atom, projects them to ``variables``,
+and steps a formula for each binding with ``letter[name] = projection in matches``. All atoms on an unseen
+entity are false, so a new entity starts with a copy of the engine for unseen entities. Signal values are kept
+as far back as ``delta`` needs.
 """
 
 from __future__ import annotations
@@ -57,18 +56,18 @@ class Ask:
     Attributes
     ----------
     name : str
-        Of an atom the proposition.
+        Name of the atom (the proposition) or signal.
     query : Query
-        Its nodes and the condition; matches say where it is true.
+        Nodes and condition. The matches are the frames in which it is true.
     variables : tuple of str
-        Those of its nodes that a binding speaks of, in order; the others (the ego) are only asked to exist.
+        Nodes in a binding, in order. Other nodes (the ego) only need to exist.
     value : Bound or None
-        What is asked of each match: of a signal.
+        Value of each match, for a signal.
     edges : tuple of str
-        Keys of its edges that a binding speaks of, too. Of a signal those that its value speaks of: of matches
-        that differ in these alone, the one counts whose relations come first in the alphabet.
+        Keys of the edges in a binding. For a signal: edges in its value. Among matches that differ only in
+        these edges, the alphabetically first relations win.
     after : tuple of Ask
-        Steps that are asked before: where these never hold for a node, this one need not be known.
+        Steps queried earlier. This query skips nodes for which they never hold.
     """
 
     name: str
@@ -114,18 +113,18 @@ class Test:
     Attributes
     ----------
     name : str
-        The proposition, if it is a condition.
+        Name of the test; also the proposition of a condition.
     expression : Bound
-        Constants, operations and courses; other parts are the values of ``signals``.
+        Constants, operations and time functions; other parts are values of ``signals``.
     variables : tuple of str
     signals : dict of Bound to Ask
-        By the part of the expression that each is.
+        Part of the expression → its signal.
     formulas : dict of Bound to Formula
-        Of the conditions within ``run_length`` and ``since_true``.
+        Formulas of the conditions inside ``run_length`` and ``since_true``.
     quantities : dict of Bound to Formula
-        Of the conditions within ``robustness``, over margins.
+        Formulas over margins of the conditions inside ``robustness``.
     presence : dict of str to str
-        Node → the atom that says where it is, for ``age``.
+        Node → atom of its presence, for ``age``.
     """
 
     name: str
@@ -146,11 +145,11 @@ class Plan:
     Parameters
     ----------
     whole : Query
-        The statement: settings and relations are taken from it, and of its scope the nodes and edges.
+        Statement with the settings, relations, nodes and edges.
     bound : tuple of str
-        Keys of the nodes that a binding speaks of.
+        Keys of the nodes in a binding.
     prefix : str
-        How names begin, so that those of several plans differ.
+        Prefix of names, to separate several plans.
 
     Attributes
     ----------
@@ -158,7 +157,7 @@ class Plan:
     tests : dict of str to Test
         By name.
     margins : dict of str to Bound
-        Comparisons, by the name of the test of the difference by which they hold.
+        Name of the test of a difference → its comparison.
     """
 
     whole: b.Query
@@ -251,8 +250,8 @@ class Plan:
     def _merged(self, operands: tuple[b.Bound, ...]) -> list[b.Bound]:
         """Group the operands of a conjunction by their nodes, to use one query per group.
 
-        What speaks of no more entities than another condition, which is false where one of these is absent, is
-        asked together with it: one question finds few, where each alone might find many.
+        A condition joins a group if the group already uses all its nodes, and is false when one of them is
+        absent. One combined query has fewer matches than separate queries.
         """
         flat = [part for operand in operands for part in b.conjuncts(operand)]
         nodes = {id(part): self._things(part) for part in flat}
@@ -402,7 +401,7 @@ def variables_of(check: BoundCheck) -> tuple[str, ...]:
 def asks_of_steps(query: b.Query, steps: Sequence[BoundStep], kept: Iterable[str]) -> list[Ask]:
     """Return the patterns of steps, named ``step 1``, ``step 2`` and so on.
 
-    All nodes of a step are bound where its conditions need that, else those kept.
+    A query binds all nodes of a step if its conditions need them, else only the kept nodes.
     """
     asks = [_ask_of_step(query, step, kept, n) for n, step in enumerate(steps, start=1)]
     happen = [n for n, step in enumerate(steps) if not step.absent]
@@ -491,7 +490,7 @@ def _all(parts: list[b.Bound]) -> b.Bound:
 def _two_valued(expression: b.Bound, *, outermost: bool = True) -> b.Bound:  # noqa: PLR0911 - a case each
     """Return a single-frame condition in which unknown simple conditions count as false.
 
-    Where it is only asked whether all of some conditions are true, nothing need be done: unknown is not true.
+    A plain conjunction does not change: unknown is not true.
     """
     match expression:
         case b.Operation("AND", operands):
@@ -597,7 +596,7 @@ def length_text(length: Length) -> str:
 def _refuse_large(value: b.Bound) -> None:
     """Reject a value over time with integers beyond the exact range of float64.
 
-    Conditions are asked of each frame, exactly.
+    Single-frame conditions are exact.
 
     Raises
     ------

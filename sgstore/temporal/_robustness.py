@@ -1,12 +1,13 @@
 """Robustness: the margin by which a formula is true or false.
 
-A comparison of numbers has a **margin**: by how much it holds, below zero by how much it fails. Any other
-condition holds infinitely, or fails so. Negation changes the sign, *and* is the least, *or* the greatest, and
-operators of time are these over frames; so what is above zero is true, what is below zero is false, and as long
-as no number in the recording changes by as much, it stays so (Fainekos and Pappas 2009, Donzé and Maler 2010).
+A comparison of numbers has a **margin**: positive if it holds, negative if it fails. Any other condition has an
+infinite margin. Negation changes the sign, *and* is the minimum, *or* the maximum, and time operators are
+minima and maxima over frames. A positive margin means true, a negative one false. The value stays the same as
+long as no number in the recording changes by more than the margin (Fainekos and Pappas 2009, Donzé and Maler
+2010).
 
-Time is that of :mod:`sgstore.temporal._formula`, bounds, ends of the trace and all: a formula of the same form,
-whose propositions are margins.
+Time, bounds and trace ends are as in :mod:`sgstore.temporal._formula`: the formula has the same form, with
+margins as propositions.
 """
 
 from __future__ import annotations
@@ -59,18 +60,18 @@ class Robustness:
     Attributes
     ----------
     value : float
-        Above zero it is true, below zero false. Infinite where no comparison of numbers decides.
+        Positive for true, negative for false. Infinite if no comparison of numbers decides.
     condition : str
-        The comparison, or other condition, whose margin it is; empty where there is none, as in a quantifier
-        over nothing, or where only the end of the trace decides.
+        Deciding comparison or condition; empty without one, for example if a quantifier has no bindings, or if
+        only the trace end decides.
     seq, time_ns, t : int, int, float; or None
-        The frame that decides: its number, its simulation time, and that in seconds since the trace began.
+        Deciding frame: number, simulation time, and seconds since the trace start.
     nodes : mapping of str to int
-        Node ids by variable, of the entities that decide.
+        Deciding entities: variable → node id.
     names : mapping of str to str
         Their names.
     upper : float or None
-        The margin with all unknown values in favour of the check, if it differs; ``value`` is that with none.
+        Margin with unknown values in favour of the check, if different; in ``value`` they count against it.
     """
 
     value: float
@@ -90,8 +91,8 @@ def apart_from_absence(found: Robustness, without: Callable[[], Robustness]) -> 
     ----------
     found : Robustness
     without : callable
-        Gives the margin if conditions on absent entities counted in favour of the check. One that is true so is
-        false by nothing that could be measured.
+        Function that returns the margin if absent entities count in favour of the check. If that margin is
+        positive, no number measures the failure.
     """
     if found.value > -np.inf:
         return found
@@ -110,13 +111,13 @@ def margin_of(test: Test, column: Column, tolerance: int, unknown: float = -np.i
     Parameters
     ----------
     test : Test
-        Its difference.
+        Test of the difference.
     column : Column
-        The values of that.
+        Values of the test.
     tolerance : int
-        Times that differ by no more are the same; ns.
+        Time tolerance for equality; ns.
     unknown : float
-        The margin where it is not known.
+        Margin of an unknown comparison.
     """
     values = np.asarray(column.values, np.float64)
     if lasts(test.expression):
@@ -161,13 +162,13 @@ def margin_columns(
     plan : Plan
     formula : Formula
     tests : function
-        The column of a test.
+        Function that returns the column of a test.
     flags : function
-        Where an atom, or a test that is a condition, of some name is true.
+        Function that returns the mask of an atom or a Boolean test.
     tolerance : int
-        Of times; ns.
+        Time tolerance; ns.
     unknown : float
-        The margin of a comparison where it is not known.
+        Margin of an unknown comparison.
     """
     found: dict[str, Floats] = {}
     for name in sorted(propositions(formula)):
@@ -188,11 +189,11 @@ class MarginTable:
     Parameters
     ----------
     columns : mapping of str to (B, F) float64, or (1, F)
-        For each binding; (1, F): the same for all.
+        Margins of each binding; (1, F) if equal for all bindings.
     times : (F,) int64
         Ascending; ns. F is at least 1.
     tolerance : int
-        Times that differ by no more are the same; ns.
+        Time tolerance for equality; ns.
     """
 
     def __init__(self, columns: Mapping[str, Floats], times: Ints, tolerance: int = 0) -> None:
@@ -254,7 +255,7 @@ class MarginTable:
 
         The first of several wins.
 
-        ``None``: no frame decides, but an end of the trace.
+        ``None`` means that a trace end decides.
         """
         match formula:
             case TruthConstant():
@@ -307,9 +308,9 @@ def until(left: Floats | None, right: Floats, first: Places, end: Places) -> Flo
     Parameters
     ----------
     left, right : (B, F) float64, or (1, F)
-        The margins of its sides; without ``left``, that is true always.
+        Margins of the two sides. Without ``left``, the left side is true.
     first, end : (F,) int
-        The first frame in the bound, and the one behind the last.
+        First frame of the bound, and the frame after the last.
     """
     frames = right.shape[1]
     hit = _greatest_of(right, first, end)
@@ -339,7 +340,8 @@ def _behind(values: Floats) -> Floats:
 def _unbounded(left: Floats, right: Floats) -> Floats:
     """Return for each frame the larger of ``right`` and the smaller of ``left`` and the next result; (B, F).
 
-    Such a step is a clamp, and so are several in a row: blocks of frames are clamped side by side, then joined.
+    Each step is a clamp, and a sequence of clamps is a clamp. So blocks of frames are processed in parallel,
+    then combined.
     """
     left, right = np.broadcast_arrays(left, right)
     rows, frames = right.shape

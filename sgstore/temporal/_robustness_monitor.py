@@ -1,12 +1,11 @@
 """Online robustness, frame by frame, in bounded memory.
 
-A formula's margin at a frame may depend on later ones. Within a bound, that is waited for. Without one, what is
-not known is *one* number for each such operator: its margin at the next frame. A margin is then built of these
-numbers and of known ones by least and greatest, and such a function is told by its values where each of the
-numbers is as small, or as great, as can be: 2 values for one number, 4 for two. When the next frame comes, each
-number is replaced by what that shows.
+The margin of a formula may depend on later frames. For a bounded operator, the monitor waits. For an unbounded
+operator, *one* number is unknown: its margin at the next frame. A margin is a function of known and unknown
+numbers, built from minimum and maximum. Its values at the extremes of the unknowns define it: 2 values for one
+unknown, 4 for two. The next frame replaces each unknown.
 
-Negations stand at propositions only; below one, *until* and *or* are their duals.
+Negations occur only at propositions. Below a negation, *until* and *or* become their duals.
 """
 
 from __future__ import annotations
@@ -117,9 +116,9 @@ class _Tape:
     Attributes
     ----------
     start : int
-        The number of the first frame.
+        Number of the first frame.
     values : (N, B, V) of MARGIN
-        For each frame and binding, and each extreme of what is not known.
+        Margins of each frame, binding and extreme of the unknowns.
     """
 
     start: int
@@ -151,17 +150,17 @@ class _Part:
     Attributes
     ----------
     formula : Formula
-        Without the negations before it.
+        Subformula without outer negations.
     positive : bool
-        Whether there is an even number of these.
+        True for an even number of outer negations.
     left, right : int or None
-        The parts that it is made of, by number; of one the right. ``None``: what is always true of an *until*.
+        Numbers of the operands; a single operand is ``right``. ``None`` on the left means always true.
     others : tuple of int
-        The parts that logic joins.
+        Numbers of the operands of a logical operator.
     bit : int
-        The number that stands for its margin at the next frame; 0: none does.
+        Bit of the unknown margin at the next frame; 0: none.
     single : bool
-        Of an operator with a bound whose right side goes on without: whether that is asked of one frame alone.
+        For a bounded operator with an unbounded right side: True if it needs the right side at one frame only.
     tape : _Tape
     """
 
@@ -194,12 +193,12 @@ class MarginStream:
     Parameters
     ----------
     formula : Formula
-        Its propositions are margins.
+        Formula with margins as propositions.
 
     Raises
     ------
     QueryError
-        Too many operators look ahead without a bound.
+        The formula has too many unbounded forward operators.
     """
 
     def __init__(self, formula: Formula) -> None:
@@ -277,10 +276,10 @@ class MarginStream:
         Parameters
         ----------
         columns : mapping of str to (B,) float64
-            The margins of the propositions, for each binding.
+            Margins of the propositions for each binding.
         tick : Tick
         parents : (B,) int64
-            The row that each binding had in the frame before, or goes on from.
+            Row of each binding, or of its parent binding, in the previous frame.
         """
         if self._count and not np.array_equal(parents, np.arange(self._rows)):
             for part in self._parts:
@@ -534,20 +533,20 @@ class RobustnessMonitor:
     ----------
     check : BoundCheck
     questions : QueryCache
-        What is asked of each frame; those of the margins become part of them.
+        Query cache; the queries of the margins are added.
     pulse : StreamClock
-        Told of each frame before this is.
+        Clock, updated with each frame before this object.
     reading : Reading, optional
-        What counts where an entity is absent; by default as the quantifiers say.
+        Rules for absent entities; by default from the quantifiers.
 
     Raises
     ------
     QueryError
-        Its formula has too many operators that look ahead without a bound.
+        The formula has too many unbounded forward operators.
 
     Notes
     -----
-    Of each binding that was ever told apart a margin is kept, for no two are alike for long.
+    A margin is stored for each binding that ever differed, because bindings rarely stay equal.
     """
 
     def __init__(
@@ -610,7 +609,7 @@ class RobustnessMonitor:
         ----------
         levels : sequence of Level
         names : mapping of str to mapping of int to str
-            Names of the entities that each variable may be.
+            Variable → names of its possible entities.
         """
         found = self._told(levels, names)
         if self._without is None:

@@ -1,7 +1,7 @@
 """Runs of a single-frame pattern, and values over them, for many traces at once.
 
-All rows, a binding in a frame each, stand in one line: by traces, bindings and frames. So the work does not
-grow with the number of traces, and a value over a run is read with the rows of the pattern, and of no others.
+All rows (one binding in one frame) form one array, ordered by trace, binding and frame. So the work does not
+grow with the number of traces. A value over a run is read only for the rows of the pattern.
 """
 
 from __future__ import annotations
@@ -69,22 +69,22 @@ RunsTold = tuple["Ints", "Ints", "Keys", list[list[Any]]]
 class FrameLine:
     """Frames of many traces in one array.
 
-    They are told by the buckets of a store, some sixty at a time; times are read where they are asked for.
+    Frames come from the buckets of a store, 60 at a time. Times are read on demand.
 
     Attributes
     ----------
     ids : (F,) int64
         In ascending order.
     owners : (F,) int64
-        The place of the trace of each.
+        Index of each frame's trace.
     traces, starts : (T,) int64
-        Ids of the traces, and the first frame of each.
+        Trace ids, and the first frame of each trace.
     periods, tolerances : (T,) int64
-        Of the traces; ns.
+        Median period and time tolerance of each trace; ns.
     apart : bool
-        Whether some frame may not follow soon after the one before it in its trace.
+        True if gaps between frames are possible.
     told : function
-        Tells the ids and times of the frames of all traces that are read; ns.
+        Function that returns ids and times (ns) of all frames read.
     """
 
     ids: Ints
@@ -169,10 +169,10 @@ class BindingRows:
     ----------
     line : FrameLine
     frames : (R,) int64
-        The place of the frame of each row in the line.
+        Index of each row's frame in the line.
     keys : (R, n) int64
     fresh : (R,) bool
-        Whether a binding begins with it.
+        True for the first row of a binding.
     values : dict of Bound to Column
         (1, R).
     """
@@ -293,16 +293,16 @@ class RunFinder:
     Parameters
     ----------
     file : StoreFile
-        It stays as it is while this is used.
+        Store; it must not change during use.
     catalog : Catalog
     query : Query
-        Of one step.
+        Query with one step.
     plan : Plan
-        Of its further conditions, and of values over its runs.
+        Plan of the additional conditions, and of values over runs.
     ask : Ask
         The pattern.
     named : tuple of str
-        The nodes and edges that a match tells.
+        Nodes and edges that a match returns.
     """
 
     def __init__(
@@ -353,7 +353,7 @@ class RunFinder:
         Parameters
         ----------
         places : sequence of Bound
-            What is worked out for each run.
+            Values to compute for each run.
         within : Window or None
         """
         # By their ids, which are digests: each window has traces of all kinds, and a part of each table.

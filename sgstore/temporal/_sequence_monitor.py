@@ -39,7 +39,7 @@ class FrameTime:
     Attributes
     ----------
     seq : int
-        Its number, from 0.
+        Frame number, from 0.
     time_ns : int
         Simulation time.
     t : float
@@ -58,25 +58,25 @@ class MonitorEvent:
     Attributes
     ----------
     kind : str
-        ``violated``: a check is, from ``start`` on; ``kept again``: that has ended with ``end``; ``found``: a
-        pattern is.
+        ``violated``: a violation begins at ``start``; ``kept again``: a violation ended at ``end``; ``found``:
+        a pattern matches.
     name : str
-        Of the check, or of the pattern.
+        Name of the check or pattern.
     told : FrameTime
-        The frame that made it known.
+        Frame that triggered the event.
     start, end : Moment
-        The frames that it is about: of a violation that lasts both are its first; of a sequence those of its
-        first and of its last step.
+        First and last frame of the event. A current violation has its first frame in both; a sequence has the
+        frames of its first and last step.
     nodes : mapping of str to int
         Node ids by variable.
     names : mapping of str to str
         Their names.
     steps : tuple of FrameTime
-        Of a sequence: the frame of each step that happens.
+        For a sequence: frame of each occurring step.
     at_end : bool
-        Whether only the end of the trace made it a violation.
+        True if only the trace end caused the violation.
     values : mapping of str to value
-        What is returned of a match, or of a violation that has ended: values over it, and times of its steps.
+        Returned values of a match or of an ended violation: aggregates, and times of its steps.
     """
 
     kind: str
@@ -107,11 +107,11 @@ class Run:
     Attributes
     ----------
     number : int
-        The number of its first frame.
+        Number of the first frame.
     last : int
-        The number of its last frame so far.
+        Number of the last frame so far.
     over : bool
-        Whether the next frame is not part of it.
+        True if the run has ended.
     """
 
     number: int
@@ -126,9 +126,9 @@ class StepFrame:
     Attributes
     ----------
     number, time : int
-        Of the frame; ns.
+        Number and time (ns) of the frame.
     gap : bool
-        Whether a gap lies before it.
+        True if a gap lies before the frame.
     run : Run
     """
 
@@ -149,16 +149,16 @@ class StepState:
     Parameters
     ----------
     pulse : StreamClock
-        Told of each frame before this is.
+        Clock, updated with each frame before this object.
     hold : BoundHold, optional
-        How long the step is to hold.
+        Required duration of the step.
 
     Attributes
     ----------
     places : list of StepFrame
-        Those that are kept, ascending.
+        Stored frames, ascending.
     open : deque of Needs
-        Of the frames that are not decided yet, the earliest first.
+        Open conditions of the undecided frames, earliest first.
     """
 
     def __init__(self, pulse: StreamClock, hold: BoundHold | None = None) -> None:
@@ -292,9 +292,9 @@ class SequenceMonitor:
     name : str
     query : Query
     questions : QueryCache
-        What is asked of each frame; those of the pattern become part of them.
+        Query cache; the queries of the pattern are added.
     pulse : StreamClock
-        Told of each frame before this is.
+        Clock, updated with each frame before this object.
     """
 
     def __init__(self, name: str, query: Query, questions: QueryCache, pulse: StreamClock) -> None:
@@ -619,7 +619,7 @@ class SequenceMonitor:
     def _oldest(self, number: int) -> tuple[dict[Key, int], list[int]]:
         """Return the first possible frames of a match by the nodes shared by the first and another step.
 
-        Also which columns of the other step these are.
+        Also return the columns of the other step with these nodes.
         """
         names, columns = self._columns[0], self._columns[number]
         common = [name for name in columns if name in names]

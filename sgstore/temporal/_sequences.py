@@ -72,10 +72,10 @@ class Leg:
     after, within : Length or None
         Bounds of ``then``.
     absent : (R,) int64 or None
-        Places at which something must not happen strictly between the two.
+        Positions of an absent step, forbidden strictly between both steps.
     places : (R,) int64 or None
-        Where the next step holds, ascending; ``None``: nothing follows, and what must not happen does not up
-        to ``within``.
+        Positions of the next step, ascending. ``None`` means no next step; the absent step must not occur up to
+        ``within``.
     """
 
     kind: str
@@ -200,16 +200,16 @@ def matches_of(line: BindingLine, first: Ints, legs: Sequence[Leg], policy: str)
     ----------
     line : BindingLine
     first : (R,) int64
-        Places at which the first step holds, ascending.
+        Positions of the first step, ascending.
     legs : sequence of Leg
     policy : str
-        ``all``; ``longest``: of those that begin where the earliest does, the one whose further frames are the
-        latest, compared from the second step on; ``first``: of each binding only the first match.
+        ``all``; ``longest``: among matches that begin at the earliest frame, the one with the latest further
+        frames, compared from the second step on; ``first``: only the first match of each binding.
 
     Returns
     -------
     (M, n) int64
-        Places of the steps that happen, in order of the first.
+        Positions of the occurring steps, ordered by the first.
     """
     steps = [first, *(leg.places for leg in legs if leg.places is not None)]
     onward: list[tuple[Ints, Ints]] = []
@@ -272,7 +272,7 @@ class JoinedBindings:
     variables : tuple of str
     bindings : (J, n) int64
     places : (J, r) int64
-        For each relation the place of its key.
+        Index of the key in each relation.
     """
 
     variables: tuple[str, ...]
@@ -301,7 +301,7 @@ def joined(
     ----------
     relations : sequence of (variables, TimedRelation)
     apart : collection of str
-        Variables of which no two may be the same.
+        Variables that must differ from each other.
     """
     variables, first = relations[0]
     found = JoinedBindings(variables, first.keys, np.arange(len(first.keys))[:, None])
@@ -370,12 +370,12 @@ class MatchesOfWay:
     Attributes
     ----------
     happen : tuple of int
-        Numbers of its steps that happen.
+        Numbers of the occurring steps.
     part : JoinedBindings
     at : list of (R,) int64
-        Places at which each of these steps holds.
+        Positions of each of these steps.
     told : (M, n) int64
-        Places of the steps of each match.
+        Positions of the steps of each match.
     """
 
     happen: tuple[int, ...]
@@ -394,9 +394,9 @@ class Finder:
     Parameters
     ----------
     file : StoreFile
-        It stays as it is while this is used.
+        Store; it must not change during use.
     query : Query
-        With steps.
+        Query with steps.
     catalog : Catalog
     """
 
@@ -418,7 +418,7 @@ class Finder:
         Parameters
         ----------
         places : tuple of Bound
-            What is worked out for each match.
+            Values to compute for each match.
         window : Window or None
         """
         parts: list[_Part] = []
@@ -460,7 +460,7 @@ class Finder:
         ----------
         window : Window or None
         places : tuple of Bound
-            What is worked out for each match.
+            Values to compute for each match.
         """
         ordered = sorted(self._steps, key=lambda ask: len(ask.after))
         about = self._file, self._catalog, self._query, self._asks_of(places, ordered)
@@ -542,8 +542,8 @@ class Finder:
     ) -> Iterator[MatchesOfWay]:
         """Yield the best match for each run of the first step and each binding.
 
-        Places of steps are compared as those of one sequence are. One that goes on counts as later than one
-        that has ended; where all are the same, the sequence that is written first counts.
+        Matches compare by the positions of their steps. A longer match counts as later than a shorter one. For
+        equal positions, the alternative written first wins.
         """
         if not found:
             return

@@ -1,8 +1,8 @@
 """Shortest clips: the fewest consecutive frames that still contain a match or a violation.
 
-Each clip that is tried is a trace of its own: what looks back or ahead sees nothing outside of it, and who is
-in none of its frames is not in it. Values of single frames stay as they are: times since the beginning,
-``parked``, and what is said of the trace.
+Each candidate clip is evaluated as a separate trace: operators see no frames outside, and entities without a
+frame in the clip are absent. Single-frame values do not change, including times since the trace start,
+``parked``, and trace attributes.
 """
 
 from __future__ import annotations
@@ -51,18 +51,18 @@ class ShortestClip:
     Attributes
     ----------
     check : str
-        Name of the check; empty: it has a match of the query.
+        Name of the check; empty for a match of a query.
     trace : str
     start_seq, end_seq : int
         First and last frame.
     start, end : float
-        Their times since the trace began; s.
+        Times since the trace start; s.
     frames : int
         Number of frames.
     of : int
-        How many there were: of the clip that was given, or of the whole trace.
+        Number of frames of the given clip, or of the whole trace.
     clip : Clip
-        What an export cuts out: log times.
+        Log times for an export.
     """
 
     check: str
@@ -83,9 +83,9 @@ def fewest(frames: int, has: Callable[[int, int], bool], *, grows: bool) -> tupl
     ----------
     frames : int
     has : function
-        Tell whether the range from a first to a last frame has it.
+        Function from a first and last frame to True if this range meets the condition.
     grows : bool
-        Whether a range that has it still has it when frames follow: then not every range needs to be tried.
+        True if a longer range also meets the condition. Then not every range needs a test.
     """
     if not grows:
         lengths = range(1, frames + 1)
@@ -112,29 +112,28 @@ def shortest_clips(
 ) -> Iterator[ShortestClip]:
     """Yield the shortest clips that match a query or violate checks: one for each trace (and check).
 
-    Each clip that is tried is a trace of its own: what looks back or ahead sees nothing outside of it, and
-    who is in none of its frames is not in it.
+    Each candidate clip is evaluated as a separate trace: operators see no frames outside, and entities without
+    a frame in the clip are absent.
 
-    A violation is one that nothing can mend that may still come: what only the end of a trace refutes, the end
-    of a clip would refute as well.
+    Only violations that no later frame can repair count. Otherwise the end of any clip would be a violation.
 
     Parameters
     ----------
     file : StoreFile
     catalog : function
-        Gives what the store holds.
+        Function that returns the catalog of the store.
     text : str
         A query, or ``CHECK`` statements.
     parameters : mapping of str to value
     clip : str, optional
-        What is cut: ``TRACE@12s..18s`` or ``TRACE#120..180``; by default every whole trace.
+        Range to search: ``TRACE@12s..18s`` or ``TRACE#120..180``; by default every whole trace.
 
     Raises
     ------
     QueryError
-        The text is neither, or has no meaning.
+        The text is neither a query nor a check, or is invalid.
     StoreError
-        There is no such clip.
+        The clip does not exist.
     """
     with file.snapshot():
         span = None if clip is None else _span(file, clip)

@@ -1,8 +1,7 @@
 """Signals and formulas over whole traces, as columns.
 
-A column is true or false at each frame; operators make columns of columns. An *until* looks for the next frame
-at which its right side holds, from where its bound begins, and compares it with the next one at which its left
-side fails.
+A column has a truth value for each frame; operators map columns to columns. An *until* compares two frames: the
+next frame in its bound at which its right side holds, and the next frame at which its left side fails.
 """
 
 from __future__ import annotations
@@ -52,14 +51,14 @@ def evaluate(formula: Formula, columns: Mapping[str, Bools], times: Ints) -> Boo
     ----------
     formula : Formula
     columns : mapping of str to (F,) bool
-        The propositions.
+        Truth values of the propositions.
     times : (F,) int64
-        Time stamps of the frames, ascending; ns.
+        Timestamps of the frames, ascending; ns.
 
     Returns
     -------
     (F,) bool
-        The formula's value at each frame.
+        Value of the formula at each frame.
 
     Raises
     ------
@@ -86,9 +85,9 @@ def evaluate_rows(formula: Formula, columns: Mapping[str, Bools], times: Ints, r
     ----------
     formula : Formula
     columns : mapping of str to (B, F) bool, or (1, F)
-        The propositions for each binding; (1, F): the same for all.
+        Propositions of each binding; (1, F) if equal for all bindings.
     times : (F,) int64
-        As in :func:`evaluate`; F is at least 1.
+        Times as in :func:`evaluate`; F is at least 1.
     rows : int
         B, the number of bindings.
 
@@ -155,7 +154,7 @@ class PropositionTable:
     def window(self, bound: Bound, *, forward: bool) -> tuple[Places | None, Places | None]:
         """Return the nearest and farthest frame of an operator's bound, for each frame.
 
-        ``None``: this frame; and the last one that there is.
+        ``None`` as nearest frame means the frame itself; as farthest frame, the trace end.
         """
         sign = 1 if forward else -1
         near = far = None
@@ -239,11 +238,11 @@ class Clock:
     times : (F,) int64
         Ascending; ns.
     runs : (F,) int64
-        Number of the stretch without gaps that each frame is in.
+        Number of each frame's run without gaps.
     period : int
         Median time between two frames; ns.
     tolerance : int
-        Times that differ by no more are the same; ns.
+        Time tolerance for equality; ns.
     """
 
     times: Ints

@@ -1,11 +1,10 @@
 """Single-frame queries of the monitor, the truth of bindings, and their values over time.
 
-A binding says of each variable which node it is, or ``None``: any node of which nothing is known. What is known
-of a binding that is not held is what is known of the one held that says most of what it says; so a check over a
-hundred vehicles of which five come near costs what five cost.
+A binding maps each variable to a node, or to ``None``: any node without known values. A binding without an
+entry uses the entry of its most specific stored generalisation. So a check over a hundred vehicles with five
+near ones costs as much as five.
 
-Whatever is told is closed: with two bindings that do not contradict one another, the one that says both is
-told.
+Sets of bindings are closed under union: they contain the union of any two compatible bindings.
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ class Lattice:
     Parameters
     ----------
     size : int
-        How many variables there are.
+        Number of variables.
     """
 
     def __init__(self, size: int) -> None:
@@ -99,7 +98,7 @@ class Lattice:
     def closed(self, bindings: Iterable[Partial], known: Iterable[Partial] = ()) -> set[Partial]:
         """Return the bindings with the empty binding and all unions of compatible bindings.
 
-        Those that are ``known`` are closed already.
+        ``known`` bindings are closed already.
         """
         found = {self.stranger, *known}
         if self.size < 2:
@@ -136,7 +135,7 @@ class BindingTable(Generic[T]):
     ----------
     lattice : Lattice
     strangers : T
-        What is known of nodes of which nothing is.
+        Value for nodes without known values.
     """
 
     def __init__(self, lattice: Lattice, strangers: T) -> None:
@@ -177,7 +176,7 @@ Key = tuple[int, ...]
 def answerer(ask: Ask) -> Callable[[FrameView, NodeNames], Mapping[Key, Any]]:
     """Return a function from a graph to the bindings of a query, each with its value (``None``: unknown).
 
-    Edges of a binding are places in :data:`RELATIONS`.
+    Edges in a binding are indices in :data:`RELATIONS`.
     """
     scope, injective = ask.query.scope, ask.query.injective
     search = ScopeSearch(scope, injective=injective)
@@ -263,11 +262,11 @@ class QueryCache:
     Attributes
     ----------
     answers : list of mapping
-        By the number of the question.
+        Results by query number.
     fresh : set of Kinds
-        Of which somebody is in the last frame who was in none before.
+        Kinds with a new entity in the last frame.
     here : dict of Kinds to int
-        The number of nodes of these kinds in the last frame.
+        Number of nodes of these kinds in the last frame.
     """
 
     _known: dict[Any, int] = field(default_factory=dict[Any, int])
@@ -293,7 +292,7 @@ class QueryCache:
     def add_parts(self, query: b.Query, keys: tuple[str, ...]) -> int:
         """Add a query for the rows of several pattern parts, and return its number.
 
-        The bindings of the named nodes and edges are told, each with what its first row returns.
+        The result has the bindings of the named nodes and edges, each with the values of its first row.
         """
         search = StageSearch(query)
         returned = () if query.result.aggregated else query.result.columns
@@ -359,16 +358,16 @@ class StreamClock:
     Parameters
     ----------
     period_ns : int, optional
-        The time between two frames; by default the median of those seen before, the last :data:`TIMES` of them.
+        Time between frames; ns. Default: median of the last :data:`TIMES` frames.
 
     Attributes
     ----------
     tick : Tick
-        The last frame. Behind a jump back of the clock its time is later than any before; see :meth:`told`.
+        Last frame. Its time is corrected after a backward jump; see :meth:`told`.
     start : int
-        The time of the first frame; ns.
+        Time of the first frame; ns.
     gap, jump : bool
-        Whether a gap lies before the last frame, and whether the clock has jumped back.
+        True if a gap, or a backward jump, lies before the last frame.
     """
 
     def __init__(self, period_ns: int | None = None) -> None:
@@ -446,14 +445,14 @@ class SignalState:
     ----------
     plan : Plan
     pulse : StreamClock
-        Told of each frame before this is.
+        Clock, updated with each frame before this object.
     bridge : bool
-        Whether gaps do not matter.
+        True to ignore gaps.
 
     Raises
     ------
     QueryError
-        The value of a test depends on later frames.
+        A test depends on later frames.
     """
 
     def __init__(self, plan: Plan, pulse: StreamClock, *, bridge: bool = False) -> None:
@@ -541,7 +540,7 @@ class SignalState:
         ----------
         memories : sequence of B
         atom : function
-            (B,) where the atom of that name is true.
+            (B,) mask of an atom by name.
         signal : function
             The values of a signal: (B, 1).
 
@@ -773,22 +772,22 @@ class Valuation:
     ----------
     plan : Plan
     variables : tuple of str
-        What bindings are about, in their order.
+        Variables of the bindings, in order.
     questions : QueryCache
-        Those of the plan become part of them.
+        Query cache; the queries of the plan are added.
     pulse : StreamClock
     bridge : bool
-        Whether gaps do not matter.
+        True to ignore gaps.
 
     Attributes
     ----------
     lattice : Lattice
     bits : dict of str to int
-        The bit of each atom and test.
+        Atom or test → its bit.
     begun : Memory
-        What is remembered before the first frame.
+        Memory before the first frame.
     columns : dict of str to Column
-        The values of the tests in the last frame, by name: (B, 1), or (1, 1), of the bindings in order.
+        Values of the tests in the last frame by name: (B, 1) or (1, 1), in the order of the bindings.
     """
 
     def __init__(
@@ -828,18 +827,18 @@ class Valuation:
         Parameters
         ----------
         held : iterable of Partial
-            Bindings of which something is known from former frames.
+            Bindings with an entry from earlier frames.
         memory : function
-            What a binding remembers; ``None``: nobody asks for it any more.
+            Function that returns the memory of a binding. ``None`` means no longer needed.
         closed : bool
-            Whether those held are all that were told before, so that only new ones are joined with them.
+            True if ``held`` is closed, so that only new bindings need unions.
 
         Returns
         -------
         letters : dict of Partial to int
-            Of all bindings of which something is known now, closed.
+            Letters of all bindings with an entry now; closed under union.
         memories : mapping of Partial to Memory
-            What they remember from now on; empty if there is nothing to.
+            New memory of each binding; empty without memory.
         """
         told = self._told()
         lattice = self.lattice

@@ -1,9 +1,9 @@
 """Verdicts of formulas: their values, the frame that decides them, and their value at every prefix.
 
-At a frame, a formula that looks ahead has a *course*: what it is if the trace ends there, and at which later
-ends it becomes something else. Logic joins courses; an *until* whose sides can only become true is true from
-one end on. At the frame that is asked for, the last *until* may have any course on its right, for only one
-frame's answer is wanted: the ends are counted at which some frame shows it.
+At a frame, a forward formula has a *course*: its value if the trace ends there, and the later ends at which the
+value changes. Logic combines courses. An *until* with monotonic sides is true from one end on. At the requested
+frame, the outermost *until* can have any course on its right side, because only one frame is needed: the code
+counts the frames that fulfil it, for each end.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ class PrefixVerdicts:
     Attributes
     ----------
     start : (F,) bool
-        If the trace ends at that frame.
+        Value if the trace ends at that frame.
     switches : (K, F) int
-        Ends from which on it is the contrary, ascending; F: there are no more.
+        Ends at which the value is negated, ascending; F: no more.
     """
 
     start: Bools
@@ -78,7 +78,7 @@ class PrefixVerdicts:
         Raises
         ------
         TooDeep
-            It does not stay true.
+            The value does not stay true.
         """
         frames = len(self.start)
         first = self.switches[0] if len(self.switches) else np.full(frames, frames)
@@ -93,7 +93,7 @@ def prefix_values(formula: Formula, table: PropositionTable) -> Bools:
     Raises
     ------
     TooDeep
-        An operator looks at what others make of later frames, in a way that is not worked out at once.
+        The nesting of forward operators is too deep for columns.
     """
     return _at_first(formula, 0, table)
 
@@ -151,7 +151,7 @@ def _course(formula: Formula, table: PropositionTable) -> PrefixVerdicts:
     Raises
     ------
     TooDeep
-        As :func:`prefix_values`.
+        See :func:`prefix_values`.
     """
     frames, here = len(table.times), table.frames
     if not looks_ahead(formula):
@@ -221,8 +221,8 @@ def known(  # noqa: PLR0911 - a case each
     table : PropositionTable
         The trace.
     ended : int, optional
-        If no frame follows: by how much bounds were widened; ns. An operator without an upper bound, or whose
-        bound is over, has then failed with the last frame.
+        If no frame follows: the tolerance added to bounds; ns. An operator whose bound is over, or unlimited,
+        has then failed at the last frame.
     """
     again = partial(known, table=table, ended=ended)
     here, frames = table.frames, len(table.times)
@@ -312,7 +312,7 @@ def met(right: Places, left: Places | None, bound: Bound, table: PropositionTabl
     Parameters
     ----------
     right, left : (F,) int
-        From when on its sides are; F: never. Without ``left``, that is true always.
+        First frame from which each side is true; F: never. Without ``left``, the left side is true.
     bound : Bound
     table : PropositionTable
     """
@@ -345,11 +345,11 @@ def _chained(
     Parameters
     ----------
     right, left, last : (F,) int
-        Without ``left`` only the greatest.
+        Without ``left``, only the maximum applies.
     start, end : (F,) int
-        Without ``end`` up to the last place.
+        Without ``end``, the range ends at the last frame.
     least : bool
-        Whether least and greatest change places.
+        True to swap minimum and maximum.
     """
     if least:
         other = None if left is None else -left
@@ -425,7 +425,7 @@ class Settled:
     times : (F,) int64
         Ascending; ns. F is at least 1.
     tolerance : int
-        By how much the bounds of the formula were widened; ns.
+        Tolerance added to the bounds of the formula; ns.
     """
 
     def __init__(
@@ -461,7 +461,7 @@ class Settled:
         ----------
         start : int
         end : str
-            As :attr:`~sgstore.lang.ir.BoundCheck.end`.
+            See :attr:`~sgstore.lang.ir.BoundCheck.end`.
         """
         if end == "pending":
             return True
@@ -510,9 +510,9 @@ class Settled:
         Parameters
         ----------
         reset : (F,) bool, optional
-            Where a violation ends, the formula being asked anew from the next frame on.
+            Frames at which a violation ends. Evaluation restarts at the next frame.
         weak : bool
-            Whether what only the end of the trace refutes is forgiven.
+            True to ignore violations caused only by the trace end.
         """
         return self.judged(reset, "weak" if weak else "strong")[0]
 
@@ -522,9 +522,9 @@ class Settled:
         Parameters
         ----------
         reset : (F,) bool, optional
-            As in :meth:`violations`.
+            See :meth:`violations`.
         end : str
-            What the end of the trace means: see :attr:`~sgstore.lang.ir.BoundCheck.end`.
+            Meaning of the trace end; see :attr:`~sgstore.lang.ir.BoundCheck.end`.
         """
         frames = self._frames
         resets = np.flatnonzero(reset) if reset is not None else np.zeros(0, np.int64)
@@ -548,8 +548,8 @@ def within_bounds(
 ) -> tuple[Bools, Bools]:
     """Return the lower and upper value of a formula at the first frame, with any content of the gaps.
 
-    In each gap one frame more is thought, of which every proposition may be true or false. What the formula
-    asks to be true is taken to be false for the one, and true for the other.
+    Each gap is treated as one additional frame with arbitrary propositions. For the lower value, they are the
+    least favourable ones; for the upper value, the most favourable.
 
     Parameters
     ----------
@@ -558,14 +558,14 @@ def within_bounds(
     times : (F,) int64
         Ascending; ns. A gap is longer than a nanosecond.
     gaps : (F,) bool
-        Whether a gap ends at a frame.
+        True if a gap ends at the frame.
     rows : int
         B.
 
     Returns
     -------
     least, most : (B,) bool
-        Where they differ, the value depends on what is not known.
+        If they differ, the value depends on the content of gaps.
     """
     at = np.flatnonzero(gaps)
     between = times[at - 1] + (times[at] - times[at - 1]) // 2

@@ -1,11 +1,10 @@
 """Aggregates over frame intervals: minimum, maximum, sum and mean.
 
-Over columns a stretch is told by its first frame and by the one behind its last, for each frame, and is worked
-out for all frames at once, in O(n log w) for the longest stretch w. A stream keeps the values that its window
-still has.
+Offline, each frame has an interval, given by its first frame and the frame after its last. All frames are
+processed at once, in O(n log w) for the longest interval w. Online, a stream keeps the values in its window.
 
-**Sums are rounded once**: over columns they are differences of sums of three times the digits, in a stream they
-are whole numbers. So the order in which values are added, and what lies before the window, make no difference.
+**Sums are rounded once**: offline sums use three times the precision, online sums are integers. So the order of
+additions and earlier values do not matter.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ def over_columns(word: str, column: Column, first: Places) -> Column:
     Returns
     -------
     Column
-        (B, F); unknown where no value in the window is known.
+        (B, F); unknown if the window has no known value.
     """
     frames = len(first)
     end = np.arange(1, frames + 1)
@@ -161,15 +160,15 @@ def next_window(
     Parameters
     ----------
     word : str
-        As of :func:`over_columns`.
+        See :func:`over_columns`.
     window : Window or None
-        ``None``: it is empty.
+        ``None`` means an empty window.
     value : float or None
-        ``None``: it is not known.
+        ``None`` means unknown.
     here : Tick
         The frame.
     oldest : (int, int)
-        Number and time (ns) of the oldest frame that the window may have.
+        Number and time (ns) of the oldest frame in the window.
     """
     points, total = window or ((), 0)
     gone = 0
