@@ -1,7 +1,7 @@
-"""A store for assistants: a server of the Model Context Protocol, whose tools ask in the sandbox.
+"""Server of the Model Context Protocol for a store; its tools run queries in a sandbox.
 
-``_worker`` answers the questions in a process of its own, ``_tools`` are the tools around it, ``_text`` is how
-answers read in a prompt, and ``_server`` gives all that to the protocol.
+``_worker`` runs the queries in its own process. ``_tools`` has the tools, ``_vocabulary`` the texts
+for prompts, and ``_server`` connects them to the protocol.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""The tools as a server of the Model Context Protocol, over stdin and stdout."""
+"""Server of the Model Context Protocol with the tools, over stdin and stdout."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ WRITING: Final = frozenset({"export_clips"})
 
 
 def serve(tools: StoreTools) -> None:
-    """Answer an assistant that speaks over stdin and stdout, until it ends.
+    """Serve an assistant over stdin and stdout until the input ends.
 
     Raises
     ------
     SgstoreError
-        If stdin cannot be read.
+        The process has no readable stdin.
     """
     if sys.stdin is None or not sys.stdin.readable():
         raise SgstoreError("stdin cannot be read: an assistant speaks there")
@@ -47,7 +47,7 @@ def serve(tools: StoreTools) -> None:
 
 
 def server_of(tools: StoreTools) -> MCPServer[Any]:
-    """A server with all tools of a store, and with resources for what they need to be used well."""
+    """Return a server with all tools of a store, and with resources for their use."""
     server = MCPServer[Any](
         "sgstore",
         version=version("sgstore"),
@@ -74,7 +74,7 @@ def _tool(name: str, tool: Callable[..., ToolAnswer]) -> Tool:
 
 
 def _untitled(schema: Any) -> Any:
-    """A schema without the titles of its parts, which say no more than their names."""
+    """Return a schema without titles, which only repeat names."""
     if isinstance(schema, dict):
         every: dict[str, Any] = schema
         kept = {n: v for n, v in every.items() if not (n == "title" and isinstance(v, str))}
@@ -86,7 +86,7 @@ def _untitled(schema: Any) -> Any:
 
 
 def _told(tool: Callable[..., ToolAnswer]) -> Callable[..., CallToolResult]:
-    """A tool that answers as the protocol does; what it refuses is an answer, which a model can mend."""
+    """Wrap a tool for the protocol; an error becomes a result, so that the model can correct its call."""
 
     @wraps(tool)
     def told(*values: Any, **named: Any) -> CallToolResult:
@@ -122,7 +122,7 @@ def _add_library(server: MCPServer[Any]) -> None:
 
     @server.resource("sgstore://pattern/{name}", name="pattern", mime_type="text/plain")
     def _(name: str) -> str:
-        """A pattern of the library: its text, with what it finds and the values that can be chosen."""
+        """Return the text of a library pattern, with its description and parameters."""
         try:
             found = pattern_named(name)
         except QueryNameError as error:

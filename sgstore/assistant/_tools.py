@@ -1,10 +1,10 @@
-"""The tools of an assistant: each asks one question of a store, or makes one picture of it.
+"""Tools of an assistant: each runs one query on a store, or makes one picture.
 
-Whatever an assistant writes, patterns, rules and SQL, is evaluated in the sandbox alone: a process that sees
-the store and nothing else, and has a deadline. What this process does itself is to draw frames that are named,
-to read what a camera saw, and, where it was given a folder for that, to cut the clips that the sandbox found.
+Patterns, rules and SQL of an assistant run only in the sandbox: a process that sees only the store
+and has a deadline. This process itself draws named frames, reads camera pictures, and, with a
+folder for it, exports clips found by the sandbox.
 
-The docstring of a tool is what the assistant is told of it.
+The docstring of a tool is its description for the assistant.
 """
 
 from __future__ import annotations
@@ -37,22 +37,22 @@ if TYPE_CHECKING:
     from sgstore.store import FrameRef
 
 ROWS: Final = 20
-"""Rows of an answer, unless more are asked for."""
+"""Default number of rows of a result."""
 
 MOST_ROWS: Final = 1_000
-"""Rows of an answer at most, unless the server is told otherwise."""
+"""Default for the greatest number of rows of a result."""
 
 MOST_BYTES: Final = 2 << 20
-"""Longest answer; bytes. A model reads a small part of it, a program more."""
+"""Greatest size of a result; bytes. A model reads a small part of it, a program more."""
 
 MOST_TEXT: Final = 30_000
-"""Characters of rows in one answer; some ten thousand tokens."""
+"""Greatest number of characters of rows in one result; about ten thousand tokens."""
 
 LONGEST: Final = 400
-"""Characters of one value; of a query more than a table of a notebook has room for."""
+"""Greatest number of characters of one value; longer than a notebook's table for queries."""
 
 SIDE: Final = 1_024
-"""Longest side of what a camera saw; pixels: models see no more."""
+"""Longest side of a camera picture; pixels: models use no larger ones."""
 
 FrameName = Annotated[str, Field(description="'town#120' (trace and number) or 'town@12.3s'")]
 Pattern = Annotated[
@@ -66,18 +66,18 @@ Limit = Annotated[int, Field(ge=1, description="rows at most")]
 
 @dataclass(frozen=True)
 class ToolAnswer:
-    """Answer of a tool.
+    """Result of a tool.
 
     Attributes
     ----------
     text : str
-        For the model.
+        Text for the model.
     data : dict
-        The same for a program: what JSON can hold.
+        The same result for programs, as JSON values.
     image : bytes
-        A picture; empty where there is none.
+        A picture, or empty.
     image_type : str
-        Of the picture: ``image/png``.
+        Type of the picture: ``image/png``.
     """
 
     text: str
@@ -88,35 +88,35 @@ class ToolAnswer:
 
 @dataclass(frozen=True)
 class KnownBindings:
-    """Bindings of a query in a frame, as the sandbox has found them, for a picture."""
+    """Bindings of a query in a frame from the sandbox, for a picture."""
 
     found: list[dict[str, int]]
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
-        """Node ids by the names of variables, for each match."""
+        """Return node ids by variable name, for each match."""
         del frame
         return self.found
 
 
 class StoreTools:
-    """Tools on one store.
+    """Tools for one store.
 
     Parameters
     ----------
     store : str or Path
     write_to : str or Path, optional
-        Folder for clips; without one nothing is exported.
+        Folder for clips; without it there is no export.
     timeout_s : float
-        Longest time for a question; s.
+        Time limit of a query; s.
     most_rows : int
-        Longest answer; rows.
+        Greatest number of rows of a result.
     tables : mapping of str to path, optional
         As in :class:`sgstore.sandbox.Sandbox`.
 
     Raises
     ------
     StoreError
-        There is no such file, or it is no store.
+        The file is missing, or is not a store.
     """
 
     def __init__(
@@ -147,12 +147,12 @@ class StoreTools:
         self.close()
 
     def close(self) -> None:
-        """End the process that answers."""
+        """Stop the sandbox process and close the store."""
         self._box.close()
         self._store.close()
 
     def tools(self) -> dict[str, Callable[..., ToolAnswer]]:
-        """The tools by name, in the order in which an assistant should read them."""
+        """Return the tools by name, in the recommended reading order."""
         reading = (
             *(self.list_traces, self.vocabulary, self.patterns_search, self.find, self.why_not),
             *(self.sql, self.check, self.timeline, self.show, self.picture, self.coverage_missing),
@@ -188,7 +188,7 @@ class StoreTools:
         return ToolAnswer(text, {"about": about, "text": text})
 
     def topic(self, about: Topic) -> str:
-        """The text on a topic of the vocabulary."""
+        """Return the text on a topic of the vocabulary."""
         if about == "language":
             return self._language
         return topic_text(about, self._ask("views" if about == "views" else "vocabulary"))
@@ -363,7 +363,7 @@ class StoreTools:
         return ToolAnswer(f"{about['frame']}, {topic}: {size}", about, image, "image/jpeg")
 
     def _drawn(self, draw: Callable[[Path], None]) -> bytes:
-        """A picture that a function draws into a file."""
+        """Return a picture that a function draws into a file."""
         with self._turn, tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "drawn.png"
             draw(file)
@@ -424,7 +424,7 @@ class StoreTools:
             raise ExportError("nothing may be written: the server was started without --write-to")
         if not _NAME.fullmatch(name):
             raise ExportError(f"{name!r} is no name of a folder; expected such as 'cut-ins_1'")
-        exporter_named(form)  # before anything is searched
+        exporter_named(form)  # before the search starts
         reply = self._ask(
             "clips",
             query=query,
@@ -448,7 +448,7 @@ class StoreTools:
 
 
 TRACES_DRAWN: Final = 12
-"""Traces of one timeline."""
+"""Greatest number of traces in one timeline."""
 
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}")
 
@@ -467,12 +467,12 @@ def _encoded(image: Image, form: str) -> bytes:
 
 
 def _rows_text(reply: Mapping[str, Any]) -> str:
-    """Rows as lines with ``|`` between the values, and what has to be known of them.
+    """Return rows as lines with ``|`` between the values, followed by notes.
 
     Parameters
     ----------
     reply : mapping
-        ``columns``, ``rows``, ``truncated``; ``notes`` and ``left_out`` where there are any.
+        ``columns``, ``rows``, ``truncated``; optionally ``notes`` and ``left_out``.
     """
     rows = reply["rows"]
     lines, shown = _lines(reply["columns"], rows)
@@ -489,7 +489,7 @@ def _rows_text(reply: Mapping[str, Any]) -> str:
 
 
 def _lines(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> tuple[list[str], int]:
-    """A head and as many rows as have room; and how many these are."""
+    """Return a header with as many rows as fit, and their number."""
     lines = [" | ".join(columns)]
     left = MOST_TEXT
     for number, row in enumerate(rows):
@@ -502,7 +502,7 @@ def _lines(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> tuple[list[
 
 
 def _remarks(reply: Mapping[str, Any]) -> list[str]:
-    """Sentences on the traces that cannot answer, and on what may be a mistake."""
+    """Return sentences about traces that cannot answer, and about likely mistakes."""
     of: dict[str, list[str]] = {}
     for name, reason in reply.get("left_out", {}).items():
         of.setdefault(reason, []).append(name)

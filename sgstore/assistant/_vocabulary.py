@@ -1,4 +1,4 @@
-"""Names that a query may use, as texts for a prompt."""
+"""Names for queries, as texts for a prompt."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ _SIGNATURE: Final = re.compile(r"PREDICATE\s+(\w+\s*\([^)]*\))")
 
 
 def topic_text(about: Topic, known: Mapping[str, Any]) -> str:
-    """The text on a topic.
+    """Return the text on a topic.
 
     Parameters
     ----------
     about : Topic
-        Any but ``language``, which is a page.
+        Any topic except ``language``, which is a page.
     known : mapping
-        What the sandbox tells of the store; see :mod:`sgstore.assistant._worker`.
+        Facts about the store from the sandbox; see :mod:`sgstore.assistant._worker`.
     """
     match about:
         case "relations":
@@ -75,7 +75,7 @@ def _here(known: Mapping[str, Any]) -> str:
 
 
 def _ends(relations: Mapping[str, tuple[list[str], list[str]]]) -> list[str]:
-    """Kinds that relations lead from and to; relations among the same kinds in one line."""
+    """Return source and target kinds of relations; relations with equal kinds share a line."""
     alike: dict[str, list[str]] = {}
     for name, (sources, targets) in relations.items():
         alike.setdefault(f"{', '.join(sources)} → {', '.join(targets)}", []).append(name)

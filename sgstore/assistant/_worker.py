@@ -1,8 +1,8 @@
-"""Questions of an assistant, answered in the process of the sandbox.
+"""Queries of an assistant, run in the sandbox process.
 
-A question is ``{"ask": NAME, "with": {…}}``, where the name is one of :data:`ANSWERS`. What a reply lists comes
-as ``columns`` and ``rows``, with ``truncated`` where there is more than was asked for, and with what has to be
-known of it: ``left_out``, the traces that cannot answer, with the reason, and ``notes``.
+A query is ``{"ask": NAME, "with": {…}}``, where the name is a key of :data:`ANSWERS`. A reply with
+a list has ``columns`` and ``rows``, ``truncated`` if there are more rows, ``left_out`` with the
+traces that cannot answer and their reasons, and ``notes``.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 def answer(store: Store, question: Mapping[str, Any], most: int) -> Reply:
-    """The reply to a question; see :data:`ANSWERS`."""
+    """Return the reply to a query; see :data:`ANSWERS`."""
     about = dict(question["with"])
     about["limit"] = min(about.get("limit", most), most)
     return plain(ANSWERS[question["ask"]](store, **about))
@@ -37,19 +37,19 @@ def answer(store: Store, question: Mapping[str, Any], most: int) -> Reply:
 def _listed(
     columns: Sequence[str], rows: Iterable[Sequence[Any]], limit: int, **about: Any
 ) -> Reply:
-    """Rows as far as they are wanted."""
+    """Return the rows up to the limit, with a flag for more."""
     found = list(islice(rows, limit + 1))
     truncated = len(found) > limit
     return {"columns": columns, "rows": found[:limit], "truncated": truncated, **about}
 
 
 def _named(text: str, parameters: Mapping[str, Any], *, check: bool) -> tuple[str, dict[str, Any]]:
-    """A query, or what a name of the library stands for; and the values that it does not hold yet.
+    """Return a query or the text of a library name, and the values for its remaining parameters.
 
     Raises
     ------
     QueryError
-        There is nothing of that name, or it is of another kind than is wanted.
+        The name is unknown, or has another kind than required.
     """
     name = text.strip()
     if not name.isidentifier():
@@ -69,7 +69,7 @@ def _named(text: str, parameters: Mapping[str, Any], *, check: bool) -> tuple[st
 def _found(
     store: Store, text: str, parameters: Mapping[str, Any]
 ) -> tuple[Matches, dict[str, Any]]:
-    """The matches of a query, and what has to be known of them."""
+    """Return the matches of a query, with reasons and notes."""
     asked, values = _named(text, parameters, check=False)
     matches = store.find(asked, **values)
     return matches, {"left_out": matches.reasons, "notes": matches.notes}
@@ -226,7 +226,7 @@ def _shares(
 
 
 def _chosen(store: Store, query: str) -> ChosenFrames:
-    """The frames that a query finds; those of the whole store without one."""
+    """Return the frames of a query; without a query, those of the whole store."""
     from sgstore.coverage import ChosenFrames, frames_of
 
     if not query:
@@ -248,7 +248,7 @@ def _views(store: Store, limit: int) -> Reply:
         "SELECT table_name, column_name, data_type FROM information_schema.columns"
         " WHERE table_schema = 'main' ORDER BY ordinal_position"
     ):
-        # An enumeration lists all its words; they are those of the vocabulary.
+        # Enumerations would list all values; they are in the vocabulary.
         short = "word" if kind.startswith("ENUM") else kind.lower()
         columns.setdefault(view, []).append(f"{column} {short}")
     views = {name: {"meaning": meanings[name], "columns": columns[name]} for name in meanings}
@@ -256,7 +256,7 @@ def _views(store: Store, limit: int) -> Reply:
 
 
 def _vocabulary(store: Store, limit: int) -> Reply:
-    """Kinds and relations that occur, each with how many rows."""
+    """Return the occurring kinds and relations with their counts."""
     del limit
     catalog = store.catalog()
     relations: Counter[str] = Counter()
@@ -297,7 +297,7 @@ ANSWERS: Final = {
     "timeline": _timeline,
     "missing": _missing,
 }
-"""What can be asked, with the function that answers it; ``limit`` is the most rows that are wanted."""
+"""Functions by query name; ``limit`` is the greatest number of rows."""
 
 if __name__ == "__main__":
     serve(answer)
