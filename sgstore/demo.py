@@ -1,4 +1,4 @@
-"""The main job on the recording that comes with the project: ingest, ask, look, export."""
+"""Demonstration on the sample recording: ingest, find, show, export."""
 
 from __future__ import annotations
 
@@ -46,45 +46,46 @@ MATCH (e:Ego), (p:Person)-[at:isIn]->(lane:Lane {lane_type: 'driving'})
 WHERE dist(e, p) < 25 AND at.overlap > 0.5 AND NOT EXISTS {(p)-[:isIn]->(:Crosswalk)}""",
     ),
 )
-"""Questions of a test engineer: name of the picture that answers it, sentence, pattern.
+"""Queries of a test engineer: name of the result picture, sentence, pattern.
 
-Each holds somewhere in the sample; ``samples/town/README.md`` says when and who."""
+Each has a match in the sample; ``samples/town/README.md`` lists them."""
 
 STORE: Final = "demo.sgstore"
 
 _SAMPLE: Final = Path(__file__).parent / "sample"
 RECORDING: Final = _SAMPLE / "town.mcap"
-"""The recording in a checkout. A wheel is without it: it would be an eighth of all that is installed."""
+"""The recording in a checkout. A wheel does not contain it, because of its size: an eighth of the
+installation."""
 SMALL: Final = _SAMPLE / "small" / "town.mcap"
-"""The same drive without the lidar and with a picture a second, which a wheel brings."""
+"""The same drive without lidar, with one picture per second; part of the wheel."""
 
 MOUNTS: Final = ("ego/lidar=0,0,1.75", "ego/camera/front=0.45,0,1.42,-90,0,-90")
-"""Where the sensors sit on the ego."""
+"""Poses of the sensors on the ego."""
 
 
 def bundled() -> Path:
-    """The sample recording that is here: the whole one in a checkout, else the small one."""
+    """Return the available sample recording: the complete one in a checkout, else the small one."""
     return RECORDING if RECORDING.is_file() else SMALL
 
 
 def run_demo(folder: str | Path, say: Say, recording: str | Path | None = None) -> None:
-    """Run the demonstration, and tell what happens.
+    """Run the demonstration, and report each step.
 
     Parameters
     ----------
     folder : str or Path
-        Made if it does not exist; what an earlier run left there is made anew.
+        Created if missing; the results of an earlier run are replaced.
     say : function
-        Takes each line.
+        Function that prints a line.
     recording : str or Path, optional
         The sample recording; by default the one of the package.
 
     Raises
     ------
     ExportError
-        The folder holds something else.
+        The folder has other content.
     SgstoreError
-        Anything that the library refuses to do.
+        Any error of the library.
     """
     folder, recording = Path(folder), Path(recording or bundled())
     if not recording.is_file():
@@ -125,7 +126,7 @@ def _ingest(store: Path, sample: Path, say: Say) -> None:
 def _answer(
     store: Store, folder: Path, say: Say, name: str, sentence: str, pattern: str
 ) -> Path | None:
-    """Ask, print the intervals, and draw the middle of the first one."""
+    """Run a query, print the intervals, and draw the middle of the first one."""
     say("")
     say(sentence)
     say("")
@@ -142,7 +143,7 @@ def _answer(
     middle = (found[0].start_seq + found[0].end_seq) // 2
     try:
         check_installed()
-        from sgstore.draw import draw_stored  # its files import the drawing packages
+        from sgstore.draw import draw_stored  # a late import, because it loads the drawing packages
 
         draw_stored(store, f"{found[0].trace}#{middle}", picture, matches=matches)
     except MissingExtraError as error:
@@ -153,7 +154,7 @@ def _answer(
 
 
 def _bound(interval: Interval) -> list[str]:
-    """``p = person 15`` for each variable."""
+    """Return ``p = person 15`` for each variable."""
     return [
         f"{name.removesuffix('.name')} = {value}"
         for name, value in interval.values.items()

@@ -1,6 +1,6 @@
-"""Notebooks: the cell ``%%sgql``, and pictures of graphs. ``%load_ext sgstore`` makes them known to IPython.
+"""Notebook support: the cell magic ``%%sgql``, and pictures of graphs, after ``%load_ext sgstore``.
 
-Nothing of IPython is imported: it calls :func:`load`, and is told what to call.
+This module does not import IPython; IPython calls :func:`load`.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ _DEFAULT: Final = re.compile(r"(\w+)\s*=")
 
 
 def load(ipython: Any) -> None:
-    """Make the cell and the pictures known to a session of IPython."""
+    """Register the cell magic and the pictures in an IPython session."""
     ipython.register_magic_function(SgqlCell(ipython.user_ns), "cell", "sgql")
     pictures = ipython.display_formatter.formatters["image/png"]
     pictures.for_type_by_name("sgstore.graph", "SceneGraph", _picture)
 
 
 def _picture(graph: Any) -> bytes | None:
-    """A graph that a generator or an exporter has made, drawn as nodes and edges."""
+    """Draw a graph of a generator or exporter as nodes and edges."""
     from sgstore.draw import graph_picture
     from sgstore.errors import MissingExtraError
 
@@ -52,9 +52,9 @@ def _picture(graph: Any) -> bytes | None:
 
 
 class SgqlCell:
-    """The cell ``%%sgql``: a pattern, rules, or SQL; the answer shows itself.
+    """Cell magic ``%%sgql``: runs a pattern, rules, or SQL, and displays the result.
 
-    ``$name`` stands for the variable of that name.
+    ``$name`` is replaced by the value of this variable.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class SgqlCell:
         self._last: Store | None = None
 
     def __call__(self, line: str, cell: str) -> Matches | CheckRun | Rows | None:
-        """Ask what stands in the cell; a mistake in it is told without a traceback."""
+        """Run the text of the cell; print errors without a traceback."""
         try:
             store, name = self._options(line)
             answer = self._asked(store, cell)
@@ -80,7 +80,7 @@ class SgqlCell:
         return answer
 
     def _options(self, line: str) -> tuple[Store, str]:
-        """The store that is asked, and what the answer is to be called."""
+        """Return the store of the query, and the variable name for the result."""
         try:
             words = shlex.split(line)
         except ValueError as error:
@@ -115,7 +115,7 @@ class SgqlCell:
         return store.check(text, **values) if _has_checks(text) else store.find(text, **values)
 
     def _values(self, text: str) -> dict[str, Any]:
-        """Variables of the session that stand in a query; those that it gives values itself are its own."""
+        """Return the session's variables in a query, except those with a value in the query itself."""
         bare = _NO_NAMES.sub("''", text)
         own = {name for part in _SCENARIO.findall(bare) for name in _DEFAULT.findall(part)}
         wanted = dict.fromkeys(name for name in _VALUE.findall(bare) if name not in own)
@@ -123,7 +123,7 @@ class SgqlCell:
 
 
 def _has_checks(text: str) -> bool:
-    """Tell whether a text has rules; one that cannot be parsed is told so as a pattern or as rules."""
+    """True if a text contains rules; invalid texts are classified by the word ``CHECK``."""
     from sgstore.errors import QueryError
     from sgstore.lang import parse
     from sgstore.lang.syntax import CheckClause

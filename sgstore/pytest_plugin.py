@@ -1,4 +1,4 @@
-"""Test sets for pytest: one test for each clip that a query finds or a lock names, or for each trace and rule.
+"""Pytest plugin for test sets: one test per clip of a query or lock, or per trace and rule.
 
 ::
 
@@ -16,16 +16,17 @@
     def test_no_rule_is_broken(scene):
         pass
 
-Whoever has sgstore installed has it: pytest finds it by its entry point. Paths count from the folder of the
-test; a lock takes its clips from the store that ``--scenes-store`` or the setting ``scenes_store`` names,
-unless the mark does. The id of a test is the trace and the numbers of the first and the last frame,
-``town#240-250``: the same whenever and wherever the store is made again, so that results can be compared, and
-the same in all processes of pytest-xdist. Of a check it is the trace and the name of the check.
+The plugin is active if sgstore is installed: pytest finds it by its entry point. Paths are relative
+to the folder of the test. A lock uses the store of ``--scenes-store``, or of the setting
+``scenes_store``, unless the mark names a store. The id of a test is the trace and the numbers of
+the first and the last frame, ``town#240-250``. It is the same for every rebuild of the store, so
+that results can be compared, and in all processes of pytest-xdist. For a check it is the trace and
+the name of the check.
 
-A case of a lock is looked at before its test runs: another number of frames, other times or other graphs are an
-error of that test; so are other messages when the test asks for one. A rule is checked before the body of its
-test: a trace that violates it fails, one that cannot answer it, or in which it is still due, is skipped. A mark
-that is wrong is an error of its tests, not of the session: the others run.
+A case of a lock is verified before its test runs: other frame counts, times or graphs are an error
+of that test; so are other messages when the test reads one. A rule is checked before the body of
+its test: a trace that violates it fails; a trace that cannot answer it, or where it is pending, is
+skipped. An invalid mark is an error of its tests only; the other tests run.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ _KNOWN: Final = {*_SOURCES, "store", "before", "after", "parameters", "allow_emp
 
 
 class ClipScene:
-    """A clip as a test sees it: what the fixture ``scene`` is.
+    """Clip of a test; the value of the fixture ``scene``.
 
     Attributes
     ----------
@@ -71,15 +72,15 @@ class ClipScene:
     clip : Clip
         Its trace, and log times.
     name : str
-        Id of its test; empty: its trace and frames.
+        Id of its test; empty means trace and frames.
 
     Parameters
     ----------
     differences : callable, optional
-        Gives the lines of a message if the store lacks what a lock says of it; called with whether the messages
-        of sensors are looked at, and not the graphs.
+        Function that returns the lines of a message if the store differs from the lock; its
+        argument is True to compare messages of sensors instead of graphs.
     asked : callable, optional
-        Gives the verdict of a check for its trace.
+        Function that returns the verdict of a check for its trace.
     """
 
     def __init__(
@@ -97,21 +98,21 @@ class ClipScene:
 
     @cached_property
     def frames(self) -> tuple[FrameRef, ...]:
-        """The frames of the clip, in order."""
+        """Return the frames of the clip, in order."""
         return _frames(self.store, self.clip)
 
     @property
     def verdict(self) -> Verdict | None:
-        """Verdict of the check for the trace; ``None`` if the test is not about a check."""
+        """Return the verdict of the check for the trace; ``None`` if the test has no check."""
         return None if self._asked is None else self._asked()
 
     def verify(self, *, messages: bool = False) -> None:
-        """Look whether the store has what a lock says, once in a session, or fail the test.
+        """Verify once per session that the store agrees with the lock, or fail the test.
 
         Parameters
         ----------
         messages : bool
-            Whether the messages of sensors are looked at, and not the graphs.
+            True to compare the messages of sensors instead of the graphs.
         """
         if self._differences is None or messages in self._verified:
             return
@@ -124,33 +125,33 @@ class ClipScene:
 
     @property
     def id(self) -> str:
-        """Id of its test."""
+        """Return the id of its test."""
         return self.name or f"{self.trace}#{self.frames[0].seq}-{self.frames[-1].seq}"
 
     @property
     def trace(self) -> str:
-        """Name of its trace."""
+        """Return the name of its trace."""
         return self.clip.trace
 
     @property
     def time(self) -> tuple[float, float]:
-        """Start and end since its trace began; s."""
+        """Return start and end since the start of its trace; s."""
         return self.frames[0].t, self.frames[-1].t
 
     @property
     def recording(self) -> Path:
-        """The recording that it is a part of."""
+        """Return the path of its recording."""
         return self.store.file.trace(self.trace).path
 
     def graph(self, frame: int | FrameRef = 0, abstraction: str | None = None) -> Any:
-        """The scene graph of a frame.
+        """Return the scene graph of a frame.
 
         Parameters
         ----------
         frame : int or FrameRef
-            Counted in the scene, from its end if below zero; or one of its frames.
+            Index in the scene, negative from its end; or one of its frames.
         abstraction : str, optional
-            As :meth:`sgstore.query.Store.graph` takes it.
+            As in :meth:`sgstore.query.Store.graph`.
 
         Returns
         -------
@@ -160,7 +161,7 @@ class ClipScene:
         return self.store.graph(self._frame(frame), *asked)
 
     def graphs(self) -> Iterator[nx.MultiDiGraph[int]]:
-        """The scene graphs of all frames, in order."""
+        """Yield the scene graphs of all frames, in order."""
         from sgstore.exporters import FEW, Export, graphs_of
 
         export = Export(self.store, (self.clip,))
@@ -169,17 +170,17 @@ class ClipScene:
                 yield graph.to_networkx()
 
     def payload(self, channel: str, frame: int | FrameRef = 0) -> bytes:
-        """The message of a channel that belongs to a frame, as it was recorded; ``frame`` as :meth:`graph`."""
+        """Return the recorded message of a channel for a frame; ``frame`` as in :meth:`graph`."""
         self.verify(messages=True)
         return self.store.payload(self._frame(frame), channel)
 
     def carried(self, channel: str, frame: int | FrameRef = 0) -> Media:
-        """Content of such a message: the file of a picture, a video up to it, or the message."""
+        """Return the content of such a message: a picture file, a video up to it, or the message."""
         self.verify(messages=True)
         return self.store.file.carried(self._frame(frame).frame_id, channel)
 
     def found(self, query: str, /, **parameters: object) -> list[FrameRef]:
-        """The frames of the scene in which a pattern holds."""
+        """Return the frames of the scene that match a pattern."""
         own = {frame.frame_id for frame in self.frames}
         matches = self.store.find(query, **parameters)
         return [frame for frame in matches.frames() if frame.frame_id in own]
@@ -197,7 +198,7 @@ class ClipScene:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """The store that locks take their clips from."""
+    """Add the option for the store of locks."""
     group = parser.getgroup("sgstore")
     about = "store that @pytest.mark.scenes takes its clips from, if the mark names none"
     group.addoption("--scenes-store", dest=OPTION, metavar="PATH", default=None, help=about)
@@ -205,12 +206,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Make the mark known."""
+    """Register the mark."""
     config.addinivalue_line("markers", _EXPLAINED)
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """One test for each scene; if the mark is wrong, one that says so."""
+    """Parametrise one test per scene; an invalid mark gives one failing test."""
     mark = metafunc.definition.get_closest_marker(MARK)
     if mark is None or "scene" not in metafunc.fixturenames:
         return
@@ -218,12 +219,12 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         scenes: list[Any] = _scenes(metafunc.config, metafunc.definition.path.parent, mark)
         ids = [scene.id for scene in scenes]
     except (SgstoreError, OSError, TypeError, ValueError) as error:
-        scenes, ids = [f"@pytest.mark.{MARK}: {error}"], ["error"]  # its test says so
+        scenes, ids = [f"@pytest.mark.{MARK}: {error}"], ["error"]  # its test reports the error
     metafunc.parametrize("scene", scenes, indirect=True, ids=ids)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Nothing is tested by a mark whose scenes nobody takes."""
+    """Fail tests with the mark but without the fixture."""
     lacks = "scene" not in getattr(item, "fixturenames", ("scene",))
     if lacks and item.get_closest_marker(MARK) is not None:
         pytest.fail(f"{item.name}: {MARK} needs the fixture `scene`", pytrace=False)
@@ -231,7 +232,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture
 def scene(request: pytest.FixtureRequest) -> ClipScene:
-    """The clip that a test is about; it needs ``@pytest.mark.scenes(…)``."""
+    """Clip of a test with ``@pytest.mark.scenes(…)``."""
     found = getattr(request, "param", None)
     if isinstance(found, str):
         pytest.fail(found, pytrace=False)
@@ -243,7 +244,7 @@ def scene(request: pytest.FixtureRequest) -> ClipScene:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> None:
-    """A violated check fails its test, whatever the body says."""
+    """Fail the test of a violated check, independent of its body."""
     found = pyfuncitem.funcargs.get("scene")
     verdict = found.verdict if isinstance(found, ClipScene) else None
     if verdict is None:
@@ -258,7 +259,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> None:
 
 
 def violations_text(verdict: Verdict) -> str:
-    """Violations of a check with their entities, a line each."""
+    """Return the violations of a check with their entities, one per line."""
     lines = [f"{verdict.trace} violates {verdict.check}"]
     for one in verdict.violations:
         who = ", ".join(map(str, one.values.values()))
@@ -273,7 +274,7 @@ def violations_text(verdict: Verdict) -> str:
 
 
 _FOUND: Final = pytest.StashKey[dict[str, list[ClipScene]]]()
-"""Results of marks, so that many tests of one mark ask once."""
+"""Cached results of marks, so that tests with the same mark share a query."""
 
 
 def _scenes(config: pytest.Config, folder: Path, mark: pytest.Mark) -> list[ClipScene]:
@@ -323,12 +324,12 @@ def _asked(store: Store, folder: Path, told: Mapping[str, Any]) -> list[ClipScen
 
 
 def scenes_of(path: Path, store: Store) -> list[ClipScene]:
-    """The clips that a lock names, as a store has them.
+    """Return the clips of a lock in a store.
 
     Raises
     ------
     SgstoreError
-        The lock cannot be read, or the store lacks what it names.
+        The lock is unreadable, or the store lacks its contents.
     """
     from sgstore.locks import cases_of, read_lock, verify_case
     from sgstore.world import Clip
@@ -348,12 +349,12 @@ def scenes_of(path: Path, store: Store) -> list[ClipScene]:
 
 
 def traces_checked(path: Path, store: Store, parameters: Mapping[str, Any]) -> list[ClipScene]:
-    """Every trace of a store with every check of a file.
+    """Return every trace of a store with every check of a file.
 
     Raises
     ------
     SgstoreError
-        The checks have no meaning in the store.
+        The checks are invalid for the store.
     OSError
         The file cannot be read.
     """
@@ -366,7 +367,7 @@ def traces_checked(path: Path, store: Store, parameters: Mapping[str, Any]) -> l
     def verdicts() -> Mapping[tuple[str, str], Verdict]:
         return {(one.trace, one.check): one for one in run}
 
-    def verdict(trace: str, check: str) -> Verdict:  # unknown of a trace with another ego
+    def verdict(trace: str, check: str) -> Verdict:  # unknown for a trace with another ego
         return verdicts().get((trace, check)) or Verdict(check, trace, "unknown")
 
     with store.file.snapshot():

@@ -1,6 +1,6 @@
-"""A live CARLA → a recording: its frames and what sensors on the ego measure, in one MCAP file.
+"""Recorder of a running CARLA: frames and sensor data of the ego in one MCAP file.
 
-A run that is recorded and ingested gives the graphs that the online mode gave. Not run against a server: see
+A recorded and ingested run gives the same graphs as the online mode. Not tested with a server: see
 :mod:`sgstore.readers.carla._live`.
 """
 
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 
 TICK_TIMEOUT_S: Final = 10.0
-"""How long the world may stand still before that is an error; s."""
+"""Time without a tick of the world that counts as an error; s."""
 LAST_S: Final = 1.0
-"""How long measurements that are on their way are waited for at the end; s."""
+"""Waiting time for the last sensor data at the end; s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,11 +36,11 @@ class Recorded:
     ----------
     written : Written
     ego : str
-        Id of the ego; empty if there was none.
+        Id of the ego; empty without an ego.
     dropped : int
-        Measurements that were lost.
+        Number of lost sensor readings.
     warnings : list of str
-        What was odd.
+        Warnings about the run.
     """
 
     written: Written
@@ -66,25 +66,27 @@ def record(  # noqa: PLR0913  as many options as a recording has
     ----------
     world : carla.World
     to : Path
-        ``….mcap``; nothing is overwritten.
+        ``….mcap``; existing files are not overwritten.
     ego : str
-        Id or role name of the ego; empty: a vehicle with the role ``hero`` or ``ego_vehicle``.
+        Id or role name of the ego; empty means a vehicle with the role ``hero`` or ``ego_vehicle``.
     sensors : sequence of Sensor
-        They are attached to the ego, and taken away at the end.
+        Sensors that are attached to the ego, and removed at the end.
     duration_s : float, optional
-        Simulation time to record; s. Without it the run ends with a ``KeyboardInterrupt``, which is no error.
+        Simulation time to record; s. Without it the run ends with a ``KeyboardInterrupt``, which is
+        not an error.
     step_s : float, optional
-        Drive the world: it goes on by this time for each frame, and waits in between (synchronous mode; its
-        settings are restored). Without it the world is followed as it goes.
+        Drive the world: it advances by this time for each frame, and waits in between (synchronous
+        mode; its settings are restored at the end). Without it the world runs by itself.
     scenery : bool
-        Whether buildings, poles, vegetation and parked vehicles of the level are entities.
+        True if buildings, poles, vegetation and parked vehicles of the level are entities.
     on_frame : function, optional
-        Called with the number of frames and the simulation time recorded, after each frame; s.
+        Called after each frame with the number of recorded frames and the recorded simulation time
+        (s).
 
     Raises
     ------
     TraceError
-        The world has no map, stands still, or has no ego to carry sensors.
+        The world has no map, does not advance, or has no ego for the sensors.
     ExportError
         The file cannot be written, or there was no frame.
     """
@@ -121,7 +123,7 @@ def record(  # noqa: PLR0913  as many options as a recording has
 
 
 class _FrameWriter:
-    """Steps that are taken for each frame."""
+    """Writer of each frame and its sensor readings."""
 
     def __init__(
         self, live: LiveWorld, recorder: Recorder, on_frame: Callable[[int, float], None] | None
@@ -153,7 +155,7 @@ class _FrameWriter:
             self._on_frame(self._frames, self.seconds)
 
     def drain(self, sensors: Sensors, timeout_s: float) -> None:
-        """Write what has been measured since the first frame."""
+        """Write the sensor readings since the first frame."""
         for reading in sensors.waiting(timeout_s):
             if reading.time_ns >= self._start_ns:
                 self._recorder.reading(reading)
@@ -172,7 +174,7 @@ class _FrameWriter:
 
 
 def _snapshots(world: Any, step_s: float | None) -> Generator[Any]:
-    """Snapshots of the world as it goes, or as it is driven."""
+    """Yield snapshots of the world, which runs by itself or is driven."""
     if step_s is None:
         while True:
             try:

@@ -1,8 +1,8 @@
-"""Matches of a query as one file of HTML, to be looked at and played without a server and without a network.
+"""Matches of a query as one HTML file that plays without a server and without a network.
 
-It holds the page's own modules, made into one script, and the answers that they would ask a server for: the
-matches, lanes of truth, states around each match, outlines of maps and, if wanted, camera pictures. A policy in
-the file lets it run that script and load nothing.
+The file contains the page's modules as one script, and the data that they would request from a
+server: matches, truth lanes, states around each match, outlines of maps and optionally camera
+pictures. A policy in the file permits only that script, and no requests.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from sgstore.query import Store
 
 CHUNK: Final = 300
-"""Frames whose states the page asks for together (``CHUNK`` of ``data.js``)."""
+"""Frames per states request of the page (``CHUNK`` of ``data.js``)."""
 
 POLICY: Final = (
     "default-src 'none'; script-src 'sha256-{script}'; style-src 'sha256-{style}';"
@@ -39,9 +39,9 @@ POLICY: Final = (
 )
 
 Found = tuple[str, int, int, dict[str, int]]
-"""A match: trace, first and last frame, and nodes by variable."""
+"""Match: trace, first and last frame, and nodes by variable."""
 Spans = dict[str, list[tuple[int, int]]]
-"""By trace: first and last frame of what is kept, in order and apart."""
+"""Trace → first and last frame of the stored ranges, ordered and disjoint."""
 
 
 def report(
@@ -60,29 +60,29 @@ def report(
     ----------
     store : Store
     text : str
-        A pattern, or checks: their violations are shown.
+        A pattern; or checks, whose violations are shown.
     to : Path
-        The file.
+        The output file.
     parameters : mapping, optional
         Values of ``$name``.
     most : int
-        Most matches that it holds.
+        Greatest number of matches.
     around_s : float
-        Time before and after each match that can be watched, too; s.
+        Additional time before and after each match; s.
     pictures : bool
-        Keep a picture of the first camera for each second of a match.
+        True to include a picture of the first camera for each second of a match.
 
     Returns
     -------
     matches : int
-        How many it holds.
+        Number of included matches.
     truncated : bool
-        Whether there are more.
+        True if there are more.
 
     Raises
     ------
     QueryError
-        The text is no query.
+        The text is not a query.
     """
     title = Path(to).stem
     page, many, truncated = _made(store, text, parameters, title, most, around_s, pictures)
@@ -92,14 +92,14 @@ def report(
 
 @dataclass(frozen=True)
 class PlayableMatches:
-    """Matches that a notebook shows as a report, in a frame of its own that can load nothing.
+    """Matches that a notebook shows as a report, in an isolated frame.
 
     Attributes
     ----------
     page : str
-        The report, as :func:`report` writes it.
+        The report, as written by :func:`report`.
     height : int
-        Of the frame; points.
+        Height of the frame; points.
     """
 
     page: str = field(repr=False)
@@ -121,19 +121,19 @@ def inline(
     around_s: float = 2.0,
     pictures: bool = False,
 ) -> PlayableMatches:
-    """Matches of a query as an object that shows itself in a notebook: a report that plays there.
+    """Return matches of a query as an object that a notebook displays as a report.
 
     Parameters
     ----------
     store, text, parameters, most, around_s, pictures
-        As :func:`report` takes them.
+        As in :func:`report`.
     height : int
-        Of the frame; points.
+        Height of the frame; points.
 
     Raises
     ------
     QueryError
-        The text is no query.
+        The text is not a query.
     """
     page, _, _ = _made(store, text, parameters, "sgstore", most, around_s, pictures)
     return PlayableMatches(page, height)
@@ -148,7 +148,7 @@ def _made(
     around_s: float,
     pictures: bool,  # noqa: FBT001 - as report has it
 ) -> tuple[str, int, bool]:
-    """A page, how many matches it holds, and whether there are more."""
+    """Return a page, its number of matches, and True if there are more."""
     with store.file.snapshot():
         kept, found, truncated = _kept(store, text, dict(parameters or {}), most, around_s)
         if pictures:
@@ -159,7 +159,7 @@ def _made(
 def _kept(
     store: Store, text: str, values: dict[str, Any], most: int, around_s: float
 ) -> tuple[dict[str, Any], list[Found], bool]:
-    """Answers for the page, as JSON holds it; the matches; whether there are more."""
+    """Return the page's data as JSON values, the matches, and True if there are more."""
     is_check = re.match(r"\s*(?:--[^\n]*\n\s*)*(?:DEFINE\b[^;]*;\s*)*CHECK\b", text, re.IGNORECASE)
     question = {"text": text, "parameters": values}
     told = list(answer(store, {"ask": "check" if is_check else "matches", **question}, most))
@@ -192,7 +192,7 @@ def _kept(
 
 
 def _found(told: list[dict[str, Any]]) -> Iterator[Found]:
-    """Matches among replies, as the page takes them."""
+    """Yield the matches among replies, in the page's form."""
     names: tuple[str, ...] = ()
     for reply in told:
         names = reply.get("names", names)
@@ -214,12 +214,12 @@ def _notes(store: Store) -> list[Any]:
 
 
 def _key(*values: Any) -> str:
-    """The key of an answer, as ``JSON.stringify`` writes it."""
+    """Return the key of a data item, as written by ``JSON.stringify``."""
     return json.dumps(values, separators=(",", ":"), ensure_ascii=False)
 
 
 def _spans(found: list[Found], traces: Mapping[str, Any], around_s: float) -> Spans:
-    """Frames of the matches and around them."""
+    """Return the frame ranges of the matches with their surroundings."""
     spans: Spans = {}
     for trace, first, last, _ in sorted(found, key=lambda match: match[:3]):
         about = traces[trace]
@@ -234,7 +234,7 @@ def _spans(found: list[Found], traces: Mapping[str, Any], around_s: float) -> Sp
 
 
 def _parts(store: Store, question: Mapping[str, Any], found: list[Found]) -> dict[str, Any]:
-    """Lanes of truth, by trace and nodes: matches of the same nodes have the same."""
+    """Return truth lanes by trace and nodes; matches of the same nodes share them."""
     parts: dict[str, Any] = {}
     for trace, first, _, binding in found:
         key = _key(trace, binding or None)
@@ -248,7 +248,7 @@ def _parts(store: Store, question: Mapping[str, Any], found: list[Found]) -> dic
 def _columns(
     store: Store, reads: Reads, traces: Mapping[str, Any], spans: Spans
 ) -> Iterator[tuple[str, str]]:
-    """Columns that the page asks for, by key: states in the spans, what never moves, maps."""
+    """Yield the page's columns by key: states in the ranges, static entities, maps."""
     maps: set[str] = set()
     for name, about in traces.items():
         yield _key("api/static", name), _small(reads.static(name))
@@ -264,7 +264,7 @@ def _columns(
 
 
 def _states(store: Store, trace: str, first: int, last: int, spans: list[tuple[int, int]]) -> bytes:
-    """States of frames in the spans; the others have none."""
+    """Return states of frames in the ranges; other frames are empty."""
     frames, states = store.file.states(trace, first, last)
     seq = states.pop("seq")
     inside = np.zeros(len(seq), bool)
@@ -272,13 +272,13 @@ def _states(store: Store, trace: str, first: int, last: int, spans: list[tuple[i
         inside |= (low <= seq) & (seq <= high)
     start = np.searchsorted(seq[inside], np.append(frames["seq"], last + 1)).astype(np.uint32)
     columns = {f"frame.{name}": column for name, column in frames.items()} | {"frame.start": start}
-    # Places to a centimetre, the others to three digits behind the point: the file is a third smaller.
+    # Positions to a centimetre, other numbers to three decimals: the file is a third smaller.
     kept = {name: _rounded(column[inside]) for name, column in states.items()}
     return packed({"trace": trace, "first": first, "last": last}, columns | kept)
 
 
 def _rounded(column: Any) -> Any:
-    """Numbers in steps of 1/128: their last bits are zeros, which need little room."""
+    """Round numbers to 1/128: trailing zero bits compress well."""
     if column.dtype.kind != "f":
         return column
     return (np.round(column * 128) / 128).astype(column.dtype)
@@ -291,7 +291,7 @@ def _small(data: bytes) -> str:
 def _pictures(
     store: Store, traces: list[dict[str, Any]], matches: list[Found]
 ) -> dict[str, dict[str, str]]:
-    """Pictures of the first camera of each trace, one for each second of a match; ``cameras`` names it."""
+    """Return pictures of each trace's first camera, one per second of a match; ``cameras`` has its name."""
     reads, found = Reads(store), dict[str, dict[str, str]]()
     cameras = {one["name"]: one["cameras"] for one in reads.about()["traces"]}
     for about in traces:
@@ -306,7 +306,7 @@ def _pictures(
                 try:
                     data, _ = reads.picture(trace, seq, topic)
                 except SgstoreError:
-                    continue  # not every frame has one
+                    continue  # some frames have none
                 kept[str(seq)] = base64.b64encode(data).decode()
     return found
 
@@ -324,7 +324,7 @@ _MINIFIED: Final = re.compile(r"export\{([^}]*)\};?\s*$")
 
 
 def script() -> str:
-    """The modules of a report as one script: each a function that gives what it exports."""
+    """Return the modules of a report as one script: each module becomes a function."""
     parts: list[str] = []
     names: dict[Path, str] = {}
 
@@ -351,7 +351,7 @@ def _imported(found: re.Match[str], name: str) -> str:
 
 
 def _exported(text: str) -> str:
-    """A module as the body of a function."""
+    """Convert a module to the body of a function that returns its exports."""
     minified = _MINIFIED.search(text)
     if minified:
         pairs = (one.split(" as ") for one in minified[1].split(","))

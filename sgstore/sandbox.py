@@ -1,14 +1,14 @@
-"""Questions of strangers: SQL and patterns that nobody has looked at, answered in a process of their own.
+"""Sandbox: untrusted SQL and patterns, run in a separate process.
 
-The process reads the store and nothing else: the database is opened read-only without access to files, its
-settings are locked, and the operating system allows it no file to be written and a bounded address space. A
-question has a deadline, after which the process is killed (a database that is asked to stop may take its time),
-and its answer a bounded number of rows and bytes. The process lives on between questions, because starting
-it takes a third of a second.
+The process can only read the store: the database is opened read-only without file access, and its
+settings are locked. The operating system forbids it to write files and limits its address space. A
+query has a deadline, after which the process is killed (stopping a query in the database can take
+long). Its result has a limited number of rows and bytes. The process lives on between queries,
+because its start takes a third of a second.
 
-Parent and child speak JSON, a line a message. Other rooms have questions of their own answered in such a
-process: a module that calls :func:`serve` with what answers them is the ``worker`` of a sandbox, and
-:meth:`Sandbox.ask` asks.
+Parent and child exchange JSON, one message per line. Other packages can run their own queries in
+such a process: the ``worker`` of a sandbox is a module that calls :func:`serve` with a function for
+its queries, and :meth:`Sandbox.ask` sends them.
 """
 
 from __future__ import annotations
@@ -52,41 +52,42 @@ TIMEOUT_S: Final = 5.0
 MEMORY: Final = 512 << 20
 MAX_ROWS: Final = 10_000
 MAX_BYTES: Final = 64 << 20
-"""Longest answer, as it is sent."""
+"""Greatest size of a result in transfer; bytes."""
 
 MAX_QUESTION: Final = 1 << 20
-"""Longest question with its values; characters."""
+"""Greatest length of a query with its values; characters."""
 
 START_S: Final = 120.0
-"""How long the process may take to start; s. It needs one, of which a very busy machine makes a minute."""
+"""Time limit for the start of the process; s. It takes one second, or up to a minute on a very busy machine."""
 
 READ_S: Final = 60.0
-"""How much longer for each table that it reads first; s."""
+"""Additional time for each table that it reads first; s."""
 
 _TABLE_BYTES: Final = 4 << 30
-"""The largest file that it may write, and that only while it reads tables, into a folder of its own."""
+"""Largest file that it may write, only while it reads tables, in its own folder; bytes."""
 
 _ADDRESS_SPACE: Final = 4 << 30
-"""What Python, its libraries and the database's threads reserve beside the memory for answers; bytes."""
+"""Address space for Python, its libraries and the database's threads, in addition to the query
+memory; bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Result of a question.
+    """Result of a query.
 
     Attributes
     ----------
     columns : tuple of str
     rows : list of tuple
-        Numbers, texts, truth values, ``None``, and lists and dicts of these; anything else as text.
+        Numbers, texts, truth values, ``None``, and lists and dicts of these; other values as text.
     truncated : bool
-        Whether there were more rows than allowed.
+        True if there were more rows than allowed.
     reasons : mapping of str to str
-        Why traces are left out that cannot answer the pattern, by name.
+        Traces that cannot answer the pattern, by name, with the reason.
     graphs : bool
-        Whether each row ends in a graph, as ``RETURN SUBGRAPHS`` asks.
+        True if each row ends in a graph (``RETURN SUBGRAPHS``).
     notes : tuple of str
-        What may be a mistake; see :attr:`sgstore.matches.Matches.notes`.
+        Likely mistakes; see :attr:`sgstore.matches.Matches.notes`.
     """
 
     columns: tuple[str, ...]
@@ -98,39 +99,40 @@ class Answer:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Traces that cannot answer the pattern."""
+        """Return the traces that cannot answer the pattern."""
         return tuple(self.reasons)
 
 
 class Sandbox:
-    """A process that answers questions about a store.
+    """Process that runs queries on a store.
 
-    Questions of several threads are answered one after the other. To be used with ``with``, or closed.
+    Queries of several threads run one after the other. A context manager; otherwise call
+    :meth:`close`.
 
     Parameters
     ----------
     store : str or Path
     timeout_s : float
-        Longest time for a question; s.
+        Time limit of a query; s.
     memory : int
-        Most memory that a question may take; bytes.
+        Memory limit of a query; bytes.
     max_rows : int
-        Longest answer; rows.
+        Greatest number of rows of a result.
     max_bytes : int
-        Longest answer; bytes.
+        Greatest size of a result; bytes.
     tables : mapping of str to path, optional
-        Tables of one's own that can be joined: Parquet, CSV or JSON files. They are read in that process too.
+        User tables for joins: Parquet, CSV or JSON files. They are also read in that process.
     worker : str
-        Module that the process runs, which calls :func:`serve`.
+        Module of the process, which calls :func:`serve`.
 
     Raises
     ------
     StoreError
-        There is no such file, it is no store, or one of another version; or a table cannot be read.
+        The file is missing, is not a store, or has another version; or a table cannot be read.
     """
 
     may_write: ClassVar[bool] = False
-    """Whether the process may write files."""
+    """True if the process may write files."""
 
     def __init__(
         self,
@@ -164,78 +166,79 @@ class Sandbox:
         self.close()
 
     def close(self) -> None:
-        """End the process."""
+        """Stop the process."""
         with self._turn:
             self._kill()
 
     @property
     def folder(self) -> Path | None:
-        """Folder of the tables that the process has read; ``None`` while there is no process."""
+        """Return the folder of the process's tables; ``None`` without a process."""
         return self._folder
 
     def sql(self, text: str) -> Answer:
-        """The rows of one statement that only reads.
+        """Return the rows of one read-only statement.
 
         Raises
         ------
         SqlError
-            It is none, the database refuses it, or it takes too much time or memory.
+            The statement is invalid, the database rejects it, or it exceeds the time or memory
+            limit.
         QueryError
-            A pattern in it is none.
+            A pattern in it is invalid.
         """
         return _answer(self.ask({"sql": text}, SqlError))
 
     def find(self, text: str, /, **parameters: object) -> Answer:
-        """The rows of a pattern.
+        """Return the rows of a pattern.
 
         Raises
         ------
         QueryError
-            The text is no query.
+            The text is not a query.
         SqlError
-            It takes too much time or memory.
+            The query exceeds the time or memory limit.
         """
         return _answer(self.ask({"find": text, "parameters": parameters}))
 
     def ask(
         self, question: Mapping[str, object], error: type[SgstoreError] = QueryError
     ) -> dict[str, Any]:
-        """The reply of the process to a question that its worker knows.
+        """Return the reply of the process to a query of its worker.
 
         Parameters
         ----------
         question : mapping
-            What JSON can hold.
+            JSON values.
         error : type
-            What is raised of a question that is too long.
+            Error class for a query that is too long.
 
         Raises
         ------
         SgstoreError
-            What the worker raised.
+            An error of the worker.
         SqlError
-            It takes too much time or memory.
+            The query exceeds the time or memory limit.
         """
         line = _line(question, error)
         with self._turn:
             return _granted(self._exchange(self._ready(), line, self._timeout_s))
 
     def replies(self, question: Mapping[str, object]) -> Iterator[dict[str, Any]]:
-        """Replies to a question, as they come; who stops reading stops the process.
+        """Yield the replies to a query on arrival; ending the iteration early stops the process.
 
-        All but the last have ``more``, which says so.
+        All replies except the last have ``more``.
 
         Parameters
         ----------
         question : mapping
-            What JSON can hold.
+            JSON values.
 
         Raises
         ------
         SgstoreError
-            What the worker raised.
+            An error of the worker.
         SqlError
-            It takes too much time or memory, or it was stopped.
+            The query exceeds the time or memory limit, or was stopped.
         """
         line, finished = _line(question, QueryError), False
         until = time.monotonic() + self._timeout_s
@@ -253,25 +256,25 @@ class Sandbox:
         yield _granted(reply)
 
     def stop(self) -> None:
-        """Stop what is asked now, by another thread: the process is killed."""
+        """Stop the current query of another thread by killing the process."""
         child = self._child
         if child is not None:
             self._stopped = True
             child.kill()
 
     def start(self) -> None:
-        """Have the process ready for the next question."""
+        """Start the process for the next query."""
         with self._turn:
             self._ready()
 
     @property
     def is_ready(self) -> bool:
-        """Return whether there is a process that can answer at once."""
+        """True if a process is ready to answer."""
         child = self._child
         return child is not None and child.poll() is None
 
     def _ready(self) -> subprocess.Popen[bytes]:
-        """The process, started if there is none."""
+        """Return the process, and start it if necessary."""
         if self._child is None or self._child.poll() is not None:
             self._kill()
             self._stopped = False
@@ -302,9 +305,9 @@ class Sandbox:
         return self._child
 
     def _exchange(self, child: subprocess.Popen[bytes], line: str | None, timeout_s: float) -> Any:
-        """Send a line, if there is one, and wait for one; the process does not outlive the deadline.
+        """Send a line, if there is one, and read one; kill the process at the deadline.
 
-        Nobody waits for its end then: a process with much memory takes its time to go.
+        The caller does not wait for its end, because a process with much memory exits slowly.
         """
         replies: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         talk = threading.Thread(
@@ -317,7 +320,7 @@ class Sandbox:
             reply = replies.get(timeout=max(timeout_s, 0))
         except queue.Empty:
             self._abandon()
-            told = self._timeout_s if line is None else timeout_s  # a later part has less left
+            told = self._timeout_s if line is None else timeout_s  # later parts have less time left
             raise SqlError(f"stopped after {told:g} s") from None
         except BaseException:
             self._kill()
@@ -333,7 +336,7 @@ class Sandbox:
         raise SqlError("stopped: it took more memory than is allowed")
 
     def _abandon(self) -> None:
-        """Kill the process; what it leaves is cleared away beside what comes next."""
+        """Kill the process, and clean up after it in the background."""
         child, folder = self._child, self._folder
         self._child = self._folder = None
         if child is not None:
@@ -349,8 +352,8 @@ class Sandbox:
 
 
 def _bury(child: subprocess.Popen[bytes], folder: Path | None) -> None:
-    """Wait for the end of a process, and clear away what it leaves."""
-    with child:  # which closes the pipes, too
+    """Wait for the end of a process, and remove its folder."""
+    with child:  # closes the pipes, too
         pass
     if folder is not None:
         shutil.rmtree(folder, ignore_errors=True)
@@ -362,9 +365,9 @@ def _sent_and_read(
     replies: queue.SimpleQueue[bytes],
     most: int,
 ) -> None:
-    """Put the line that a process answers with; one without an end if it died or says too much."""
+    """Put the reply line of a process into the queue; incomplete if it died or exceeded the limit."""
     reply = b""
-    # Whoever kills the process may close its pipes while they are used here.
+    # A thread that kills the process may close its pipes during their use here.
     with suppress(OSError, ValueError):
         if child.stdin is not None and child.stdout is not None:
             if line is not None:
@@ -382,7 +385,7 @@ def _line(question: Mapping[str, object], error: type[SgstoreError]) -> str:
 
 
 def _granted(reply: Any) -> dict[str, Any]:
-    """A reply that is no refusal; that is raised."""
+    """Return a reply, or raise the error in it."""
     if "query" in reply or "error" in reply:
         raise error_of(reply)
     return reply
@@ -396,19 +399,19 @@ def _answer(reply: dict[str, Any]) -> Answer:
 
 
 class Workshop(Sandbox):
-    """The same for work of our own that writes files, and ends at once when somebody says so."""
+    """Sandbox for internal tasks that write files, with immediate cancelling."""
 
     may_write: ClassVar[bool] = True
 
 
 class Errand:
-    """A longer piece of work in a :class:`Workshop` of its own; asked and cancelled as a :class:`SandboxPool`.
+    """Longer task in its own :class:`Workshop`, with the interface of :class:`SandboxPool`.
 
     Parameters
     ----------
     store : str or Path
     **limits
-        As :class:`Sandbox` takes them.
+        As in :class:`Sandbox`.
     """
 
     def __init__(self, store: str | Path, **limits: Any) -> None:
@@ -417,13 +420,13 @@ class Errand:
         self._gone = False
 
     def ask(self, question: Mapping[str, object], _key: str) -> Iterator[dict[str, Any]]:
-        """Replies, as they come; none where it was cancelled before."""
+        """Yield the replies on arrival; none after an early cancel."""
         with self._make() as self._box:
             if not self._gone:
                 yield from self._box.replies(question)
 
     def cancel(self, _key: str = "") -> bool:
-        """Stop it."""
+        """Stop the task."""
         self._gone = True
         if self._box is not None:
             self._box.stop()
@@ -431,27 +434,28 @@ class Errand:
 
 
 class SandboxPool:
-    """Sandboxes of one store, which answer several questions at a time; one more stands ready.
+    """Pool of sandboxes of one store for parallel queries, with a spare one.
 
-    A question that is stopped, or takes too long, loses its process; the spare one takes its place, and a new
-    spare one is started beside. To be used with ``with``, or closed.
+    A query that is stopped, or takes too long, loses its process. The spare process takes its
+    place, and a new spare one is started in the background. A context manager; otherwise call
+    :meth:`close`.
 
     Parameters
     ----------
     store : str or Path
     size : int
-        How many questions are answered at a time; the others wait.
+        Number of parallel queries; further ones wait.
     small : collection of str
-        What is asked (``ask`` of a question) that waits for none of the others: the spare one answers it.
+        Kinds of short queries (``ask`` of a query) that never wait: the spare sandbox runs them.
     first : mapping, optional
-        A question that each process is asked before it stands ready, so that it knows what others will need.
+        Warm-up query of each new process.
     **limits
-        As :class:`Sandbox` takes them.
+        As in :class:`Sandbox`.
 
     Raises
     ------
     StoreError
-        As :class:`Sandbox`.
+        As in :class:`Sandbox`.
     """
 
     def __init__(
@@ -485,7 +489,7 @@ class SandboxPool:
         self.close()
 
     def close(self) -> None:
-        """End all processes; what is asked is stopped."""
+        """Stop all processes and running queries."""
         with self._changed:
             self._closed = True
             boxes = [*self._free, *(box for box in self._asked.values() if box is not None)]
@@ -498,13 +502,13 @@ class SandboxPool:
             box.close()
 
     def ask(self, question: Mapping[str, object], key: str) -> Iterator[dict[str, Any]]:
-        """Replies to a question, as :meth:`Sandbox.replies` gives them.
+        """Yield the replies to a query, as :meth:`Sandbox.replies`.
 
         Parameters
         ----------
         question : mapping
         key : str
-            What :meth:`cancel` calls it; no other that is under way has it.
+            Key for :meth:`cancel`, unique among running queries.
         """
         with self._changed:
             if key in self._asked:
@@ -522,7 +526,7 @@ class SandboxPool:
                 self._asked.pop(key, None)
 
     def cancel(self, key: str) -> bool:
-        """Stop a question; false if there is none of that key under way."""
+        """Stop a query; return False if no running query has this key."""
         with self._changed:
             box = self._asked.pop(key, None)
             known = box is not None or key in self._asked
@@ -547,7 +551,7 @@ class SandboxPool:
         again.start()
 
     def _more(self) -> None:
-        with suppress(SgstoreError):  # the first one was made, so that this is of passing nature
+        with suppress(SgstoreError):  # the first one started, so this fault is temporary
             self._ready(self._make())
 
     def _again(self, box: Sandbox) -> None:
@@ -556,7 +560,7 @@ class SandboxPool:
         self._ready(box)
 
     def _ready(self, box: Sandbox) -> None:
-        """Put a process to the others that has just begun."""
+        """Add a newly started process to the pool."""
         with suppress(SgstoreError):
             if self._first is not None:
                 box.ask(self._first)
@@ -576,13 +580,12 @@ class SandboxPool:
 
 
 def serve(answering: Answering) -> None:
-    """Answer the questions that come on stdin, until it ends, and end the process.
+    """Answer the queries on stdin until it ends, then exit the process.
 
     Parameters
     ----------
     answering : callable
-        Gives the reply to a question: what JSON can hold. Whatever of sgstore's errors it raises is told to who
-        asked.
+        Function from a query to its reply (JSON values). Errors of sgstore are sent to the caller.
     """
     with suppress(KeyboardInterrupt, BrokenPipeError):
         _serve(answering)
@@ -602,7 +605,7 @@ def _serve(answering: Answering) -> None:
     try:
         tables = UserTables(settings["tables"])
         _limit(settings["memory"], files=None if free else 0)
-        os.chdir(path.parent)  # so that the database knows no more of where it is than its name
+        os.chdir(path.parent)  # so that the database knows only the file name
         store = Store(path.name, memory=settings["memory"], tables=tables)
     except OSError as error:
         _send(replies, _refusal(StoreError(f"{path}: {error.strerror}")))
@@ -622,12 +625,12 @@ def _serve(answering: Answering) -> None:
 
 
 def tell(reply: Mapping[str, Any]) -> None:
-    """Send a reply, before the others, while an answer is on its way: in the process that answers."""
+    """Send a partial reply from the sandbox process."""
     _send(sys.stdout.buffer, {**reply, "more": True})
 
 
 def rows_found(store: Store, question: dict[str, Any], most: int) -> dict[str, Any]:
-    """Rows of a statement, ``sql``, or of a pattern, ``find`` with its ``parameters``."""
+    """Return rows of a statement ``sql``, or of a pattern ``find`` with ``parameters``."""
     graphs, notes = False, ()
     if "sql" in question:
         rows = store.sql(question["sql"], max_rows=most)
@@ -645,7 +648,7 @@ def rows_found(store: Store, question: dict[str, Any], most: int) -> dict[str, A
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON can hold it."""
+    """Convert a value to JSON values."""
     if isinstance(value, (list, tuple)):
         return [plain(item) for item in value]  # pyright: ignore[reportUnknownVariableType]
     if isinstance(value, dict):
@@ -662,7 +665,7 @@ def _refusal(error: SgstoreError) -> dict[str, Any]:
 
 
 def _spilled(error: SgstoreError) -> bool:
-    """Return whether an error is due to temporary files: :func:`_limit` lets the database write none."""
+    """True if an error comes from temporary files, which :func:`_limit` forbids."""
     text = str(error)
     return os.strerror(errno.EFBIG) in text and "duckdb_temp" in text
 
@@ -673,13 +676,15 @@ def _send(to: IO[bytes], reply: object) -> None:
 
 
 def _limit(memory: int, *, files: int | None) -> None:
-    """Limit the resources of this process, where the system can; the limits cannot be widened again.
+    """Limit the resources of this process permanently, if the system supports it.
 
-    ``files``: the largest file that it may write; bytes. ``None``: any.
+    ``files``: largest file that it may write; bytes. ``None`` means no limit.
     """
     try:
         import resource
-    except ImportError:  # not on Windows: there the database's own limits and the deadline hold
+    except (
+        ImportError
+    ):  # not on Windows: there only the database's own limits and the deadline apply
         return
     for limit, most in (
         (resource.RLIMIT_AS, _ADDRESS_SPACE + 2 * memory),
