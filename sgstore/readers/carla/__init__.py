@@ -1,4 +1,4 @@
-"""sgstore.readers.carla."""
+"""Reader of CARLA recordings, and access to a running CARLA simulator."""
 
 import lazy_loader
 

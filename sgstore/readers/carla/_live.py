@@ -1,4 +1,4 @@
-"""A live CARLA: frames of a ``carla.World``, and its sensors, in our axes, for the online mode and recording.
+"""Access to a running CARLA: frames of a ``carla.World`` and its sensors, in the axes of sgstore.
 
 ::
 
@@ -8,12 +8,12 @@
         live.world.wait_for_tick()      # or live.world.tick(), if this client owns the clock
         graph = generator.step(live.frame())
 
-CARLA's axes are left-handed (y to the right, yaw clockwise, angles in degrees): y and yaw change their
-signs, and so does all that turns with them. An actor's own place is its origin, on the ground under a vehicle;
-ours is the centre of its box. Poses and velocities come from one snapshot of the world, so that they belong to
-one instant and cost no round trip for each actor; what an actor is, is asked once.
+CARLA's axes are left-handed (y to the right, yaw clockwise, angles in degrees). y, yaw and all dependent values
+therefore change their signs. The position of an actor is its origin, which is on the ground below a vehicle; in
+sgstore, it is the centre of the box. Poses and velocities come from one snapshot of the world. They belong to
+one instant and need no request per actor. Constant properties of an actor are requested once.
 
-Not run against a server: exercised with the wheel's own types and a world that stands in for one.
+Not tested with a server: the tests use the types of the ``carla`` wheel and a simulated world.
 
 Source: CARLA 0.9.16, Python API reference; LibCarla ``geom/Rotation.h`` and ``geom/Transform.h`` for the order
 of rotations; ros-bridge for the signs.
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 ENTITIES: Final = ("vehicle.", "walker.", "traffic.", "static.")
-"""How the types of actors begin that are entities; others are sensors, controllers and the spectator."""
+"""Prefixes of actor types that are entities. Others are sensors, controllers and the spectator."""
 
 SCENERY: Final[Mapping[str, tuple[str, str]]] = {
     "Buildings": ("building", ""),
@@ -72,11 +72,11 @@ SCENERY: Final[Mapping[str, tuple[str, str]]] = {
     "Bicycle": ("bicycle", ""),
     "Pedestrians": ("person", ""),
 }
-"""``CityObjectLabel`` of an environment object → kind and subkind. What is not named is ground, sky, water and
-marks upon the road, or a traffic light, which is an actor too."""
+"""``CityObjectLabel`` of an environment object → kind and subkind. Missing labels are ground, sky, water and
+road markings, or traffic lights, which are also actors."""
 
 MOVING: Final = (*VEHICLES, "person", "animal")
-"""Kinds that move, if only they wanted to: a parked car of the level has a state in every frame."""
+"""Kinds that can move. A parked car of the level therefore has a state in every frame."""
 
 LIGHTS: Final = (
     (0x20, "light_left"),
@@ -91,13 +91,13 @@ LIGHTS: Final = (
     (0x200, "light_special1"),
     (0x400, "light_special2"),
 )
-"""Bits of ``VehicleLightState`` → lights of a vehicle."""
+"""Bit of ``VehicleLightState`` → light of a vehicle."""
 
 SAME_PLACE: Final = 1.0
-"""How far a sign may stand from the signal of the map that it is; m."""
+"""Maximum distance of a sign from its signal in the map; m."""
 
 TIMEOUT_S: Final = 10.0
-"""How long to wait for a server."""
+"""Time limit for the answer of a server; s."""
 
 TRAFFIC_LIGHT: Final = "traffic.traffic_light"
 
@@ -107,14 +107,14 @@ _NO_BOX: Final = (0.0, 0.0, 0.0, _NAN, _NAN, _NAN, 0.0)
 
 
 def connect(host: str = "localhost", port: int = 2000, timeout_s: float = TIMEOUT_S) -> Any:
-    """A ``carla.Client`` that is connected to a server.
+    """Return a ``carla.Client`` with a connection to a server.
 
     Raises
     ------
     MissingExtraError
         The package ``carla`` is not installed.
     TraceError
-        No server answers there, or it is not of the client's version.
+        The server does not answer, or has another version than the client.
     """
     try:
         import carla
@@ -124,7 +124,7 @@ def connect(host: str = "localhost", port: int = 2000, timeout_s: float = TIMEOU
         client = carla.Client(host, port)
         client.set_timeout(timeout_s)
         server, own = str(client.get_server_version()), str(client.get_client_version())
-    except RuntimeError as error:  # what the client raises, whatever went wrong
+    except RuntimeError as error:  # The client raises this for any fault.
         raise TraceError(f"no CARLA server answers at {host}:{port}: {error}") from error
     if server.split(".")[:2] != own.split(".")[:2]:
         reason = (
@@ -136,18 +136,18 @@ def connect(host: str = "localhost", port: int = 2000, timeout_s: float = TIMEOU
 
 @dataclass(frozen=True, slots=True)
 class _Actor:
-    """Properties of an actor that do not change.
+    """Constant properties of an actor.
 
     Attributes
     ----------
     handle : carla.Actor
-        For what no snapshot tells: what a light shows, the inputs of the ego.
+        For values missing in snapshots: light states, control inputs.
     type_name, role : str
     meaning : TypeMeaning
     box : tuple of float
-        Its box in its own axes, as CARLA has them: centre, half extents, yaw; NaN where it has none.
+        Its box in its own CARLA axes: centre, half extents, yaw; NaN without a box.
     map_ref : str
-        Signal of the map that it is.
+        Its signal in the map.
     """
 
     handle: Any
@@ -159,7 +159,7 @@ class _Actor:
 
 
 class LiveWorld:
-    """A world of CARLA, read frame by frame.
+    """World of a running CARLA, read frame by frame.
 
     Parameters
     ----------
@@ -167,13 +167,13 @@ class LiveWorld:
     ego : str
         Id or role name of the ego; empty: a vehicle with the role ``hero`` or ``ego_vehicle``.
     scenery : bool
-        Whether buildings, poles, vegetation and parked vehicles of the level are entities, too.
+        True: buildings, poles, vegetation and parked vehicles of the level become entities, too.
 
     Attributes
     ----------
     world : carla.World
     map_text, map_name : str
-        The road map as OpenDRIVE, and what the simulator calls it.
+        The road map as OpenDRIVE, and its name in the simulator.
 
     Raises
     ------
@@ -197,47 +197,47 @@ class LiveWorld:
 
     @cached_property
     def road_map(self) -> RoadMap:
-        """The road map; read when it is first asked for.
+        """Road map of the world, parsed at the first use.
 
         Raises
         ------
         MapError
-            It is no OpenDRIVE map.
+            The text is not an OpenDRIVE map.
         """
         return read_map(self.map_text, self.map_name)
 
     @property
     def warnings(self) -> list[str]:
-        """Oddities up to now: traffic lights that cannot be what they were taken for."""
+        """Warnings so far: traffic lights that are assigned to wrong signals."""
         if self._at_once is None:
             return []
         return [*shared_signals(self._heads, self.road_map), *self._at_once.warnings]
 
     def frame(self, snapshot: Any = None) -> Frame:
-        """Frame of the world as it is now.
+        """Return the current frame of the world.
 
         Parameters
         ----------
         snapshot : carla.WorldSnapshot, optional
-            As ``wait_for_tick`` and ``on_tick`` give it; by default the latest one.
+            Result of ``wait_for_tick`` or ``on_tick``. Default: the latest snapshot.
 
         Returns
         -------
         Frame
-            Actors and vehicles of the level; the first frame has the scenery, too.
+            Actors and vehicles of the level. The first frame also contains the scenery.
 
         Raises
         ------
         TraceError
-            The server does not answer any more.
+            The server no longer answers.
         """
         try:
             return self._frame(self.world.get_snapshot() if snapshot is None else snapshot)
-        except RuntimeError as error:  # what the client raises, whatever went wrong
+        except RuntimeError as error:  # The client raises this for any fault.
             raise TraceError(f"the CARLA server does not answer: {error}") from error
 
     def find_ego(self) -> Any:
-        """The ego as a ``carla.Vehicle``, without making a frame; ``None`` if there is none."""
+        """Return the ego as a ``carla.Vehicle`` without a new frame, or ``None``."""
         try:
             here = self._here({state.id for state in self.world.get_snapshot()})
         except RuntimeError as error:
@@ -246,7 +246,7 @@ class LiveWorld:
         return None if ego is None else here[ego].handle
 
     def _here(self, present: set[int]) -> dict[int, _Actor]:
-        """The actors that are entities."""
+        """Return the present actors that are entities."""
         self._look(present)
         return {i: a for i in sorted(present) if (a := self._actors[i]) is not None}
 
@@ -265,7 +265,7 @@ class LiveWorld:
         return frame
 
     def _look(self, present: set[int]) -> None:
-        """Ask about the actors that are new, and forget those that are gone."""
+        """Request the properties of new actors, and drop removed actors."""
         for ident in self._actors.keys() - present:
             del self._actors[ident]
             self._heads.pop(ident, None)
@@ -276,7 +276,7 @@ class LiveWorld:
         signals = self._signals(told)
         for ident in present - self._actors.keys():
             handle = told.get(ident)
-            # One that is in the snapshot but not in the list is on its way out.
+            # An actor in the snapshot but not in the list is being removed.
             self._actors[ident] = (
                 None if handle is None else _described(handle, signals.get(ident, ""))
             )
@@ -291,11 +291,10 @@ class LiveWorld:
         return None
 
     def _signals(self, actors: Mapping[int, Any]) -> dict[int, str]:
-        """Ids of the signals of the map that lights and signs are.
+        """Return the ids of the map signals for lights and signs.
 
-        A light knows its own. One that does not is found as in a recording
-        (:mod:`sgstore.readers.carla._signals`), by the lanes of its stop waypoints where its place does not
-        tell.
+        A light may know its signal. Otherwise, it is matched as in a recording
+        (:mod:`sgstore.readers.carla._signals`), by position or by the lanes of its stop waypoints.
         """
         found: dict[int, str] = {}
         lights: dict[int, Light] = {}
@@ -309,12 +308,12 @@ class LiveWorld:
                 self._heads[ident] = told
             else:
                 lights[ident] = _light(actor)
-        # Those that were met before keep what they are, and no other light is that.
+        # Known lights keep their signals, which are not assigned to other lights.
         self._heads = signals_of(lights, self.road_map, self._heads) if lights else self._heads
         return found | self._heads
 
     def _watch(self, here: Mapping[int, _Actor]) -> None:
-        """Take note of what the lights show."""
+        """Check the states of the lights for contradictions."""
         heads = [ident for ident, actor in here.items() if actor.type_name == TRAFFIC_LIGHT]
         if not heads:
             return
@@ -335,7 +334,7 @@ class LiveWorld:
         return np.flatnonzero(np.isin(self.road_map.nodes.kind, codes))
 
     def _sign_at(self, x: float, y: float) -> str:
-        """The sign of the map that stands at a place; empty if none does."""
+        """Return the name of the map's sign at a position; empty without one."""
         nodes, rows = self.road_map.nodes, self._sign_rows
         if not len(rows):
             return ""
@@ -344,7 +343,7 @@ class LiveWorld:
         return nodes.name[rows[nearest]] if apart[nearest] <= SAME_PLACE else ""
 
     def _add_scenery(self, frame: Frame) -> None:
-        """The objects of the level: those that stand, once; vehicles and people that are part of it, always."""
+        """Add the objects of the level: static ones once, vehicles and people in every frame."""
         for ident, kind, place, more in self._level:
             moves = kind in MOVING
             if moves or not self._told:
@@ -353,7 +352,7 @@ class LiveWorld:
 
     @cached_property
     def _level(self) -> list[tuple[str, str, tuple[float, float, float], dict[str, Any]]]:
-        """Id, kind, place and what else there is of the objects of the level; boxes are in the world's axes."""
+        """Return id, kind, position and other properties of the level's objects. Boxes are in world axes."""
         found: list[tuple[str, str, tuple[float, float, float], dict[str, Any]]] = []
         for thing in self.world.get_environment_objects():
             label = str(thing.type)
@@ -379,7 +378,7 @@ class LiveWorld:
 
 
 def _described(handle: Any, map_ref: str) -> _Actor:
-    """Ask an actor for its properties that do not change."""
+    """Request the constant properties of an actor."""
     type_name = str(handle.type_id)
     return _Actor(
         handle=handle,
@@ -392,7 +391,7 @@ def _described(handle: Any, map_ref: str) -> _Actor:
 
 
 def _box(box: Any) -> tuple[float, ...]:
-    """Centre, half extents and yaw of an actor's box; a light has none, and one of no size at all is none."""
+    """Return centre, half extents and yaw of an actor's box. A light or a box of size 0 gives NaN."""
     if box is None or not (box.extent.x or box.extent.y or box.extent.z):
         return _NO_BOX
     place, half = box.location, box.extent
@@ -405,7 +404,7 @@ def _add_actor(
     transform, turn = state.get_transform(), state.get_transform().rotation
     is_light = actor.type_name == TRAFFIC_LIGHT
     static = not is_light and actor.type_name.startswith(("traffic.", "static."))
-    # The box of a light is the volume that triggers it, on the road: a light stands where its mast stands.
+    # The box of a light is its trigger volume on the road. The position of a light is that of its mast.
     x, y, z, length, width, height, yaw = _NO_BOX if is_light else actor.box
     frame.add(
         *(ident, actor.meaning.kind, *in_world((x, y, z), transform)),
@@ -428,7 +427,7 @@ def _add_actor(
 
 
 def _motion(state: Any) -> dict[str, Any]:
-    """Velocity, acceleration and yaw rate of an actor."""
+    """Return velocity, acceleration and yaw rate of an actor."""
     velocity, acceleration = state.get_velocity(), state.get_acceleration()
     return {
         "vx": velocity.x,
@@ -442,7 +441,7 @@ def _motion(state: Any) -> dict[str, Any]:
 
 
 def in_world(point: tuple[float, float, float], transform: Any) -> tuple[float, float, float]:
-    """A point in the axes of a ``carla.Transform`` as one of the map, in our axes; m."""
+    """Convert a point from the axes of a ``carla.Transform`` into map axes; m."""
     x, y, z = point
     turn, place = transform.rotation, transform.location
     sin_p, cos_p = math.sin(math.radians(turn.pitch)), math.cos(math.radians(turn.pitch))
@@ -465,7 +464,7 @@ def in_world(point: tuple[float, float, float], transform: Any) -> tuple[float, 
 
 
 def _controls(actor: _Actor) -> dict[str, Any]:
-    """Inputs of a vehicle; CARLA steers to the right."""
+    """Return the control inputs of a vehicle. The sign of the steering is inverted."""
     if not actor.type_name.startswith("vehicle."):
         return {}
     control = actor.handle.get_control()
@@ -483,7 +482,7 @@ def _shown(light: Any) -> str:
 
 
 def _light(actor: Any) -> Light:
-    """A light as the search for its signal wants it: where it stands, and each place where it stops traffic."""
+    """Return the pose of a traffic light and its stop positions, for the search of its signal."""
     transform = actor.get_transform()
     place, heading = transform.location, math.radians(-transform.rotation.yaw)
     stops: list[tuple[float, ...]] = []
@@ -494,17 +493,16 @@ def _light(actor: Any) -> Light:
     return Light(place.x, -place.y, place.z, heading, tuple(stops))
 
 
-# Sensors, attached to the ego, and what they measure, in our axes ----------------------------------
-# What a sensor measures comes from threads of the client's own, so it goes into a queue of a bounded length.
-# If that is full the sensor waits, and with it the stream from the server; what cannot wait is dropped and
-# counted.
+# Sensors on the ego, and their measurements in the axes of sgstore. Measurements arrive on client threads and
+# go into a queue of limited length. If the queue is full, the sensor and the stream from the server wait. After
+# a time limit, a measurement is dropped and counted.
 #
 # Source: CARLA 0.9.16, Python API reference, "Sensors reference".
 
 QUEUE: Final = 128
-"""Measurements that may wait to be written."""
+"""Maximum number of queued measurements."""
 PATIENCE_S: Final = 5.0
-"""How long a measurement waits for room in the queue; s."""
+"""Maximum time that a measurement waits for space in the queue; s."""
 MAX_CONFIG_BYTES: Final = 1 << 20
 
 LIDAR: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
@@ -527,7 +525,7 @@ _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 
 @dataclass(frozen=True, slots=True)
 class SensorPicture:
-    """Picture of a camera: (height, width, 3) uint8, red green blue; ``fov``: across, degrees."""
+    """Camera picture: (height, width, 3) uint8, RGB. ``fov`` is the horizontal field of view; degrees."""
 
     pixels: np.ndarray[Any, np.dtype[np.uint8]]
     fov: float
@@ -535,14 +533,14 @@ class SensorPicture:
 
 @dataclass(frozen=True, slots=True)
 class SensorCloud:
-    """Points: rows of :data:`LIDAR`, :data:`SEMANTIC_LIDAR` or :data:`RADAR`."""
+    """Point cloud: rows of :data:`LIDAR`, :data:`SEMANTIC_LIDAR` or :data:`RADAR`."""
 
     points: np.ndarray[Any, np.dtype[Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class SensorReading:
-    """One measurement.
+    """Measurement of a sensor.
 
     Attributes
     ----------
@@ -551,7 +549,7 @@ class SensorReading:
     time_ns : int
         Simulation time; ns.
     data : SensorPicture, SensorCloud or dict
-        A dictionary: numbers and texts by name, for whatever is neither picture nor points.
+        A dictionary contains numbers and texts by name, for sensors without pictures or points.
     """
 
     sensor: str
@@ -561,17 +559,17 @@ class SensorReading:
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """A sensor to be attached to the ego.
+    """Configuration of a sensor on the ego.
 
     Attributes
     ----------
     name : str
-        What its channel is called after.
+        Name of its channel.
     type : str
         Blueprint: ``sensor.camera.rgb``, ``sensor.lidar.ray_cast``, …
     x, y, z, roll, pitch, yaw : float
-        Where it sits in the ego's axes, which are ours: x ahead, y to the left, z up, yaw counter-clockwise;
-        from the ego's origin, on the ground; m, degrees.
+        Pose in the ego's axes as in sgstore: x ahead, y to the left, z up, yaw counter-clockwise; from the
+        ego's origin, on the ground; m, degrees.
     attributes : dict
         Attributes of the blueprint: ``image_size_x``, ``fov``, ``sensor_tick`` (seconds between
         measurements), …
@@ -589,12 +587,12 @@ class Sensor:
 
 
 def load_sensors(path: Path) -> list[Sensor]:
-    """The sensors that a TOML file lists, each in a table ``[[sensor]]``.
+    """Return the sensors of a TOML file, each in a table ``[[sensor]]``.
 
     Raises
     ------
     ConfigError
-        The file cannot be read, is not TOML, or lists something that is no sensor.
+        The file cannot be read, is not TOML, or contains an invalid sensor.
     """
     try:
         if path.stat().st_size > MAX_CONFIG_BYTES:
@@ -642,7 +640,7 @@ def _sensor(where: str, table: Any) -> Sensor:
 
 
 class Sensors:
-    """Sensors that are attached to an ego, until they are closed.
+    """Sensors attached to an ego until they are closed.
 
     Parameters
     ----------
@@ -653,14 +651,14 @@ class Sensors:
     Attributes
     ----------
     dropped : int
-        Measurements that were lost: there was no room in time, or they are not what was expected.
+        Number of lost measurements: the queue was full, or the data were invalid.
     reason : str
-        Why the last one was not what was expected; empty if all were.
+        Fault of the last invalid measurement; empty without one.
 
     Raises
     ------
     TraceError
-        There is no ego, the world has no such blueprint or attribute, or no room for a sensor.
+        The ego does not exist, the world lacks the blueprint or attribute, or a sensor cannot be placed.
     """
 
     def __init__(self, world: Any, ego: Any, sensors: list[Sensor]) -> None:
@@ -686,19 +684,19 @@ class Sensors:
         self.close()
 
     def close(self) -> None:
-        """Stop the sensors and take them out of the world."""
+        """Stop the sensors and remove them from the world."""
         for actor in self._actors:
             actor.stop()
             actor.destroy()
         self._actors.clear()
 
     def waiting(self, timeout_s: float = 0.0) -> Iterator[SensorReading]:
-        """Take the readings that have been measured and not been taken yet.
+        """Yield the measurements since the last call.
 
         Parameters
         ----------
         timeout_s : float
-            How long to wait for the first; s.
+            Maximum time to wait for the first one; s.
         """
         try:
             yield self._queue.get(timeout=timeout_s) if timeout_s else self._queue.get_nowait()
@@ -718,7 +716,7 @@ class Sensors:
                         f"sensor {sensor.name!r}: {sensor.type} has no attribute {name!r}"
                     )
                 blueprint.set_attribute(name, value)
-            # The other hand: y, and what turns about x's neighbours.
+            # Conversion between left-handed and right-handed axes.
             place = carla.Location(sensor.x, -sensor.y, sensor.z)
             turn = carla.Rotation(pitch=-sensor.pitch, yaw=-sensor.yaw, roll=sensor.roll)
             pose = carla.Transform(place, turn)
@@ -729,7 +727,7 @@ class Sensors:
         actor.listen(partial(self._take, sensor.name))
 
     def _take(self, name: str, data: Any) -> None:
-        """Called by threads of the client's: what is raised here is seen by nobody."""
+        """CARLA callback. It runs on a client thread, which swallows exceptions."""
         try:
             self._queue.put(reading_of(name, data), timeout=PATIENCE_S)
         except queue.Full:
@@ -740,7 +738,7 @@ class Sensors:
 
 
 def reading_of(name: str, data: Any) -> SensorReading:
-    """Reading of a ``carla.SensorData`` of any kind."""
+    """Convert a ``carla.SensorData`` of any type into a measurement."""
     time_ns = round(data.timestamp * 1e9)
     kind = type(data).__name__
     if hasattr(data, "fov") and hasattr(data, "raw_data"):
@@ -759,7 +757,7 @@ def reading_of(name: str, data: Any) -> SensorReading:
 
 
 def _radar(data: Any) -> np.ndarray[Any, np.dtype[Any]]:
-    """Detections, which are velocity, altitude, azimuth (clockwise; rad) and depth, as points."""
+    """Convert radar detections (velocity, altitude, clockwise azimuth, depth; rad, m) into points."""
     told = np.frombuffer(data.raw_data, "<f4").reshape(-1, 4).astype(np.float64)
     velocity, altitude, azimuth, depth = told.T
     points = np.zeros(len(told), RADAR)
@@ -771,7 +769,7 @@ def _radar(data: Any) -> np.ndarray[Any, np.dtype[Any]]:
 
 
 def _values(data: Any) -> dict[str, Any]:
-    """Public values, by name, of the data of an inertial unit, a receiver of satellites, or an event."""
+    """Return the public values of an IMU, GNSS or event measurement by name."""
     found: dict[str, Any] = {"type": type(data).__name__}
     for name in dir(data):
         if name.startswith("_") or name in {"transform", "frame_number", "raw_data", "timestamp"}:
@@ -789,7 +787,7 @@ def _values(data: Any) -> dict[str, Any]:
 
 
 def _vector(name: str, value: Any) -> dict[str, float]:
-    """A vector in our axes; turning about x and z changes its sign, a push along y does."""
+    """Convert a vector into the axes of sgstore. Rotations change sign in x and z, translations in y."""
     if "gyroscope" in name:
         return {"x": 0.0 - value.x, "y": value.y, "z": 0.0 - value.z}
     return {"x": value.x, "y": 0.0 - value.y, "z": value.z}

@@ -1,20 +1,18 @@
-"""CARLA's traffic lights, and their signals in the road map.
+"""Assignment of CARLA's traffic lights to the signals of the road map.
 
-Which signal of the road map each traffic light of CARLA is.
+A light has at most one signal, and a signal at most one light. The steps are:
 
-A light is at most one signal, and a signal at most one light. In turn
+1. *by position*: CARLA places a light :data:`FORWARD` in front of its map position, in the signal's own axes.
+   If all lights of a world have another common offset, it is learned: the median over lights and signals
+   without other candidates. The offset with the most matches is used first;
+2. *by remaining signals*: a light within :data:`SAME_PLACE` of a free signal;
+3. *by sideways offset*: CARLA moves lights on the road sideways until they are beside it;
+4. *by lanes*: the signal of the lanes in the light's trigger boxes, or of their successors.
 
-1. *by place*: CARLA puts a light :data:`FORWARD` in front of the place that the map gives, in the signal's own
-   axes. Where the lights of a world stand elsewhere, but all alike, the offset is learnt: the median of those
-   lights and signals that have nothing else near them. The offset that most lights agree with goes first;
-2. *by what is left*: a light that stands within :data:`SAME_PLACE` of a signal that nobody has;
-3. *aside*: CARLA moves what would stand on the road sideways until it does not;
-4. *by lanes*: the signal that applies to the lanes of what triggers the light, or to those that they lead to.
+The sum of squared distances over all lights is minimised. A common shift adds the same amount to every
+assignment, so twin lights a few centimetres apart keep their order for any shift.
 
-Distances are squared and summed over all lights at once. A common shift adds the same to every way of giving
-lights to signals, so twins a few centimetres apart keep their order, however far off both of them stand.
-
-Source: LibCarla ``road/MapBuilder.cpp`` (0.25 m forward, then aside by steps of a fifth of the lane's width,
+Source: LibCarla ``road/MapBuilder.cpp`` (0.25 m forward, then sideways by steps of a fifth of the lane's width,
 ten at most), CarlaUE4 ``Traffic/TrafficLightManager.cpp`` (actors are turned by 90° against their signals).
 """
 
@@ -46,45 +44,45 @@ if TYPE_CHECKING:
 
 
 FORWARD: Final = 0.25
-"""How far in front of a signal of the map CARLA puts its light; m."""
+"""Distance of a CARLA light in front of its map signal; m."""
 SAME_SPOT: Final = 0.1
-"""How far from there it may stand; m."""
+"""Tolerance of this position; m."""
 SAME_PLACE: Final = 1.0
-"""How far a light may stand from a signal that no other light is; m."""
+"""Maximum distance of a light from a free signal; m."""
 ASIDE: Final = 10.0
-"""How far CARLA moves a light sideways at most: ten times a fifth of a lane 5 m wide; m."""
+"""Maximum sideways offset of a light in CARLA: ten times a fifth of a lane of 5 m; m."""
 SAME_WAY: Final = math.pi / 4
-"""By how much a light may face another way; rad."""
+"""Maximum difference of the headings of a light and its signal; rad."""
 TURNS: Final = (0.0, -math.pi / 2)
-"""How a light may be turned against its signal: as landmarks are, or as CARLA's actors are; rad."""
+"""Possible rotations of a light relative to its signal: of landmarks, and of CARLA actors; rad."""
 LEARNT_FROM: Final = 3
-"""Lights from which an offset is learnt, at the least."""
+"""Minimum number of lights for a learned offset."""
 LEARNT_WITHIN: Final = 5.0
-"""How far from their signals these may stand; m."""
+"""Maximum distance of these lights from their signals; m."""
 
 MOST_NAMED: Final = 5
-"""Lights or lanes that a warning names."""
+"""Maximum number of lights or lanes in a warning."""
 
 _MOST_TOGETHER: Final = 300
-"""Lights that are given to signals by the least sum; more of them in one heap take the nearest in turn."""
+"""Maximum number of lights per group for the optimal assignment. Larger groups use the nearest signals."""
 _AT_ONCE: Final = 1 << 20
-"""Lights times signals that are looked at in one go."""
+"""Maximum product of lights and signals processed at once."""
 _OF_HEIGHT: Final = 1e-3
-"""What a difference of height counts beside one in the plane: it decides between what is in one place."""
+"""Weight of a height difference against one in the plane, to separate signals at one position."""
 _DRIVING: Final = "driving"
 _RED, _GREEN = LIGHT_STATE_CODE["red"], LIGHT_STATE_CODE["green"]
 
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """A traffic light.
+    """Traffic light with its pose and trigger boxes.
 
     Attributes
     ----------
     x, y, z, heading : float
-        Where it stands and faces; NaN: not known.
+        Pose; NaN means unknown.
     boxes : tuple of tuple of float
-        What triggers it, each with its centre ``x, y, z``, heading, length, width; as far as known.
+        Known trigger boxes, each with its centre ``x, y, z``, heading, length, width.
     """
 
     x: float
@@ -97,7 +95,7 @@ class Light:
 def signals_of(
     lights: Mapping[int, Light], road_map: RoadMap, told: Mapping[int, str] | None = None
 ) -> dict[int, str]:
-    """Id of the signal of a road map that each light is, or else the lanes that it applies to by name.
+    """Return the map signal of each light by light id. Without a signal, return names of its lanes.
 
     Parameters
     ----------
@@ -105,12 +103,12 @@ def signals_of(
         Lights by id, in any order.
     road_map : RoadMap
     told : mapping, optional
-        Lights of which the signal is known; no other light is one of these signals.
+        Known signals of lights, which are not assigned to other lights.
 
     Returns
     -------
     dict
-        Those that were told, and the others but for those that are no signal and whose boxes are on no lane.
+        The known signals and the new ones. A light without a signal and without a lane in its boxes is absent.
     """
     found = dict(told or {})
     nodes = road_map.nodes
@@ -128,11 +126,8 @@ def signals_of(
     return found | _by_boxes(others, road_map, left.tolist())
 
 
-# By place -----------------------------------------------------------------------------------------
-
-
 class _Rule(NamedTuple):
-    """Pose of lights relative to their signals: turn, and offset ahead and to the left in the signal's axes."""
+    """Usual pose of lights relative to their signals: rotation, and offset ahead and left in signal axes."""
 
     turn: float
     ahead: float
@@ -140,9 +135,9 @@ class _Rule(NamedTuple):
 
 
 class _Near(NamedTuple):
-    """Lights and signals that may be one another: rows of both, and how far apart they are.
+    """Candidate pairs of lights and signals: the rows of both, and their distances.
 
-    ``ahead``, ``left``: in the signal's axes, less what the rule takes off; ``up``: less the usual height; m.
+    ``ahead``, ``left``: in the signal's axes, minus the offset of the rule; ``up``: minus the usual height; m.
     """
 
     light: Rows
@@ -160,7 +155,7 @@ class _Near(NamedTuple):
 
 
 def _matched(lights: Floats, signals: Floats) -> dict[int, int]:
-    """Row of the signal that each light is by where it stands; rows are ``x, y, z, heading``."""
+    """Return the signal row for each light row, by position. Columns: ``x, y, z, heading``."""
     found: dict[int, int] = {}
     best = _Rule(TURNS[0], FORWARD, 0.0)
     first = True
@@ -170,7 +165,7 @@ def _matched(lights: Floats, signals: Floats) -> dict[int, int]:
         ranked = [
             (_assigned(_near(lights, signals, rule, SAME_SPOT, found)), rule) for rule in rules
         ]
-        matches, rule = max(ranked, key=lambda one: len(one[0]))  # of equals the first
+        matches, rule = max(ranked, key=lambda one: len(one[0]))  # Of equal ones, the first.
         if not matches:
             break
         best, first = (rule if first else best), False
@@ -187,7 +182,7 @@ def _matched(lights: Floats, signals: Floats) -> dict[int, int]:
 def _near(
     lights: Floats, signals: Floats, rule: _Rule, reach: float, found: Mapping[int, int]
 ) -> _Near:
-    """The lights and signals that are still free, face one another's way and are so near each other."""
+    """Return the candidate pairs of free lights and signals with similar heading within a distance."""
     light = np.setdiff1d(np.arange(len(lights)), list(found))
     signal = np.setdiff1d(np.arange(len(signals)), list(found.values()))
     rows, columns = [light[:0]], [signal[:0]]
@@ -205,13 +200,15 @@ def _near(
     ahead, left = dx * cos + dy * sin - rule.ahead, dy * cos - dx * sin - rule.left
     away = np.abs(np.arctan2(np.sin(turn - rule.turn), np.cos(turn - rule.turn))) > SAME_WAY
     near = _Near(one, other, ahead, left, np.nan_to_num(dz))
-    near = near.take((np.hypot(ahead, left) <= reach) & ~away)  # what faces nowhere faces any way
+    near = near.take(
+        (np.hypot(ahead, left) <= reach) & ~away
+    )  # A light without a heading matches any heading.
     usual = float(np.median(near.up)) if len(near.up) else 0.0
     return near._replace(up=near.up - usual)
 
 
 def _learnt(lights: Floats, signals: Floats, turn: float, found: Mapping[int, int]) -> _Rule | None:
-    """The offset that most of those have that have nothing else near them; ``None`` if they do not agree."""
+    """Return the common offset of lights with a single candidate. ``None`` if they disagree."""
     near = _near(lights, signals, _Rule(turn, 0.0, 0.0), LEARNT_WITHIN, found)
     sure = near.take(_only(near.light) & _only(near.signal))
     if len(sure.light) < LEARNT_FROM:
@@ -222,18 +219,18 @@ def _learnt(lights: Floats, signals: Floats, turn: float, found: Mapping[int, in
 
 
 def _alone(near: _Near) -> dict[int, int]:
-    """Those of which neither may be any other."""
+    """Return the pairs in which both light and signal have no other candidate."""
     sure = near.take(_only(near.light) & _only(near.signal))
     return dict(zip(sure.light.tolist(), sure.signal.tolist(), strict=True))
 
 
 def _only(rows: Rows) -> Bools:
-    """Mask of the values that come once."""
+    """Return a mask of the values that occur once."""
     return np.bincount(rows)[rows] == 1 if len(rows) else np.zeros(0, np.bool_)
 
 
 def _assigned(near: _Near) -> dict[int, int]:
-    """One signal for as many lights as possible, so that the sum of the squared distances is the least."""
+    """Assign signals to the largest possible number of lights, with the smallest sum of squared distances."""
     cost = near.ahead**2 + near.left**2 + (_OF_HEIGHT * near.up) ** 2
     found: dict[int, int] = {}
     for rows in _heaps(near):
@@ -242,7 +239,7 @@ def _assigned(near: _Near) -> dict[int, int]:
         if len(light) > _MOST_TOGETHER:
             found |= _nearest_in_turn(near, rows[np.argsort(cost[rows], kind="stable")])
             continue
-        # More lights than signals: some of them are none, at a price above all others.
+        # With more lights than signals, some lights have none, at the highest price.
         none = float(cost[rows].sum()) + 1.0
         table = np.full((len(light), len(signal) + len(light)), none)
         table[:, : len(signal)] = 2 * none
@@ -258,12 +255,12 @@ def _assigned(near: _Near) -> dict[int, int]:
 
 
 def _heaps(near: _Near) -> Iterator[Rows]:
-    """The pairs by heaps that share neither a light nor a signal with one another."""
+    """Yield groups of pairs that share no light and no signal with other groups."""
     if not len(near.light):
         return
     light, signal = near.light, near.signal
     label = np.arange(int(light.max()) + 1)
-    while True:  # a light has the least label of the lights that want what it wants
+    while True:  # A light gets the smallest label of the lights with a common candidate.
         least = np.full(int(signal.max()) + 1, len(label))
         np.minimum.at(least, signal, label[light])
         after = label.copy()
@@ -287,7 +284,7 @@ def _nearest_in_turn(near: _Near, rows: Rows) -> dict[int, int]:
 
 
 def least_sum(cost: Floats) -> Rows:
-    """A column for each row, none of them twice, so that the sum is the least.
+    """Return a different column for each row, so that the sum of the costs is minimal.
 
     Parameters
     ----------
@@ -300,8 +297,8 @@ def least_sum(cost: Floats) -> Rows:
 
     Notes
     -----
-    Row after row is brought in along the shortest path of exchanges, with prices that keep all costs above 0;
-    n² m steps, the m at once.
+    The rows are added one by one along the shortest path of exchanges. Prices keep all costs positive. The
+    number of steps is n² m; the m steps are vectorised.
 
     Source: R. Jonker, A. Volgenant, "A shortest augmenting path algorithm for dense and sparse linear
     assignment problems", Computing 38 (1987).
@@ -326,7 +323,7 @@ def least_sum(cost: Floats) -> Rows:
         passed = np.flatnonzero(done & (owner >= 0))
         row_price[owner[passed]] += so_far - length[passed]
         column_price[passed] -= so_far - length[passed]
-        while at >= 0:  # everybody on the path moves on by one
+        while at >= 0:  # Shift all assignments along the path by one.
             before = int(came_from[at])
             owner[at] = row if before < 0 else owner[before]
             at = before
@@ -336,16 +333,13 @@ def least_sum(cost: Floats) -> Rows:
     return found
 
 
-# By lanes -----------------------------------------------------------------------------------------
-
-
 def _by_boxes(
     lights: Mapping[int, Light], road_map: RoadMap, columns: Iterable[int]
 ) -> dict[int, str]:
-    """The free signals that apply to the lanes of the boxes of lights, or to those that they lead to.
+    """Assign free signals to lights by the lanes in their trigger boxes, or by the successors of these lanes.
 
-    Of several signals it is the one that has most of these lanes, then the nearest. Where nothing is left, the
-    lanes of the boxes are named.
+    Of several signals, the one with the most of these lanes is used, then the nearest. Without a free signal,
+    the lanes of the boxes are returned by name.
     """
     nodes = road_map.nodes
     own = _lanes_of_boxes(lights, road_map)
@@ -386,7 +380,7 @@ def _lanes_after(road_map: RoadMap) -> dict[int, set[int]]:
 
 
 def _lanes_of_boxes(lights: Mapping[int, Light], road_map: RoadMap) -> dict[int, set[int]]:
-    """The lanes, by node id, that run through what triggers each light."""
+    """Return the driving lanes (node ids) in the trigger boxes of each light."""
     told = [(ident, box) for ident, light in lights.items() for box in light.boxes]
     boxes = np.array([box for _, box in told], np.float64).reshape(-1, 6)
     hits = road_map.lanes_of(boxes[:, [0, 1, 3, 4, 5]], np.full(len(boxes), np.nan))
@@ -400,23 +394,20 @@ def _lanes_of_boxes(lights: Mapping[int, Light], road_map: RoadMap) -> dict[int,
 
 
 def _through(hits: Any, boxes: Floats) -> Bools:
-    """Of which lanes the centre line runs through the box, not only its border."""
+    """Return a mask of the lanes whose centre line passes through the box."""
     error, box = hits.heading_error, boxes[hits.row]
     reach = (np.abs(np.sin(error)) * box[:, 4] + np.abs(np.cos(error)) * box[:, 5]) / 2
     return np.abs(hits.offset) <= reach
 
 
-# What cannot be -----------------------------------------------------------------------------------
-
-
 def shared_signals(signals: Mapping[int, str], road_map: RoadMap) -> list[str]:
-    """A warning for each signal of the map that several lights are."""
+    """Return a warning for each map signal with several lights."""
     if len(set(signals.values())) == len(signals):
         return []
     known = set(road_map.nodes.name)
     by_name: dict[str, list[int]] = {}
     for ident, name in signals.items():
-        if name in known:  # lanes that are named may well have several lights
+        if name in known:  # Several lights of one lane name are valid.
             by_name.setdefault(name, []).append(ident)
     return [
         f"traffic lights {_listed(sorted(idents))} are one signal of the road map: {name!r}"
@@ -426,25 +417,25 @@ def shared_signals(signals: Mapping[int, str], road_map: RoadMap) -> list[str]:
 
 
 class AtOnce:
-    """Watches for lanes that are red and green at once: then lights are taken for the wrong signals.
+    """Detector of lanes with red and green at the same time, a sign of wrong assignments.
 
     Parameters
     ----------
     signals : mapping
-        Signals of the road map that lights are.
+        Signal of the road map by light.
     road_map : RoadMap or None
     idents : iterable of int
-        Lights, in the order in which their states come.
+        Lights, in the order of their states.
     before : AtOnce, optional
-        Who watched before other lights came; what it saw counts on.
+        Earlier detector, whose counts are continued after a change of the lights.
 
     Attributes
     ----------
     idents : list of int
     who : dict
-        Lane by name → the lights that made it red and green.
+        Lane name → the red and the green light.
     frames : dict
-        Lane by name → frames in which it was so.
+        Lane name → number of frames with the contradiction.
     """
 
     def __init__(
@@ -470,7 +461,7 @@ class AtOnce:
         self.frames: dict[str, int] = {} if before is None else before.frames
 
     def see(self, states: Ints) -> None:
-        """Take note of what the lights show in a frame: codes of :data:`sgstore.vocabulary.LIGHT_STATES`."""
+        """Check the light states of a frame: codes of :data:`sgstore.vocabulary.LIGHT_STATES`."""
         if states is not self._last:
             self._last = states
             self._bad = self._contradicting(states)
@@ -491,7 +482,7 @@ class AtOnce:
 
     @property
     def warnings(self) -> list[str]:
-        """One for each two lights that contradicted one another."""
+        """Warnings, one for each pair of contradicting lights."""
         by_lights: dict[tuple[int, int], list[str]] = {}
         for lane, who in sorted(self.who.items()):
             by_lights.setdefault(who, []).append(lane)
@@ -514,22 +505,21 @@ def _listed(names: list[Any]) -> str:
     return f"{shown} and {more} more" if more > 0 else shown
 
 
-# Traffic lights of CARLA's bridge: where they stand, and what they show -------------------------
-# The bridge tells the place of a light and the box on the road that triggers it, but no lane. The lanes are
-# those of the signal of the map that it is (:mod:`sgstore.readers.carla._signals`). A light that the map does
-# not have at all applies to the lanes of its box.
+# Traffic lights of CARLA's bridge: positions and states. The bridge contains the position of a light and its
+# trigger box on the road, but no lane. The lanes are those of its map signal
+# (:mod:`sgstore.readers.carla._signals`). A light without a map signal applies to the lanes in its box.
 
 TYPE_NAME: Final = "traffic.traffic_light"
 _STATES: Final = ("red", "yellow", "green", "off", "unknown")
 
 
 def light_state(number: int) -> str:
-    """Name in :data:`sgstore.vocabulary.LIGHT_STATES` of a state, as CARLA and its bridge number them."""
+    """Return the name of a light state for its number in CARLA and its bridge."""
     return _STATES[number] if 0 <= number < len(_STATES) else "unknown"
 
 
 def read_places(message: dict[str, Any]) -> dict[int, Light]:
-    """Lights by id, as a ``CarlaTrafficLightInfoList`` tells them, without those that have no usable place."""
+    """Return the lights of a ``CarlaTrafficLightInfoList`` by id, without those lacking a valid position."""
     lights: dict[int, Light] = {}
     for told in records(message, "traffic_lights"):
         x, y, z = (number(told, f"transform.position.{axis}") for axis in "xyz")
@@ -549,7 +539,7 @@ def read_places(message: dict[str, Any]) -> dict[int, Light]:
 
 
 def heading_of(x: float, y: float, z: float, w: float) -> float:
-    """Heading of a quaternion of any length; rad. NaN for one that is none."""
+    """Return the heading of a quaternion of any length; rad. NaN if it is invalid."""
     norm = x * x + y * y + z * z + w * w
     if not 0.25 < norm < 4:
         return NAN
@@ -557,18 +547,18 @@ def heading_of(x: float, y: float, z: float, w: float) -> float:
 
 
 class Lights:
-    """The traffic lights of a trace, with a row in every frame.
+    """Traffic lights of a trace, with a row in every frame.
 
     Parameters
     ----------
     places : mapping
         Lights by id.
     signals : mapping
-        Ids of the signals of the road map that they are.
+        Signal id in the road map by light id.
     road_map : RoadMap or None
         That map.
     roster : EntityTable
-        Takes each of them up as an entity.
+        Receives each light as an entity.
     """
 
     def __init__(
@@ -593,30 +583,30 @@ class Lights:
 
     @property
     def unplaced(self) -> int:
-        """Lights that have a state but no place."""
+        """Number of lights with a state but without a position."""
         return len(self._unplaced)
 
     @property
     def aimless(self) -> int:
-        """Lights of which it is not known for which lanes they are."""
+        """Number of lights without known lanes."""
         return len(self._row.keys() - self._signals.keys())
 
     @property
     def warnings(self) -> list[str]:
-        """Lights that cannot be what they were taken for, as far as frames were made."""
+        """Warnings so far about lights with a wrong signal."""
         return [*self._shared, *self._at_once.warnings]
 
     def of_frame(self) -> Ints:
-        """States that they show in the next frame: codes of :data:`sgstore.vocabulary.LIGHT_STATES`.
+        """Return the states of the lights in the next frame: codes of ``LIGHT_STATES``.
 
-        The array is kept by frames: it is not to be written to.
+        Frames share this array; do not change it.
         """
         self._at_once.see(self._states)
         return self._states
 
     def update(self, message: dict[str, Any]) -> None:
-        """Take up a ``CarlaTrafficLightStatusList``; lights that it does not name stay as they are."""
-        states = self._states.copy()  # frames keep the array that they were given
+        """Update the states from a ``CarlaTrafficLightStatusList``. Other lights keep their states."""
+        states = self._states.copy()  # Frames share the old array.
         for told in records(message, "traffic_lights"):
             ident, state = ident_of(told, "id"), ident_of(told, "state")
             if ident is None or state is None:

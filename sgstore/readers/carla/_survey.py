@@ -1,7 +1,7 @@
-"""The first reading of a CARLA recording: actors, channels, egos, lights and map.
+"""First reading of a CARLA recording: actors, channels, egos, lights and map.
 
-What an object is stands in the list of actors, which may come once and late, as may the places of lights and
-the map. All of that is gathered when a recording is opened.
+The list of actors contains the type of each object. It may occur only once and late, like the positions of
+lights and the map. All of them are collected at the opening of a recording.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ if TYPE_CHECKING:
 
 
 EGO_ROLES: Final = ("hero", "ego_vehicle", *(f"hero{i}" for i in range(10)))
-"""Role names by which the bridge knows a vehicle under test, in the order in which they are asked."""
+"""Role names of the bridge for a vehicle under test, in the order of their priority."""
 
 LISTED: Final = 20
-"""Actors that an error lists by name."""
+"""Maximum number of actors listed in an error."""
 
 _CLASSES: Final = {
     4: "person",
@@ -65,14 +65,14 @@ _CLASSES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Actor:
-    """An actor as the list of actors has it.
+    """Actor in the list of actors.
 
     Attributes
     ----------
     type_name : str
         Id of its blueprint: ``vehicle.tesla.model3``.
     role : str
-        ``hero``, ``autopilot``, …; empty: none.
+        ``hero``, ``autopilot``, …; empty without a role.
     """
 
     type_name: str
@@ -80,9 +80,9 @@ class Actor:
 
 
 def meaning_of(type_name: str) -> TypeMeaning:
-    """Meaning of a blueprint: that of its id, else of the longest beginning of it that ends before a dot.
+    """Return the meaning of a blueprint id, or of its longest known prefix before a dot.
 
-    Of a vehicle that nothing maps it is only known that it is one.
+    An unmapped vehicle has the general kind ``vehicle``.
     """
     meanings = type_meanings()
     name = type_name.lower()
@@ -94,10 +94,9 @@ def meaning_of(type_name: str) -> TypeMeaning:
 
 
 def meaning_of_object(actor: Actor | None, classification: float) -> TypeMeaning:
-    """Meaning of an object: by its blueprint, else by the class that the bridge gives it.
+    """Return the meaning of an object by its blueprint, else by the class from the bridge.
 
-    The bridge says "car" whenever it does not know better, so of a blueprint that nothing maps this word is
-    not believed.
+    The class ``car`` is the bridge's default, so it is ignored for an unmapped blueprint.
     """
     number = int(classification) if math.isfinite(classification) else 0
     kind = _CLASSES.get(number, "unknown")
@@ -110,20 +109,20 @@ def meaning_of_object(actor: Actor | None, classification: float) -> TypeMeaning
 
 @dataclass(slots=True)
 class Egos:
-    """Choice of the ego: a vehicle with one of the bridge's role names, or the one that the user names.
+    """Choice of the ego: the requested vehicle, or a vehicle with a role name of the bridge.
 
     Attributes
     ----------
     wanted : str
-        Id or role name that the user gave; empty: as the recording says.
+        Id or role name from the user; empty: the ego of the recording.
     actors : dict
         Actor id → :class:`Actor`.
     by_role : dict
-        Role name → actor id, as other messages than the list of actors tell it.
+        Role name → actor id, from other messages than the list of actors.
     seen : set of int
-        Ids of objects that were seen.
+        Ids of the objects so far.
     later : dict
-        Actor id → what later lists call it, where that is another blueprint.
+        Actor id → a different blueprint in later lists.
     """
 
     wanted: str
@@ -133,22 +132,22 @@ class Egos:
     later: dict[int, list[Actor]] = field(default_factory=dict[int, list[Actor]])
 
     def id_of(self, role: str) -> int | None:
-        """The vehicle with a role name, if there is one."""
+        """Return the id of the vehicle with a role name, or ``None``."""
         ids = self._with(role)
         return ids[0] if ids else self.by_role.get(role)
 
     def settle(self, driven: Iterable[str]) -> tuple[int | None, list[str]]:
-        """The ego's id, and what is odd about the choice.
+        """Return the id of the ego, and warnings about the choice.
 
         Parameters
         ----------
         driven : iterable of str
-            Role names of the vehicles that channels of their own tell of.
+            Role names of the vehicles with their own channels.
 
         Raises
         ------
         TraceError
-            Nothing bears the name that the user gave, or several actors do.
+            The given name does not exist, or is ambiguous.
         """
         if self.wanted:
             return self._named(), []
@@ -183,7 +182,7 @@ class Egos:
 
 
 def _listing(egos: Egos) -> str:
-    """Actors that could have been meant."""
+    """Return a text with the possible actors, for an error message."""
     things = [
         f"{ident} ({actor.role or actor.type_name})"
         for ident, actor in _vehicles(egos.actors).items()
@@ -193,7 +192,7 @@ def _listing(egos: Egos) -> str:
 
 
 def _vehicles(actors: Mapping[int, Actor]) -> dict[int, Actor]:
-    """The actors that move, those with a role of their own first."""
+    """Return the moving actors; actors with a role other than ``autopilot`` come first."""
     moving = {
         ident: actor
         for ident, actor in actors.items()
@@ -202,9 +201,9 @@ def _vehicles(actors: Mapping[int, Actor]) -> dict[int, Actor]:
     return dict(sorted(moving.items(), key=lambda item: (item[1].role == "autopilot", item[0])))
 
 
-# What the channels of a recording of CARLA's ROS bridge carry, by their schemas -----------------
-# Topics are free and tell nothing, with one exception: a message of a vehicle's own sensors does not say whose
-# it is, but the bridge puts them under the vehicle's role name, ``/carla/<role>/vehicle_status``.
+# Contents of the channels of CARLA's ROS bridge, by their schemas. Topics are arbitrary, with one exception: a
+# message of a vehicle's own sensors lacks the vehicle, but its topic contains the role name of the vehicle,
+# ``/carla/<role>/vehicle_status``.
 #
 # Source: carla-simulator/ros-bridge, ros-carla-msgs, astuff_sensor_msgs (message definitions).
 
@@ -236,10 +235,10 @@ CONTENTS: Final = {
     "carla_msgs/CarlaCollisionEvent": COLLISION,
     "carla_msgs/CarlaLaneInvasionEvent": LANE_INVASION,
 }
-"""Schema → what its messages are."""
+"""Schema → content type of its messages."""
 
 LASTING: Final = frozenset({ACTORS, LIGHT_PLACES, LIGHT_STATES, WORLD, VEHICLE})
-"""What holds until it is told anew, so that no single frame owns the message."""
+"""Content types with lasting facts, valid until the next message."""
 
 FOR_FRAMES: Final = frozenset(
     {
@@ -253,20 +252,20 @@ FOR_FRAMES: Final = frozenset(
         VEHICLE_LIGHTS,
     }
 )
-"""What is read with the frames, after what lasts is known."""
+"""Content types that are read with the frames."""
 
 OF_ONE_VEHICLE: Final = frozenset({STATUS, COMMANDS, VEHICLE, ODOMETRY, COLLISION, LANE_INVASION})
-"""What the bridge publishes under the role name of a vehicle."""
+"""Content types that the bridge publishes under the role name of a vehicle."""
 
 NEVER: Final = -(1 << 62)
-"""Time of what was not told yet; ns."""
+"""Time value for missing messages; ns."""
 _MAX_SECONDS: Final = 1 << 32
 
 
 def content_of(recording: Recording, channel: int) -> str:
-    """Kind of content that the messages of a channel have; empty where the reader does not know them.
+    """Return the content type of a channel's messages; empty if the reader does not support them.
 
-    Lights of vehicles are no part of the bridge: they are read from JSON messages ``{"t": s, "lights": {id:
+    The bridge has no messages for vehicle lights. They are read from JSON messages ``{"t": s, "lights": {id:
     carla.VehicleLightState}}`` of a schema whose name ends in ``VehicleLights``.
     """
     record = recording.channels[channel]
@@ -279,7 +278,7 @@ def content_of(recording: Recording, channel: int) -> str:
 
 
 def structure(recording: Recording, channel: int) -> Struct | None:
-    """The structure of a channel's messages, as the recording itself defines it; ``None``: no ROS messages.
+    """Return the structure of a channel's messages from the recording. ``None`` means other than ROS.
 
     Raises
     ------
@@ -298,37 +297,37 @@ def _is_ros(channel: Channel, schema: Schema) -> bool:
 
 
 def role_in(topic: str) -> str:
-    """The role name of the vehicle that a topic is of: ``hero`` in ``/carla/hero/vehicle_status``."""
+    """Return the role name in a topic: ``hero`` in ``/carla/hero/vehicle_status``; empty without one."""
     parts = topic.split("/")
     return parts[-2] if len(parts) > 2 else ""
 
 
 def stamp_of(message: dict[str, Any]) -> int | None:
-    """Time in a message's header; ns. ``None`` if it has none, or one beyond all clocks."""
+    """Return the time in a message's header; ns. ``None`` means missing or out of range."""
     return stamp_from([number(message, f"header.stamp.{part}") for part in ("sec", "nanosec")])
 
 
 def stamp_from(told: Floats | list[float]) -> int | None:
-    """Time of seconds and nanoseconds, likewise."""
+    """Return the time for seconds and nanoseconds; ns. ``None`` means missing or out of range."""
     seconds, nanos = told
     there = abs(seconds) < _MAX_SECONDS and abs(nanos) < _MAX_SECONDS
     return int(seconds) * 1_000_000_000 + int(nanos) if there else None
 
 
-# Collisions and crossed lane markings, as the sensors of CARLA's bridge tell them ---------------
+# Collisions and crossed lane markings, from the sensors of CARLA's bridge.
 # Source: ros-carla-msgs, CarlaCollisionEvent and CarlaLaneInvasionEvent.
 
 EVENTS: Final = frozenset({COLLISION, LANE_INVASION})
-"""Contents of the channels that tell events."""
+"""Content types with events."""
 _MARKINGS: Final = {0: "other", 1: "broken", 2: "solid"}
 
 
 def event_of(
     content: str, message: dict[str, Any], place: tuple[int, int, int], ident: str
 ) -> Event:
-    """The event that a message tells.
+    """Return the event of a message.
 
-    ``place``: simulation time, log time, number of the frame before it; ``ident``: id of the vehicle.
+    ``place``: simulation time, log time, number of the previous frame; ``ident``: id of the vehicle.
     """
     if content == COLLISION:
         other = ident_of(message, "other_actor_id")
@@ -346,12 +345,12 @@ def event_of(
     return Event("lane_invasion", *place, ident, detail=", ".join(names))
 
 
-# The survey ---------------------------------------------------------------------------------------
+# First reading.
 
 SAME_TICK: Final = 1_000_000
-"""Greatest difference of the stamps of one instant, which the bridge cuts off unevenly; ns."""
+"""Maximum difference of stamps of one instant, which the bridge rounds differently; ns."""
 SAME_PLACE: Final = 0.01
-"""How far an object may be from the odometry of the vehicle that it is; m."""
+"""Maximum distance of an object from the odometry of its vehicle; m."""
 
 _PLACES: Final = ("id", "pose.position.x", "pose.position.y", "pose.position.z")
 _ODOMETRY: Final = tuple(f"pose.{path}" for path in _PLACES[1:])
@@ -361,12 +360,12 @@ _MOST_NOTES: Final = 100
 
 
 class CarlaSurvey(Survey[Lead]):
-    """Findings of the first reading of a recording.
+    """First reading of a CARLA recording.
 
     Attributes
     ----------
     contents : dict
-        Channel id → kind of content of its messages, such as :data:`OBJECTS`.
+        Channel id → content type of its messages, such as :data:`OBJECTS`.
     structures : dict
         Channel id → structure of its messages.
     egos : Egos
@@ -385,8 +384,8 @@ class CarlaSurvey(Survey[Lead]):
         self.ego: int | None = None
         self.lights: dict[int, Light] = {}
         self._tables: dict[int, ColumnReader] = {}
-        # Places of the vehicles with a role, to find them among objects that no list of actors names: their
-        # odometry by role; stamp, ids and places of the objects of the last frame.
+        # Positions of the vehicles with a role, to find them among objects without a list of actors: their
+        # odometry by role; stamp, ids and positions of the objects in the last frame.
         self._odometry: dict[str, tuple[int | None, Floats]] = {}
         self._objects: tuple[int | None, Floats] = (None, np.zeros((0, 4)))
         self._tries = 0
@@ -394,12 +393,12 @@ class CarlaSurvey(Survey[Lead]):
         self._lasting: list[Ref] = []
 
     def rank(self, lead: Lead) -> tuple[int, ...]:
-        """Order by frames, then by bytes in them."""
+        """Return the sort key of a candidate: the number of frames, then their bytes."""
         return lead.frames, lead.weight
 
     @property
     def driven(self) -> dict[int, str]:
-        """Channel id → role name of the vehicle, of the channels that are of a single vehicle."""
+        """Role name of the vehicle by channel id, for channels of a single vehicle."""
         return {
             channel: role_in(self.topic(channel))
             for channel, content in self.contents.items()
@@ -407,12 +406,12 @@ class CarlaSurvey(Survey[Lead]):
         }
 
     def no_frames(self) -> str:
-        """The reason why no channel leads."""
+        """Return the reason for a recording without a leading channel."""
         lost = self.lost.losses()
         return lost[0].reason if lost else "no list of objects can be read"
 
     def ego_named(self, name: str) -> str | None:
-        """The id of the ego that a name means; objects are looked through for a number that no list has."""
+        """Return the id of the ego for a name. ``None`` means that objects must be searched for the number."""
         egos = self.egos
         if name.isdecimal() and int(name) not in egos.actors.keys() | egos.seen:
             return None
@@ -425,33 +424,31 @@ class CarlaSurvey(Survey[Lead]):
         return "" if self.ego is None else str(self.ego)
 
     def role(self, channel: int) -> str:
-        """The role of a channel; messages of some of them last."""
+        """Return the role of a channel, ``lasting`` for a channel with lasting facts."""
         lasts = channel != self.leading and self.contents.get(channel) in LASTING
         return "lasting" if lasts else super().role(channel)
 
     def context(self) -> list[Ref]:
-        """Messages that later ones depend on: those that last, where they tell something new; calibrations."""
+        """Return the messages that later ones depend on: changes of lasting facts, and calibrations."""
         return [*self._lasting, *super().context()]
 
-    # Channels ----------------------------------------------------------------------------------------
-
     def meet(self, channel: int) -> bool:
-        """Return whether the messages of a channel are frames, or last."""
+        """True if the messages of a channel are frames or lasting facts."""
         return self._content(channel) in LASTING | {OBJECTS}
 
     def watches(self, channel: int, *, met: bool) -> bool:
-        """Look also at texts, one of which may be the map, and at places of vehicles that nobody knows."""
+        """True also for texts, which may contain the map, and for odometry of an unknown vehicle."""
         content = self.contents[channel]
         if content == TEXT:
-            return channel not in self._last  # a text that is no map is not looked at again
+            return channel not in self._last  # A text other than a map is examined only once.
         return met or (content == ODOMETRY and self._is_lost(channel))
 
     def keeps(self, channel: int) -> bool:
-        """Return whether the frames need the messages of a channel."""
+        """True if the reading of the frames needs the messages of a channel again."""
         return self._content(channel) in FOR_FRAMES
 
     def _content(self, channel: int) -> str:
-        """Kind of content that the messages of a channel have; empty if they are of no concern."""
+        """Return the content type of a channel's messages; empty if they are not needed."""
         if channel not in self.contents:
             self.contents[channel] = content = content_of(self.recording, channel)
             try:
@@ -466,7 +463,7 @@ class CarlaSurvey(Survey[Lead]):
         return self.contents[channel]
 
     def _learn(self, channel: int, content: str) -> None:
-        """Learn the structure of a channel's messages, if these are ROS messages."""
+        """Parse the structure of a channel's messages, if they are ROS messages."""
         found = structure(self.recording, channel)
         if found is None:
             return
@@ -476,17 +473,15 @@ class CarlaSurvey(Survey[Lead]):
             stamps = self.shared_stamps(channel, Stamps(explicit=False))
             self.leads[channel] = Lead(stamps=stamps)
 
-    # One message -----------------------------------------------------------------------------------
-
     def look(self, run: Messages, row: int) -> None:
-        """Look at one message; what cannot be read is counted."""
+        """Examine one message. Unreadable messages are counted."""
         channel = int(run.channel[row])
         if self.contents[channel] in {TEXT, ODOMETRY} and not self.watches(channel, met=False):
             return
         if self.contents[channel] == OBJECTS:
             self.count(run, row, int(run.length[row]))
             self.leads[channel].stamps.next()
-            with suppress(TraceError):  # reported when frames are read
+            with suppress(TraceError):  # Reported during the reading of the frames.
                 head = self._tables[channel].head(run.data(row))
                 self.see_stamp(run, row, stamp_of(head))
                 self._look_for_egos(run.data(row), channel)
@@ -500,8 +495,8 @@ class CarlaSurvey(Survey[Lead]):
                 role = role_in(self.topic(channel))
                 self._odometry[role] = (stamp_of(message), place)
                 self._find_egos()
-            elif self._last.get(channel) != data:  # the bridge says many things again and again
-                news = content == LIGHT_STATES  # which are read with the frames
+            elif self._last.get(channel) != data:  # The bridge repeats many messages.
+                news = content == LIGHT_STATES  # Light states are read with the frames.
                 news = news or self._take[content](decode(self.structures[channel], data))
                 self._last[channel] = data
                 if news and content in LASTING:
@@ -512,7 +507,7 @@ class CarlaSurvey(Survey[Lead]):
 
     @property
     def _take(self) -> dict[str, Callable[[dict[str, Any]], bool]]:
-        """Functions that take messages whose contents last; each returns whether they say anything new."""
+        """Functions that store lasting facts, by content type. They return True for new facts."""
         return {
             ACTORS: self._take_actors,
             LIGHT_PLACES: self._take_lights,
@@ -536,7 +531,7 @@ class CarlaSurvey(Survey[Lead]):
         return "<OpenDRIVE" in told[:_MAP_BEGINS] and self._take_map(told, "")
 
     def _take_actors(self, message: dict[str, Any]) -> bool:
-        """Take up a list of actors; whether any of them was not known."""
+        """Add a list of actors. Return True if an actor is new."""
         actors = self.egos.actors
         known = len(actors)
         for told in records(message, "actors"):
@@ -565,15 +560,13 @@ class CarlaSurvey(Survey[Lead]):
         return True
 
     def _note(self, note: str) -> None:
-        """Take note of something odd, once; of very much that is odd only the first."""
+        """Add a warning once, up to the maximum number of warnings."""
         if note not in self.notes and len(self.notes) <= _MOST_NOTES:
             more = "and more that is as odd"
             self.notes.append(note if len(self.notes) < _MOST_NOTES else more)
 
-    # Vehicles under test that no list names -----------------------------------------------------------
-
     def _is_lost(self, channel: int) -> bool:
-        """Return whether nobody knows which object the vehicle of an odometry is."""
+        """True if the vehicle of an odometry channel is unknown."""
         role = role_in(self.topic(channel))
         tried = self._tries >= _MOST_TRIES
         return bool(role) and not tried and self.egos.id_of(role) is None
@@ -590,7 +583,7 @@ class CarlaSurvey(Survey[Lead]):
             self._find_egos()
 
     def _find_egos(self) -> None:
-        """Find the only object that is where the odometry of a role says, at the same instant."""
+        """Find the only object at the position of a role's odometry, at the same instant."""
         stamp, table = self._objects
         self._tries += 1
         for role, (when, place) in self._odometry.items():

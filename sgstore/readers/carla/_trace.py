@@ -1,20 +1,20 @@
-"""Recordings of CARLA's ROS bridge: ``ros2 bag record -s mcap`` of ``derived_object_msgs`` and ``carla_msgs``.
+"""Reader of recordings of CARLA's ROS bridge (``derived_object_msgs`` and ``carla_msgs``).
 
-They are recognised by the schema of a channel and by nothing else. A frame is one list of objects, in file
-order; its time is the simulation's. The road map is the OpenDRIVE text of ``CarlaWorldInfo``, or of a string
-message that holds one. The bridge tells where vehicles and walkers are, and nothing else that has a body: signs
-and props stand in the list of actors without a place, and are left out; signs come from the road map.
+They are recorded with ``ros2 bag record -s mcap``, and recognised only by the schema of a channel. A frame is
+one list of objects, in file order; its time is the simulation time. The road map is the OpenDRIVE text of
+``CarlaWorldInfo`` or of a string message. The bridge contains positions only of vehicles and walkers. Signs and
+props in the list of actors have no position and are ignored; signs come from the road map.
 
-* Axes and units of ROS are ours: x ahead, y to the left, z up, metres, radians; the bridge has mirrored
-  CARLA's y and yaw already. Velocities and accelerations of objects are in the axes of the map.
-* A vehicle's origin lies on the ground below its middle, a walker's in the middle of its body. Our position
-  is the centre of the box, so a vehicle is lifted by half its height, along its own upright axis. (The bridge
-  drops the small offset that some blueprints have between their origin and their box.)
-* What an object is, is told by the list of actors (:mod:`sgstore.readers.carla._survey`).
-* Controls, lights of vehicles and odometry come in messages of their own, before or behind the objects of
-  the same instant. They belong together if their stamps agree within 1 ms; controls that come less often
-  hold for half a second.
-* CARLA's steer is positive to the right; ours to the left.
+* Axes and units of ROS equal those of sgstore: x ahead, y to the left, z up, metres, radians. The bridge has
+  already mirrored CARLA's y and yaw. Velocities and accelerations of objects are in map axes.
+* The origin of a vehicle is on the ground below its centre, that of a walker in the centre of its body. In
+  sgstore, the position is the centre of the box, so a vehicle is lifted by half its height along its own
+  upright axis. (The bridge drops the small offset of some blueprints between origin and box.)
+* The type of an object comes from the list of actors (:mod:`sgstore.readers.carla._survey`).
+* Controls, vehicle lights and odometry are separate messages, before or after the objects of the same instant.
+  They belong together if their stamps differ by at most 1 ms. Less frequent controls are valid for half a
+  second.
+* CARLA's steering is positive to the right, that of sgstore to the left.
 
 Source: carla-simulator/ros-bridge (carla_common/transforms.py, carla_ros_bridge/traffic_participant.py,
 ego_vehicle.py); carla.VehicleLightState.
@@ -76,7 +76,7 @@ COLUMNS: Final = (
     "twist.angular.z",
     *(f"shape.dimensions[{i}]" for i in range(3)),
 )
-"""Numbers that are read of every ``derived_object_msgs/Object``."""
+"""Used numbers of ``derived_object_msgs/Object``."""
 STAMP: Final = ("header.stamp.sec", "header.stamp.nanosec")
 CONTROLS: Final = (
     *("steer", "throttle", "brake", "gear", "hand_brake", "reverse", "manual_gear_shift"),
@@ -87,12 +87,12 @@ ODOMETRY_COLUMNS: Final = (
     *(f"twist.twist.linear.{axis}" for axis in "xyz"),
     "twist.twist.angular.z",
 )
-"""Numbers that are read of a ``nav_msgs/Odometry``; its velocity is in the axes of the vehicle."""
+"""Used numbers of ``nav_msgs/Odometry``; its velocity is in the axes of the vehicle."""
 
 HOLDS: Final = 500_000_000
-"""How long controls hold after the last message that told them; ns."""
+"""Validity of controls after their last message; ns."""
 MAX_JSON: Final = 1 << 20
-"""Greatest JSON message that is read; bytes."""
+"""Maximum size of a JSON message; bytes."""
 
 _ID, _CLASS, _SHAPE, _POSITION, _TURN, _MOTION, _SIZE = 0, 1, 2, 3, 6, 10, 17
 _SPHERE, _CYLINDER, _CONE = 2, 3, 4
@@ -100,12 +100,12 @@ _CARLA_LIGHTS: Final = (5, 4, 3, 6, 0, 1, 2, 7, 8, 9, 10)
 """Bit in :data:`sgstore.vocabulary.VEHICLE_LIGHTS` → bit of ``carla.VehicleLightState``. These are: position 0,
 low beam 1, high beam 2, brake 3, right 4, left 5, reverse 6, fog 7, interior 8, special 9 and 10."""
 Controls = tuple[float, ...]
-""":data:`sgstore.world.INPUTS`; NaN: not told."""
+""":data:`sgstore.world.INPUTS`; NaN means unknown."""
 
 
 @dataclass(slots=True)
 class CarlaRawFrame:
-    """A frame whose numbers are still as CARLA has them.
+    """Frame with the numbers of CARLA, not converted yet.
 
     Attributes
     ----------
@@ -121,9 +121,9 @@ class CarlaRawFrame:
     vehicle_lights : mapping
         Actor id → mask of :data:`sgstore.vocabulary.VEHICLE_LIGHTS`.
     odometry : (11,) float64 or None
-        Columns :data:`ODOMETRY_COLUMNS` of the ego, where it is not among the objects.
+        Columns :data:`ODOMETRY_COLUMNS` of the ego, if it is not among the objects.
     kinds : dict
-        As :class:`~sgstore.readers._blocks.FrameRows` has them.
+        As in :class:`~sgstore.readers._blocks.FrameRows`.
     """
 
     time_ns: int
@@ -138,17 +138,17 @@ class CarlaRawFrame:
 
 
 class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
-    """Messages → frames, with what must be remembered from one to the next.
+    """Converter of messages of the CARLA bridge into frames.
 
     Parameters
     ----------
     survey : CarlaSurvey
     signals : mapping
-        Traffic light → id of the signal of the road map that it is.
+        Traffic light → id of its signal in the road map.
     road_map : RoadMap or None
         That map.
     report : TraceReport
-        Takes up what cannot be used.
+        Receives losses and warnings.
     """
 
     def __init__(
@@ -179,7 +179,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
         self._lights = Lights(survey.lights, signals, road_map, self.roster)
 
     def decode(self, run: Messages, row: int) -> CarlaRawFrame | None:
-        """The frame that a message is; ``None`` if it is none, cannot be read, or lies outside the window."""
+        """Return the frame of a message. ``None`` means not a frame, unreadable or outside the window."""
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
         if channel in self._leading:
             self._stamps.next()
@@ -196,7 +196,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
         return None
 
     def settle(self) -> None:
-        """Report what could not be used, once all frames are read."""
+        """Report the losses, after all frames are read."""
         self._untimed = self._stamps.untimed
         warn = self._report.warnings.append
         if self._lights.unplaced:
@@ -215,8 +215,6 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
             warn(
                 "no list of actors: what a vehicle is, is what the bridge guesses, and mostly a car"
             )
-
-    # Frames ------------------------------------------------------------------------------------------
 
     def _raw(self, log_time: int, data: memoryview) -> CarlaRawFrame:
         head, objects = self._table.read(data)
@@ -254,7 +252,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
         return frame
 
     def _enter(self, ident: int, classification: float) -> None:
-        """Enter an object that is seen for the first time."""
+        """Add a new object."""
         actor = self._survey.egos.actors.get(ident)
         meaning = meaning_of_object(actor, classification)
         type_name = actor.type_name if actor else f"class {classification:.0f}"
@@ -268,7 +266,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
             self._people.add(node)
 
     def _other(self, ident: int, classification: float) -> dict[int, Called]:
-        """What an object is that has another class than when it was entered, if that is another kind."""
+        """Return the changed kind of an object by node id, if its class differs from the first one."""
         node = self._nodes[ident]
         if np.isnan(self._classes[ident]):
             self._classes[ident] = classification
@@ -284,7 +282,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
         return {} if vague or meaning.kind == first else {node: (meaning, type_name)}
 
     def complete(self, frames: list[CarlaRawFrame]) -> list[FrameRows]:
-        """Frames with their numbers, for all of them at once."""
+        """Return the frames with their numbers, converted for all frames at once."""
         if not frames:
             return []
         nodes = np.concatenate([frame.nodes for frame in frames])
@@ -304,7 +302,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
         return done
 
     def _rows(self, frame: CarlaRawFrame, values: Floats, usable: Bools) -> FrameRows:
-        """A frame with its numbers, without the rows that cannot be used."""
+        """Return a frame with its numbers, without unusable rows."""
         node = frame.nodes
         if not usable.all():
             for row in np.flatnonzero(~usable).tolist():
@@ -345,10 +343,8 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
     def _unuse(self, reason: str, node: int, frame: CarlaRawFrame) -> None:
         self._unusable.add(reason.format(self._idents[node]), frame.log_time_ns)
 
-    # What else is told ---------------------------------------------------------------------------------
-
     def _takers(self) -> dict[int, Callable[[int, int, memoryview], None]]:
-        """Channel → what takes up its messages."""
+        """Return the function that processes the messages of each channel."""
         found = self._survey
         takers: dict[int, Callable[[int, int, memoryview], None]] = {}
         own = {
@@ -357,7 +353,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
             if (ident := found.egos.id_of(role)) is not None
         }
         for channel, (content, ident) in own.items():
-            # A status tells what was applied, a command only what was asked for.
+            # A status contains the applied controls, a command only the requested ones.
             applied = (STATUS, ident) in own.values()
             if content == (STATUS if applied else COMMANDS):
                 columns = tuple(("control." if applied else "") + name for name in CONTROLS)
@@ -409,13 +405,13 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
 
     def _take_odometry(self, channel: int, log_time: int, data: memoryview) -> None:
         if self._frame is not None and self._ego in self._nodes and self._odometry[1] is None:
-            return  # it is among the objects
+            return  # The ego is among the objects.
         told = self._fields[channel].read(data)[1][0]
         self._odometry = self._stamps.beside(log_time, stamp_from(told[:2])), told[2:]
         self._see_odometry()
 
     def _see_odometry(self) -> None:
-        """Give the ego its place in the frame by its odometry where it is not among the objects."""
+        """Set the position of the ego from its odometry, if it is not among the objects."""
         frame, (stamp, numbers), ego = self._frame, self._odometry, self._ego
         if frame is None or numbers is None or ego is None:
             return
@@ -428,21 +424,21 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
 
 
 def _numbers(objects: Floats, lifted: Bools) -> tuple[Floats, Bools]:
-    """Poses of objects.
+    """Return the poses of objects.
 
     Parameters
     ----------
     objects : (n, 20) float64
         Columns :data:`COLUMNS`.
     lifted : (n,) bool
-        Whose origin lies at the foot of the box.
+        True if the origin is at the bottom of the box.
 
     Returns
     -------
     values : (n, 16) float64
         Columns :data:`sgstore.world.POSE`.
     usable : (n,) bool
-        Whether there is a position on earth, and a quaternion that is one.
+        True with a valid position and a valid quaternion.
     """
     values = np.full((len(objects), len(POSE)), np.nan)
     angles, up = _turned(objects[:, _TURN : _TURN + 4])
@@ -459,10 +455,10 @@ def _numbers(objects: Floats, lifted: Bools) -> tuple[Floats, Bools]:
 
 
 def _turned(quaternions: Floats) -> tuple[Floats, Floats]:
-    """Heading, pitch, roll of quaternions (x, y, z, w), and where their upright axis points; NaN for none.
+    """Return heading, pitch and roll of quaternions (x, y, z, w), and their upright axes; NaN if invalid.
 
-    A quaternion may be a little longer or shorter than 1. With the nose straight up or down heading and roll
-    turn about one axis: then the roll is 0.
+    The length of a quaternion may differ slightly from 1. At a pitch of ±90°, heading and roll have the same
+    axis; the roll is then 0.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         norm = np.sqrt((quaternions * quaternions).sum(axis=1))
@@ -479,7 +475,7 @@ def _turned(quaternions: Floats) -> tuple[Floats, Floats]:
 
 
 def _boxes(shape: Floats, size: Floats) -> Floats:
-    """Length, width and height of shapes; a box has its edges, round ones a radius."""
+    """Return length, width and height of shapes. Round shapes are defined by their radius."""
     boxes = size.copy()
     sphere = shape == _SPHERE
     boxes[sphere] = 2 * size[sphere, :1]
@@ -489,11 +485,11 @@ def _boxes(shape: Floats, size: Floats) -> Floats:
 
 
 def _pose_of(odometry: Floats) -> Floats:
-    """Columns :data:`sgstore.world.POSE` of an odometry: without a box, so at the vehicle's origin."""
+    """Return the pose columns of an odometry, at the vehicle's origin because it has no box."""
     values = np.full(len(POSE), np.nan)
     angles, _ = _turned(odometry[None, 3:7])
     values[:3], values[3:6] = odometry[:3], angles[0]
-    # A vector in the axes that a quaternion turns, in those that it is turned from.
+    # Rotation of a vector from vehicle axes into map axes.
     quaternion = odometry[3:7]
     vector = odometry[7:10]
     axis, w = quaternion[:3], quaternion[3]
@@ -504,12 +500,12 @@ def _pose_of(odometry: Floats) -> Floats:
 
 
 def _vehicle_lights(data: memoryview) -> tuple[int, dict[int, int]]:
-    """Stamp of a JSON message, and lights by the id of their vehicle.
+    """Return the stamp of a JSON message, and its light states by vehicle id.
 
     Raises
     ------
     TraceError
-        It is too large, or not of the form that is read.
+        The message is too large or has another format.
     """
     if len(data) > MAX_JSON:
         raise TraceError(f"{len(data)} bytes of JSON; at most {MAX_JSON} are read")
@@ -529,38 +525,34 @@ def _vehicle_lights(data: memoryview) -> tuple[int, dict[int, int]]:
         raise TraceError(reason) from error
 
 
-@lru_cache(maxsize=4096)  # vehicles show the same lights for long
+@lru_cache(maxsize=4096)  # Vehicles keep the same lights for a long time.
 def _our_lights(bits: int) -> int:
-    """Mask of :data:`sgstore.vocabulary.VEHICLE_LIGHTS` for a ``carla.VehicleLightState``."""
+    """Return the mask of ``VEHICLE_LIGHTS`` for a ``carla.VehicleLightState``."""
     return sum((bits >> theirs & 1) << ours for ours, theirs in enumerate(_CARLA_LIGHTS))
 
 
-# The recording ------------------------------------------------------------------------------------
-
-
 class CarlaTrace(SurveyedTrace[CarlaSurvey]):
-    """A recording of CARLA's ROS bridge.
+    """Recording of CARLA's ROS bridge.
 
     Parameters
     ----------
     recording : Recording
     ego : str
-        Id or role name of the ego; empty: the vehicle whose role is ``hero`` or ``ego_vehicle``, or that has
-        channels of its own.
+        Id or role name of the ego; empty: the vehicle with the role ``hero`` or ``ego_vehicle``, or with its
+        own channels.
     digest : str
-        SHA-256 of the file, if it is known; else the file is hashed.
+        SHA-256 of the file if known; empty: the file is hashed.
 
     Attributes
     ----------
     info : TraceInfo
     report : TraceReport
-        Filled while blocks are read.
+        Filled during the reading of blocks.
 
     Raises
     ------
     TraceError
-        The definition of the objects is malformed, no frame can be read, or nothing bears the name given for
-        the ego.
+        The definition of the objects is malformed, no frame can be read, or the given ego does not exist.
     """
 
     name: ClassVar[str] = "carla"
@@ -573,35 +565,35 @@ class CarlaTrace(SurveyedTrace[CarlaSurvey]):
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:
-        """Return whether one of the channels carries lists of objects."""
+        """True if a channel contains lists of objects."""
         return any(content_of(recording, channel) == OBJECTS for channel in recording.channels)
 
     def decoder(self, report: TraceReport) -> CarlaDecoder:
-        """A decoder that has read nothing yet."""
+        """Return a new decoder."""
         self._survey.tell(report)
         return CarlaDecoder(self._survey, self._signals, self._road_map, report)
 
     def on_map(self, road_map: RoadMap | None) -> None:
-        """Find the lanes of traffic lights in the road map that the recording is read with."""
+        """Find the lanes of traffic lights in the road map of the ingest."""
         if self._survey.lights and road_map is not None:
             self._road_map = road_map
             self._signals = signals_of(self._survey.lights, road_map)
 
     def _own_map(self) -> RoadMap | None:
-        """The recording's own map, where it has lights to be found in it."""
+        """Return the recording's own map, if lights must be found in it."""
         if not (self._survey.lights and self._survey.map_text):
             return None
         try:
             return read_map(self._survey.map_text, self._survey.map_name)
-        except MapError:  # whoever reads the map for its lanes says so
+        except MapError:  # The reading of the map for its lanes reports the error.
             return None
 
 
 def _inputs(told: Sequence[float], *, applied: bool) -> Controls:
-    """Columns :data:`CONTROLS` as :data:`sgstore.world.INPUTS`.
+    """Convert columns :data:`CONTROLS` into :data:`sgstore.world.INPUTS`.
 
-    A control that was applied says the gear that is in. One that asks says a gear only if gears are shifted by
-    hand; else the simulator chooses one, of which no more is known than that it goes backwards.
+    An applied control contains the actual gear. A requested control contains a gear only for manual shifting.
+    Otherwise, the simulator chooses the gear, and only the reverse direction is known.
     """
     steer, throttle, brake, gear, hand_brake, reverse, manual = told
     if not applied and manual != 1:
