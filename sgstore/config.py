@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
 COMMENT: Final = "comment"
-"""Key of a setting's comment among the metadata of its field."""
+"""Metadata key of a setting's comment."""
 
 SHAPES: Final = ("radius", "rectangle", "polygon", "corridor")
 EXTENTS: Final = ("footprint", "centre")
@@ -59,7 +59,7 @@ OF_LABELS: Final = (
 
 MOST_CORNERS: Final = 64
 MOST_LENGTH: Final = 100_000.0
-"""Greatest length that a range may reach; m. No map is larger, and numbers stay exact."""
+"""Largest length of a range; m. No map is larger, and numbers stay exact."""
 
 _WORD: Final = re.compile(r"[a-z0-9][a-z0-9_]{0,39}|")
 
@@ -302,9 +302,9 @@ class Signs:
     """Settings for reading the signals of a road map."""
 
     kinds: tuple[tuple[str, str], ...] = ()
-    """Type codes of signals, in lower case, and the kinds that the client says they are."""
+    """Signal type codes in lower case, with their configured kinds."""
     orientation: str = "asam"
-    """One of :data:`ORIENTATIONS`: what the orientation of a signal without validity means."""
+    """One of :data:`ORIENTATIONS`: meaning of the orientation of a signal without validity."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -761,7 +761,7 @@ def _unknown(prefix: str, name: str, known: set[str]) -> ConfigError:
 
 
 _ENDLESS: Final = frozenset({"range.world"})
-"""Numbers that may be infinite."""
+"""Settings that can be infinite."""
 
 _PLAIN: Final[dict[object, str]] = {str: "a text", bool: "true or false", int: "a whole number"}
 
@@ -811,7 +811,7 @@ def _built(cls: Any, values: Mapping[str, Any], prefix: str) -> Any:
 # Configs as commented TOML, and the page that tells of all settings -----------------------------
 
 WIDTH: Final = 98
-"""Characters of a line of a comment."""
+"""Line width of comments; characters."""
 
 
 def as_toml(config: Config) -> str:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
 LONGEST: Final = 200
-"""Characters of one value."""
+"""Longest value in a table cell; characters."""
 
 _CELL: Final = "text-align:{align};padding:0.15em 0.8em;white-space:pre-wrap"
 

@@ -46,7 +46,7 @@ class SgstoreError(Exception):
 
 
 _URL: Final = re.compile(r"(s3a?|gs|az|abfs|https?):/+(?=[^/])")
-"""How URLs begin; in paths two strokes have become one."""
+"""Start of a URL. ``Path`` merges its two slashes."""
 
 
 def place_named(path: str | Path) -> str:
@@ -104,7 +104,7 @@ class TraceError(SgstoreError):
 
 
 INTERRUPTIONS: Final = ("Query interrupted", "KeyboardInterrupt", "INTERRUPT Error")
-"""Words of the database for an interruption, which it turns into errors of its own."""
+"""Words in the error messages of DuckDB after an interruption."""
 
 
 def is_interruption(error: BaseException | None) -> bool:
@@ -292,7 +292,7 @@ def _with_carets(reason: str, text: str, span: TextSpan | None, hint: str | None
 
 
 EXCERPT: Final = 160
-"""Longest part of a line of a query that a message shows; characters."""
+"""Longest part of a query line in a message; characters."""
 
 
 def _excerpt(line: str, start: int, length: int) -> tuple[str, str]:

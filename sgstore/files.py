@@ -38,7 +38,7 @@ except ImportError:  # not on Windows: there a folder in use cannot be removed a
 
 
 PREFIX: Final = "sgstore-held-"
-"""How the folders of processes begin, in the folder for temporary files."""
+"""Prefix of process folders in the folder for temporary files."""
 
 _FLAGS: Final = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_NOFOLLOW", 0)
 
@@ -156,7 +156,7 @@ def sweep_temporary() -> None:
 
 
 _mine: dict[tuple[int, Path], Path] = {}
-"""The folder of this process, by the process and the folder for temporary files."""
+"""Folder of each process: (process id, folder for temporary files) → path."""
 
 
 def temporary_folder() -> Path:
@@ -210,11 +210,11 @@ def _root() -> Path:
 # half a file. What cannot be replaced by a renaming (a pipe, a device, ``/dev/stdout``) is written into.
 
 FILE_PREFIX: Final = ".sgstore-held-"
-"""How the folders begin in which files are written, beside the places where they belong."""
+"""Prefix of the temporary folders next to output files."""
 
 _DESCRIPTOR: Final = re.compile(r"/dev/fd/(\d+)|/proc/self/fd/(\d+)")
 _NOT_THERE: Final = {errno.EACCES, errno.EPERM, errno.EROFS, errno.EBUSY, errno.EXDEV}
-"""Why a file may be one that can be written, but not replaced."""
+"""Errors of a place in which a file is writable but not replaceable."""
 
 
 _CONTROLS: Final = {

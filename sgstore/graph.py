@@ -32,10 +32,10 @@ if TYPE_CHECKING:
     EdgeRecord = tuple[int, str, int, Attributes]
 
 MOST_RECORDS: Final = 1 << 16
-"""Edges of a graph of which records are made at once; where there are more, they stay columns."""
+"""Largest number of edges of a graph stored as records; larger graphs store columns."""
 
 _IS_IN, _LEADS, _FOLLOWS = (RELATION_CODE[name] for name in ("isIn", "leads", "follows"))
-"""Of each relation whether its edges may have attributes."""
+"""Codes of the relations whose edges can have attributes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -351,7 +351,7 @@ class LaneDistances:
     """
 
     FARTHEST: Final = 200.0
-    """How far is looked; m. The view ``pairs`` has this number too."""
+    """Longest distance along lanes; m. The view ``pairs`` contains the same number."""
 
     def __init__(
         self,
@@ -478,7 +478,7 @@ class EdgeColumns(Sequence["EdgeRecord"]):
     """
 
     AT_ONCE: Final = 4096
-    """Rows of which the records are made together while one goes over them."""
+    """Rows converted to records at once during iteration."""
 
     def __init__(
         self, src: Whole, relation: Codes, dst: Whole, about: Mapping[int, dict[str, Any]]

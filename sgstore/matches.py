@@ -60,32 +60,32 @@ if TYPE_CHECKING:
     from sgstore.truth_lanes import TruthLanes
 
 SHOWN: Final = 80
-"""Characters of a query that the repr of its matches shows."""
+"""Maximum length of the query text in the repr of matches; characters."""
 
 FIRST_WINDOW: Final = 1024
-"""Buckets of the first window, for who may stop early: 61,440 frames, some 30 ms of real traffic."""
+"""Buckets of the first window: 61,440 frames, about 30 ms for real traffic. The caller may stop early."""
 
 BUCKET_SHIFT: Final = 6
 """``frame_id >> 6`` is the bucket of a frame."""
 
 GROWTH: Final = 16
-"""How many times as long a window is as the one before, if that had few rows."""
+"""Growth factor of windows after a window with few rows."""
 
 LAST_WINDOW: Final = 16_384
-"""Buckets of the largest window, and of the first one of who wants all rows: a million frames."""
+"""Buckets of the largest window, and of the first window for a call of all rows: a million frames."""
 
 COUNTED: Final = 16_384
-"""Buckets of a store whose matching frames a notebook counts by itself: a million frames."""
+"""Largest store, in buckets, whose matching frames a notebook counts automatically: a million frames."""
 
 PICTURES: Final = 4
-"""Pictures below the matches in a notebook, and the frames that are looked at for them."""
+"""Number of pictures below the matches in a notebook, and of the frames searched for them."""
 LOOKED_AT: Final = 2_000
 
 ROWS: Final = 1_000_000
-"""Rows that a window should not exceed by much: it grows, or shrinks, as those before it had few or many."""
+"""Target number of rows per window. Windows grow after few rows and shrink after many."""
 
 BLOCK: Final = 50_000
-"""Matches over several frames that the database is given at a time."""
+"""Multi-frame matches inserted into the database at once."""
 T = TypeVar("T")
 
 if TYPE_CHECKING:

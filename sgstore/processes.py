@@ -16,7 +16,7 @@ NEEDED: Final = (
     *("sgstore", "duckdb", "numpy", "mcap", "google/protobuf", "zstandard", "lz4", "isal"),
     *("shapely", "lark", "networkx", "typer"),
 )
-"""The packages that a child imports, as folders."""
+"""Packages that a child process imports, as folders."""
 
 _START: Final = (
     "import json, runpy, sys\n"

@@ -40,24 +40,24 @@ OWN_ENTITY_KINDS: Final = (
     *(*VEHICLES, "person", "animal", *SIGNALS),
     *("prop", "building", "pole", "barrier", "vegetation", "unknown"),
 )
-"""Kinds of entities: what has a pose and, mostly, a box. ``vehicle``: a vehicle, and no more is told of it."""
+"""Built-in kinds of entities, which have a pose and usually a box. ``vehicle``: vehicle of unknown type."""
 
 MAP_KINDS: Final = ("lane", "road", "junction", "crosswalk", "off_road", "waypoint", "roundabout")
-"""Kinds of the parts of a road map. ``off_road`` is a single node: whatever is not a driving lane."""
+"""Kinds of map elements. ``off_road`` is a single node for everything outside driving lanes."""
 
 EVENT_KINDS: Final = {"collision": 2, "lane_invasion": 1, "environment": 0}
-"""Kinds of events that recordings tell of, and to how many each happens; environment: weather, light."""
+"""Kinds of recorded events, with the number of involved entities. Environment means weather and light."""
 
 OWN_KINDS: Final = OWN_ENTITY_KINDS + MAP_KINDS
-"""Kinds of this package, the parts of the map behind the entities."""
+"""Built-in kinds: entities, then map elements."""
 
 _entity_kinds: Final[list[str]] = list(OWN_ENTITY_KINDS)
 ENTITY_KINDS: Final[Sequence[str]] = _entity_kinds
-"""All kinds of entities known so far; see :func:`add_kind`."""
+"""All registered kinds of entities; see :func:`add_kind`."""
 
 _kinds: Final[list[str]] = list(OWN_KINDS)
 KINDS: Final[Sequence[str]] = _kinds
-"""All kinds known so far. It grows behind the kinds of this package, and what is in it keeps its place."""
+"""All registered kinds, built-in kinds first. New kinds are appended."""
 
 SUPER_KINDS: Final[Mapping[str, Sequence[str]]] = {
     "vehicle": VEHICLES,
@@ -66,18 +66,18 @@ SUPER_KINDS: Final[Mapping[str, Sequence[str]]] = {
     "signal": SIGNALS,
     "entity": ENTITY_KINDS,
 }
-"""Labels that stand for several kinds. ``vru``: vulnerable road users.
+"""Labels of several kinds. ``vru``: vulnerable road users.
 
-As a label ``Vehicle`` is every vehicle; as a kind, ``vehicle`` is one of which no more is told.
+The label ``Vehicle`` means every vehicle; the kind ``vehicle`` means a vehicle of unknown type.
 """
 
 SIDES: Final = ("toLeftOf", "toRightOf")
 
 LABEL_ALIASES: Final[Mapping[str, str]] = {"pedestrian": "person", "walker": "person"}
-"""Other words for a kind, as users of Scenic, CARLA and nuScenes know them."""
+"""Synonyms of kinds from Scenic, CARLA and nuScenes."""
 
 OWN_RELATIONS: Final = tuple(plugins.RELATIONS.own)
-"""Relations of this package."""
+"""Built-in relations."""
 
 
 def _declared_in(file: str) -> tuple[str, ...]:
@@ -86,26 +86,26 @@ def _declared_in(file: str) -> tuple[str, ...]:
 
 
 PROXIMITY: Final = _declared_in("_proximity")
-"""Rungs of distance by their usual names, from the nearest to the farthest."""
+"""Usual names of distance relations, from near to far."""
 
 DIRECTIONS: Final = tuple(name for name in _declared_in("_bearing") if name not in SIDES)
-"""Sectors of bearing by their usual names, from ahead to behind."""
+"""Usual names of direction relations, from ahead to behind."""
 
 BEYOND: Final = ("isIn", "controlsTrafficOf", "leads", "follows")
-"""Relations of entities that are known beyond the graphs, too."""
+"""Relations of entities that are also stored outside the graphs."""
 
 MAP_ONLY: Final = _declared_in("_map")
-"""Relations that hold among parts of a map alone: they come with the map and cannot be left out."""
+"""Relations between map elements only. They come with the map, and settings cannot exclude them."""
 
 _relations: Final = list(OWN_RELATIONS)
 RELATIONS: Final[Sequence[str]] = _relations
-"""All relations known so far. It grows, and what is in it keeps its place; see :func:`add_relation`."""
+"""All registered relations. New relations are appended; see :func:`add_relation`."""
 
 RELATION_ALIASES: Final[Mapping[str, str]] = {
     "collides": "overlaps",
     "safe_hazard": "safety_hazard",
 }
-"""``safe_hazard`` is the spelling of CARLASGG's documentation and of SceneFlow."""
+"""Synonyms of relations. CARLASGG's documentation and SceneFlow use ``safe_hazard``."""
 
 LANE_TYPES: Final = (
     *("none", "driving", "stop", "shoulder", "biking", "sidewalk", "walking", "border"),
@@ -119,20 +119,20 @@ DRIVING: Final = frozenset(
     {"driving", "bidirectional", "entry", "exit", "onRamp", "offRamp", "connectingRamp", "slipLane"}
     | {"bus", "taxi", "HOV", "mwyEntry", "mwyExit"}
 )
-"""Types of lanes that are made for motor traffic. (ASAM OpenDRIVE 1.4 to 1.8, lane types.)"""
+"""Types of lanes for motor traffic. (ASAM OpenDRIVE 1.4 to 1.8, lane types.)"""
 
 TRAFFIC: Final = DRIVING | {"biking", "special1", "special2", "special3"}
-"""Types of lanes that have a direction of travel which matters to their neighbours."""
+"""Types of lanes whose travel direction matters to neighbouring lanes."""
 
 OWN_LIGHT_STATES: Final = ("unknown", "off", "red", "yellow", "green", "red_yellow", "flashing")
-"""States of traffic lights of this package. ``flashing``: a bulb that flashes, whatever its colour."""
+"""Built-in traffic light states. ``flashing`` is a flashing lamp of any colour."""
 
 _light_states: Final[list[str]] = list(OWN_LIGHT_STATES)
 LIGHT_STATES: Final[Sequence[str]] = _light_states
-"""All that a traffic light can show, as far as it is known so far; see :func:`add_light_state`."""
+"""All registered traffic light states; see :func:`add_light_state`."""
 
 SPECIALS: Final = ("emergency", "taxi", "electric", "public_transport", "service")
-"""Special kinds, beside the kind: CARLASGG's ``special_type`` and OSI's vehicle roles."""
+"""Special roles of an entity: CARLASGG's ``special_type`` and OSI's vehicle roles."""
 
 VEHICLE_LIGHTS: Final = (
     *("light_left", "light_right", "light_brake", "light_reverse", "light_position"),
@@ -158,10 +158,10 @@ _NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,39}")
 _growing: Final = Lock()
 
 MOST_RELATIONS: Final = 63
-"""Relations that one process can know: a set of them is a 64-bit number."""
+"""Largest number of relations in a process: a set is a 64-bit number."""
 
 MOST_KINDS: Final = 127
-"""Kinds, and states of lights, that one process can know: a code is an 8-bit number."""
+"""Largest number of kinds, and of light states, in a process: a code is an 8-bit number."""
 
 _OWN_RELATIONS_FOLDED: Final[Mapping[str, str]] = {
     normalize_name(name): name for name in OWN_RELATIONS
@@ -185,7 +185,7 @@ NAMES: Final[Mapping[str, Sequence[str]]] = {
     "relation": RELATIONS,
     "light_state": LIGHT_STATES,
 }
-"""Enumerations of a store, by the names of their types: all their values so far, by their codes."""
+"""Enumerations of a store: type name → registered values in code order."""
 
 _OWN: Final = {
     "kind": OWN_KINDS,

@@ -33,19 +33,19 @@ Codes: TypeAlias = "NDArray[np.int8]"
 Bools: TypeAlias = "NDArray[np.bool_]"
 
 BUCKET_FRAMES = 60
-"""Frames that one mask of the store covers; blocks that start at multiples of it are stored best."""
+"""Frames per mask of the store. Blocks should start at multiples of it."""
 
 GAP: Final = 2.5
-"""Between frames that are further apart than so many median periods of their trace some are missing."""
+"""Frames are missing between two frames if their gap exceeds this number of median periods."""
 
 JUMP_NS: Final = 86_400_000_000_000
-"""Time between two frames where the clock jumps back, as all that looks along time has it: a day; ns."""
+"""Assumed time between two frames at a backward clock jump: a day; ns."""
 
 TOLERANCE_NS: Final = 1_000
-"""Times that differ by no more than this are the same; ns."""
+"""Smallest time tolerance for equality; ns."""
 
 TOLERANCE_SHARE: Final = 100
-"""So are those that differ by no more than this part of the median period of their trace."""
+"""Time tolerance as a fraction of the median period: one part in this number."""
 
 
 def seconds_of(ns: int) -> float:
@@ -91,22 +91,22 @@ POSE: Final = (
     *("vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"),
     *("length", "width", "height"),
 )
-"""Columns of :class:`States` that say where a body is, how it moves and how large it is, in order."""
+"""Columns of :class:`States` with pose, motion and size of a body, in order."""
 
 LARGEST: Final = 1_000.0
-"""Greatest length, width or height of a body; m."""
+"""Largest valid length, width or height of a body; m."""
 
 FASTEST: Final = 150.0
-"""Greatest speed of a body; m/s."""
+"""Highest valid speed of a body; m/s."""
 
 HARDEST: Final = 30.0
-"""Greatest acceleration that differences of positions or velocities may give; m/s²."""
+"""Highest valid acceleration derived from positions or velocities; m/s²."""
 
 LEAP: Final = 5.0
-"""Distance beyond the way at :data:`FASTEST` from which on a position is another body's; m."""
+"""A position belongs to another body if it is this far beyond the reach at :data:`FASTEST`; m."""
 
 INPUTS: Final = ("steer", "throttle", "brake", "gear", "hand_brake")
-"""Columns of :class:`States` that say how a vehicle is driven, in order."""
+"""Columns of :class:`States` with the control inputs of a vehicle, in order."""
 
 _SPEEDS: Final = slice(POSE.index("vx"), POSE.index("vz") + 1)
 _SIZES: Final = slice(POSE.index("length"), POSE.index("height") + 1)
@@ -179,7 +179,7 @@ class FaultTally:
     """Numbers that no body has, by entity: the first one, and in how many states."""
 
     MOST: Final = 1000
-    """Numbers of entities that are listed; further ones are counted together."""
+    """Number of listed faults. Further faults are only counted."""
 
     def __init__(self) -> None:
         self._found: dict[str, tuple[str, int]] = {}
@@ -225,10 +225,10 @@ def leaps(away: Floats, seconds: Floats) -> Bools:
 
 
 TWINS_NS: Final = 1_000_000_000
-"""How long an entity may be away while another one has its id, and go on; ns."""
+"""Longest absence of an entity whose id another entity uses meanwhile; ns."""
 
 TWINS: Final = 4
-"""Entities beside the last one that may have one id by turns."""
+"""Number of earlier entities that can share an id in turns."""
 
 AnyEntity = TypeVar("AnyEntity")
 
@@ -344,10 +344,10 @@ class Lives(Generic[AnyEntity]):
 
 
 UNTOLD: Final = -2
-"""Carrier of a state as readers give it: the generator finds it."""
+"""Carrier value set by readers: the generator computes the carrier."""
 
 HIGHEST_GEAR: Final = 127
-"""A gear beyond it, forwards or backwards, is none; a store keeps 8 bits."""
+"""Highest valid gear, forwards and backwards. A store has 8 bits for it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -672,7 +672,7 @@ class Event:
 
 
 FAR_NS: Final = 1_000_000_000
-"""An event whose simulation time is farther than this from all frames near it goes by log time instead."""
+"""An event is assigned by log time if its simulation time is this far from all near frames; ns."""
 _PIECE: Final = 4096
 
 
@@ -743,7 +743,7 @@ KEPT: Final = (
     *("pitch", "roll", "vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"),
     *("length", "width", "height", *INPUTS),
 )
-"""Columns of :class:`States` that a store keeps as they are, cut to float32."""
+"""Columns of :class:`States` that a store keeps as float32."""
 
 _VELOCITY: Final = slice(KEPT.index("vx"), KEPT.index("vz") + 1)
 _GEAR: Final = KEPT.index("gear")

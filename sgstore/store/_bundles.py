@@ -37,20 +37,20 @@ if TYPE_CHECKING:
 
 
 TOGETHER: Final = 64
-"""Stores that are open at a time while they are joined: of more, some are joined first."""
+"""Largest number of stores to join at once. More stores are joined in several steps."""
 
 _TRACE_OF: Final = {
     "trace_id": "trace_id",
     "bucket": f"bucket >> {BUCKET_BITS}",
     "frame_id": f"frame_id >> {SEQ_BITS}",
 }
-"""Column → the trace that a row belongs to; of a table that has several, the first counts."""
+"""Column → SQL of the trace of a row. The first column present in a table counts."""
 
 _AS_MADE: Final = frozenset({"store_info", "bits"})
-"""Tables that every new store has filled."""
+"""Tables with rows in every new store."""
 
 _SORTED: Final = frozenset({*STATES, *REPEATED, *REPEATED.values(), "frame", *MASKS, "derived_gap"})
-"""The large tables."""
+"""Large tables, sorted in a bundle."""
 
 
 # Traces of stores → a store of their own ------------------------------------------------------
@@ -183,7 +183,7 @@ def _choose(
 
 
 _ONCE: Final = {table: owner for owner, tables in SHARED.items() for table in tables}
-"""Tables of what many traces may have → the table that says who has it."""
+"""Tables shared by several traces → table with the references."""
 
 
 def _chosen(table: str, database: str) -> str:
@@ -287,13 +287,13 @@ CATALOGUE: Final[dict[str, dict[str, str]]] = {
 """Tables of a catalogue, with their columns and the types of these in the database.
 
 ``word``: the names that the compiler must know beside its own: of an enumeration (``kind``, ``relation``,
-``light_state``), of attributes of a client's own (``own``, ``own_edges``, with their types), and of
-abstractions in which the classes of frames are known (``classed``). ``trace.scope``: what settings left out of
-it, as its report has it, in JSON; empty or NULL: not known.
+``light_state``), of user-defined attributes (``own``, ``own_edges``, with their types), and of abstractions
+with stored frame classes (``classed``). ``trace.scope``: counts of excluded data from its report, as JSON;
+empty or NULL: unknown.
 """
 
 LATER: Final = frozenset({"scope"})
-"""Columns that catalogues of before do not have."""
+"""Columns that old catalogues lack."""
 
 Facts = dict[str, list[tuple[Any, ...]]]
 """Rows of a catalogue by table."""

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 _NUMBERS: Final = frozenset({"BIGINT", "UBIGINT", "HUGEINT", "DOUBLE"})
-"""Types of numbers of JSON."""
+"""JSON types of numbers."""
 
 
 def catalog_of(connection: DuckDBPyConnection) -> Catalog:
@@ -114,7 +114,7 @@ def known_range(scope: Mapping[str, Any] | None) -> float:
 
 
 _KNOWN: Final = ("state", "node", "lane_state", "lane_gap")
-"""Tables of graphs that ``known_…`` has with what is known beyond them."""
+"""Graph tables with a ``known_…`` version that includes the data outside the graphs."""
 
 
 def _beyond(connection: DuckDBPyConnection) -> dict[str, Any]:

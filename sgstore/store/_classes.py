@@ -56,11 +56,11 @@ ORDER BY ingested_at, name
 
 
 _TOGETHER: Final = 2000
-"""Frames of traces whose classes one transaction brings in, about: with short traces it takes longest."""
+"""Approximate number of frames whose classes are added in one transaction."""
 _REMEMBERED: Final = 4096
-"""Frames whose classes are remembered."""
+"""Number of frames with cached classes."""
 _FEW_EDGES: Final = 1 << 16
-"""Edges of frames up to which all their abstractions are in memory at once."""
+"""Up to this number of edges, all abstractions are in memory at once."""
 
 
 class TraceClasses:

@@ -40,7 +40,7 @@ MESSAGES: Final = {
     "channel": "INTEGER",
     **dict.fromkeys(("log_time_ns", "chunk_offset", "offset", "length"), "BIGINT"),
 }
-"""Columns of the messages that were seen, which are staged like a table until they are joined to frames."""
+"""Columns of messages, staged like a table until the join to frames."""
 
 TEXTS: Final = {"VARCHAR", "VARCHAR[]", "JSON", "TIMESTAMP", "UUID"}
 
@@ -138,7 +138,7 @@ ORDERS: Final = {
     "map_node": "node_id DESC",
     "message": "",
 }
-"""Order of the rows of tables, in a trace and in a store that is written anew; others go by all columns."""
+"""Row order of tables in a trace and in a rewritten store. Other tables are sorted by all columns."""
 
 MASKS: Final = (
     *(
@@ -153,7 +153,7 @@ MASKS: Final = (
         "derived_edge",
     ),
 )
-"""Tables with a mask: rows that differ in nothing else are one."""
+"""Tables with a mask. Rows that differ only in the mask are merged."""
 
 
 STATES: Final = ("state", "world_state")
@@ -165,7 +165,7 @@ REPEATED: Final = {
     "world_gap_single": "world_gap_repeated",
     "gap_single": "gap_repeated",
 }
-"""Tables with a row a frame, and those with a row for several frames of a bucket."""
+"""Tables with one row per frame → tables with one row for several frames of a bucket."""
 
 
 @cache
@@ -292,10 +292,10 @@ _STEP: Final = 0x9E3779B97F4A7C15
 _FIRST: Final = np.uint64(0xBF58476D1CE4E5B9)
 _SECOND: Final = np.uint64(0x94D049BB133111EB)
 _MISSING: Final = np.uint64(0x6E756C6C6E756C6C)
-"""What stands for NULL."""
+"""Hash word of NULL."""
 
 _AT_ONCE: Final = 1 << 13
-"""Rows that are mixed together: their words stay in the cache of a processor."""
+"""Rows hashed at once: their words fit into the processor cache."""
 
 _ASSIGNED: Final = {
     ("trace", "name"),
@@ -303,7 +303,7 @@ _ASSIGNED: Final = {
     ("map", "name"),
     ("recording", "place"),
 }
-"""Tables and columns to which a store gives a value of its own."""
+"""Tables and columns whose values the store assigns."""
 
 
 @dataclass(slots=True)

@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 
 WINDOW: Final = 4_000
-"""Frames whose messages are read at once."""
+"""Frames to read messages of at once."""
 
 GRAPHS: Final = 500
-"""Frames whose graphs are read at once; a thousand edges of a frame, and 45 values of each node, are usual."""
+"""Frames to read graphs of at once. A frame usually has a thousand edges, and 45 values per node."""
 
 DIGEST_BYTES: Final = 16
 
@@ -57,14 +57,14 @@ _TABLES: Final = {
     ),
     "lane_gaps": ("src", "dst", "gap"),
 }
-"""Views, and the columns of them that a graph is made of. Changing them changes every digest."""
+"""Views and columns that define a graph. A change here changes every digest."""
 
 _LATER: Final = {
     "(SELECT * FROM nodes WHERE gear IS NOT NULL OR hand_brake IS NOT NULL)": (
         *("node_id", "gear", "hand_brake"),
     ),
 }
-"""The same of columns that came later. Where they are not known, digests are what they were without them."""
+"""Newer columns that define a graph. If their values are missing, the digest does not include them."""
 
 _MESSAGES: Final = f"""
 SELECT p.frame_id, p.channel, p.log_time_ns, p.chunk_offset, p.message_offset, p.length
@@ -80,7 +80,7 @@ GROUP BY f.trace_id, p.chunk_offset, p."offset"
 """
 
 TOGETHER: Final = 200_000
-"""About how many frames are asked about at once, of whole traces."""
+"""Approximate number of frames per query, in whole traces."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     from sgstore.store._lease import Stamp
 
 MOST_STATES: Final = 1 << 20
-"""States of tracks that are kept; of a trace with more, those of a pair alone are read."""
+"""Largest number of cached track states. For a longer trace, only the states of the pair are read."""
 MOST_PAIRS: Final = 1 << 20
-"""Pairs whose measures are kept."""
+"""Number of pairs with cached measures."""
 _FILES: Final = 4
-"""Files of which they are kept."""
+"""Number of files with cached measures."""
 
 _WANTED: Final = re.compile(r"\b(recorded|encounters)\b", re.IGNORECASE)
 _FUNCTION: Final = "sgstore_recorded"

@@ -40,7 +40,7 @@ class GivenTable:
 
 
 Given = GivenTable | tuple[str, Mapping[str, object]]
-"""A table that a statement is given: its rows, or a statement of ours that makes it, and its values."""
+"""Temporary table of a statement: its rows, or trusted SQL that creates it, with parameter values."""
 
 
 def give(connection: DuckDBPyConnection, given: Iterable[Given]) -> None:
@@ -58,7 +58,7 @@ def give(connection: DuckDBPyConnection, given: Iterable[Given]) -> None:
 
 
 _BLOCK: Final = ":block"
-"""The name of the rows on their way; no table of a user's is called so."""
+"""Name of the registered rows during an insert. No user table has this name."""
 
 
 def _insert(
@@ -82,7 +82,7 @@ _NUMBERS: Final[Mapping[str, tuple[str, object]]] = {
     "DOUBLE": ("fi", 0.0),
     "BOOLEAN": ("b", False),
 }
-"""Kinds of arrays that the database takes as values of a type, and what stands there for NULL."""
+"""Array kinds that DuckDB accepts for a type, with the stand-in for NULL."""
 
 
 def _arrays_of(block: Sequence[list[Any]], kinds: Sequence[str]) -> dict[str, Any] | None:

@@ -39,10 +39,10 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 WINDOW: Final = 8
-"""Buckets that are read at once."""
+"""Buckets to read at once."""
 
 _MAPS: Final = 4
-"""Maps that are remembered, because many frames lie on one."""
+"""Number of cached maps. Many frames share a map."""
 
 _GROUNDS: Final = """
 SELECT enum_code(kind) AS kind, coalesce(name, '') AS name, coalesce(lane_type, '') AS lane_type,
@@ -126,7 +126,7 @@ _MAP_PLACES: Final = (
 _MAP_COURSES: Final = "SELECT lane, start, curvature, slope FROM map_course WHERE map_id = $map_id"
 
 FIRST: Final = 2_000
-"""Frames of any traces that are read first; then as many as have about so many edges together:"""
+"""Frames of any traces in the first read. Later reads are limited by the number of edges:"""
 _EDGES_TOGETHER: Final = 2_000_000
 
 

@@ -37,14 +37,14 @@ if TYPE_CHECKING:
 
 
 MEMORY: Final = 256 << 20
-"""Most memory for reading a table; bytes. Beyond it the database spills to disk."""
+"""Memory limit for reading a table; bytes. Beyond it, the database writes temporary files."""
 
 MAX_TABLES: Final = 64
-"""Tables beside one store."""
+"""Largest number of user tables of a store."""
 
 _NAME: Final = re.compile(r"[A-Za-z_]\w{0,62}", re.ASCII)
 _TAKEN: Final = frozenset({"ego", "env", "frame", "trace"})
-"""Names that mean something else in patterns."""
+"""Names with another meaning in patterns."""
 
 _READERS: Final = {
     ".parquet": "read_parquet({})",

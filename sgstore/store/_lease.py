@@ -41,10 +41,10 @@ if TYPE_CHECKING:
 
 
 LEASE_S: Final = 1.0
-"""How long a file stays open after a question; s."""
+"""Time that a file stays open after a query; s."""
 
 LOOK_S: Final = 0.05
-"""How often somebody looks whether another process waits for a file that is kept open; s."""
+"""Interval of the check for waiting writers of an idle open file; s."""
 
 
 def stamp_of(path: Path) -> Stamp:
@@ -126,7 +126,7 @@ class AttachedFile:
 
 
 _instances: Final[dict[tuple[object, ...], DuckDBPyConnection]] = {}
-"""Instances of the database that are kept as long as the process lives, by what they are for."""
+"""Database instances for the life of the process, by key."""
 
 _instances_lock = threading.Lock()
 
@@ -295,7 +295,7 @@ class _Watch:
 _watch = _Watch()
 
 files: Final[dict[Path, OpenFile]] = {}
-"""The files of stores that this process has asked for, by their paths."""
+"""Store files used by this process, by path."""
 
 
 def give_back(patience_s: float = 0.0) -> None:
@@ -317,7 +317,7 @@ def _end() -> None:
 
 
 _of_parents: Final[list[object]] = []
-"""What a process that was forked off has of its parent's: the database survives no fork, not even its end."""
+"""Objects inherited over a fork. They must stay alive, because DuckDB objects cannot be closed after a fork."""
 
 
 def _begin_anew() -> None:

@@ -49,7 +49,7 @@ _KINDS: Final = {
 
 
 _NO_NAME: Final = frozenset("?\\")
-"""Characters that DuckDB takes for the end of a path, or for a slash."""
+"""Characters that DuckDB treats as the end of a path, or as a slash."""
 
 
 def refuse_name(path: Path) -> None:
@@ -207,31 +207,31 @@ except ImportError:  # not on Windows: there writers and readers take their turn
 
 
 STORAGE_VERSION: Final = "v1.5.0"
-"""Format of the file: the newest that every supported DuckDB can read."""
+"""File format version: the newest one that every supported DuckDB can read."""
 
 BLOCK_SIZE: Final = 1 << 16
-"""Size of the blocks of a new file; bytes. Each of some thirty tables takes whole ones, however few rows."""
+"""Block size of a new file; bytes. Each of about thirty tables uses whole blocks, even for few rows."""
 
 _BUSY: Final = ("Could not set lock on file", "Conflicting lock is held")
-"""What DuckDB says when another process has the file."""
+"""Words in the DuckDB error if another process uses the file."""
 
 _HELD_HERE: Final = (
     "Unique file handle conflict",
     "different configuration than existing connections",
 )
-"""What it says when this process has it already, by a connection that is none of ours."""
+"""Words in the DuckDB error if another connection of this process uses the file."""
 
 WAIT_S: Final = 60.0
-"""How long to wait for others that read or write; s."""
+"""Longest wait for other readers or writers; s."""
 
 _HELD_HERE_S: Final = 0.25
-"""How long to wait for such a connection, which may just be closing; s."""
+"""Longest wait for another connection of this process, which may be closing; s."""
 
 _SURPRISES: Final = (
     *(ArithmeticError, AssertionError, AttributeError, LookupError, StopIteration),
     *(TypeError, ValueError),
 )
-"""What our code ends in where the rows of a store are not as they must be."""
+"""Exceptions that invalid store rows can cause."""
 
 _PAUSE: Final = 0.005, 0.1
 """First and longest pause between two attempts; s."""
@@ -261,7 +261,7 @@ _CAREFUL: Final = (
     *("common_aggregate", "common_subplan", "compressed_materialization", "duplicate_groups"),
     *("join_filter_pushdown", "late_materialization", "statistics_propagation", "top_n"),
 )
-"""Optimizers of DuckDB that queries are fast enough without."""
+"""DuckDB optimizers that can be disabled after a fault."""
 
 
 def _be_careful(connection: DuckDBPyConnection) -> None:
@@ -280,7 +280,7 @@ def default_memory() -> int:
 
 
 SPILL: Final = 10 * 10**9
-"""Most that reading puts on disk beside its memory, unless it is allowed more; bytes."""
+"""Default limit of temporary files for reading; bytes."""
 
 
 def memory_setting(memory: int) -> str:

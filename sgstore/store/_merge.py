@@ -39,22 +39,22 @@ if TYPE_CHECKING:
     from sgstore.store._rows import Given, Parameters
 
     Written = tuple[Path | None, tuple[str, ...], int, list[tuple[Any, ...]]]
-    """The file of a part, if there is one; types; number of rows; the rows, if they are few."""
+    """Partial result: file or ``None``, types, number of rows, and the rows if few."""
 
 
 _EXACT: Final = {"HUGEINT": "DECIMAL(38,0)", "UHUGEINT": "DECIMAL(38,0)"}
-"""Types that Parquet has not, and those that hold the same whole numbers."""
+"""Types that Parquet lacks → types for the same integers."""
 
 _NOTHING: Final = ""
-"""The type of a column of which no value is known."""
+"""Type of a column with only NULL values."""
 
 FEW: Final = 200
-"""Rows that are told as values: to write them to a file, and to read that, takes as long as a question."""
+"""Largest number of rows kept in memory. A file would take as long as a query."""
 
 _PLAIN: Final = frozenset(
     {"BOOLEAN", "TINYINT", "SMALLINT", "INTEGER", "BIGINT", "FLOAT", "DOUBLE", "VARCHAR"}
 )
-"""Types whose values are the same in Python, and in JSON; those of an enumeration are texts there."""
+"""Types with equal values in Python and JSON. Enumeration values are texts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +207,7 @@ def write_coded(file: StoreFile, abstraction: str, to: Path) -> PartFile:
 
 
 Parts = dict[str, list[PartFile]]
-"""Table of a statement → its rows; those of a table have the same columns."""
+"""Table of a statement → files of its rows, with the same columns."""
 
 
 @contextmanager

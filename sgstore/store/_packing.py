@@ -26,27 +26,27 @@ if TYPE_CHECKING:
 Whole: TypeAlias = "NDArray[np.signedinteger[Any]]"
 
 Columns: TypeAlias = "dict[str, NDArray[Any]]"
-"""A table's columns by name, all of one length. What is missing is not finite, :data:`MISSING`, or empty."""
+"""Columns of a table by name, of equal length. Missing values are non-finite, :data:`MISSING`, or empty."""
 
 MISSING: Final = -(1 << 31)
-"""A whole number that is missing. A masked array would say it better, but DuckDB 1.5 does not see masks."""
+"""Missing integer value. DuckDB 1.5 ignores the mask of a masked array."""
 
 EDGE_ROWS: Final = 1 << 18
-"""Edges that become rows together: what is made of more on the way takes more memory than they do."""
+"""Edges converted to rows at once, to limit the memory for intermediate arrays."""
 
 BUCKET_BITS: Final = 18
-"""Bits of a bucket's number in its trace."""
+"""Bits of the bucket number in a trace."""
 FRAME_BITS: Final = 6
-"""Bits of a frame's number in its bucket."""
+"""Bits of the frame number in a bucket."""
 MAX_FRAMES: Final = BUCKET_FRAMES << BUCKET_BITS
 
 SEQ_BITS: Final = BUCKET_BITS + FRAME_BITS
-"""Bits of a frame's id below those of its trace."""
+"""Bits of a frame id below the trace id."""
 
 TOLERANCE: Final = f"greatest({TOLERANCE_NS}, coalesce(period_ns, 0) // {TOLERANCE_SHARE})"
 """SQL: :func:`sgstore.world.tolerance_ns` of a trace's ``period_ns``."""
 LONGEST_STEP: Final = f"{GAP} * period_ns + {TOLERANCE}"
-"""SQL: :func:`sgstore.world.longest_step_ns` of it."""
+"""SQL: :func:`sgstore.world.longest_step_ns` of a trace's ``period_ns``."""
 
 
 @dataclass(slots=True)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 _SAMPLE: Final = 8192
-"""Messages from which the period of a channel is told: its first ones, so that memory stays bounded."""
+"""Number of first messages used to estimate the period of a channel."""
 
 
 @dataclass(slots=True)
@@ -61,11 +61,11 @@ class Periods:
 
 
 FRAMES: Final = -1
-"""The frames themselves, as a channel of :class:`Periods`."""
+"""Channel number of the frames themselves in :class:`Periods`."""
 
 
 _AT_ONCE: Final = 250_000
-"""Messages of a channel that are in memory together."""
+"""Messages of a channel in memory at once."""
 
 _PLACE: Final = ("log_time_ns", "chunk_offset", "offset", "length")
 
@@ -247,7 +247,7 @@ def _no_payload(connection: DuckDBPyConnection, frame: FrameRef, channel: str) -
 # Events of a trace → rows, each with the frame that is nearest in time --------------------------
 
 MOST_WAITING: Final = 100_000
-"""Events that wait for the frames to come; if there are more, they go to the last frame so far."""
+"""Largest number of held-back events. Beyond it, they are assigned to the last frame so far."""
 
 
 class Happenings:

@@ -52,7 +52,7 @@ SHARED: Final = {
     "config": ("config",),
     "map": ("map", "map_node", "map_edge", "map_reach", "map_place", "map_course"),
 }
-"""Tables of what many traces may have: it comes into a store once, and is known there by its digest."""
+"""Tables with data shared by traces. Each row is stored once, by its digest."""
 
 
 class PresentError(StoreError):
@@ -277,7 +277,7 @@ _OWNED: Final = {
     "bucket": "bucket >= $trace_id << 18 AND bucket < ($trace_id + 1) << 18",
     "frame_id": "frame_id >= $trace_id << 24 AND frame_id < ($trace_id + 1) << 24",
 }
-"""Column → condition on the rows of a trace; of a table that has several, the first counts."""
+"""Column → SQL condition for the rows of a trace. The first column present in a table counts."""
 
 ORPHANS: Final = "".join(
     f"DELETE FROM store.inside.{table} WHERE {owner}_id NOT IN"
@@ -289,7 +289,7 @@ ORPHANS: Final = "".join(
     f" (SELECT {owner}_id FROM store.inside.{owner});\n"
     for owner in (*SHARED, "trace")
 )
-"""Statements that delete what no trace has any more."""
+"""SQL that deletes data without a trace."""
 
 
 def owned(connection: DuckDBPyConnection, database: str) -> Iterator[tuple[str, str]]:
@@ -325,7 +325,7 @@ def _delete(connection: DuckDBPyConnection, trace_id: int) -> None:
 
 
 _SCATTERED: Final = (*STATES, *REPEATED, *REPEATED.values(), "frame", *MASKS, "derived_gap")
-"""The large tables, sorted over all traces: then a scan for one relation or kind skips all else."""
+"""Large tables, sorted across all traces. A scan for one relation or kind can then skip other rows."""
 
 
 def copy_sorted(connection: DuckDBPyConnection) -> None:
@@ -346,7 +346,7 @@ def copy_sorted(connection: DuckDBPyConnection) -> None:
 # What is added to traces that are in a store already: built aside, brought in by one transaction, noted ----
 
 STEP: Final = 64
-"""Buckets whose rows are in memory at once: 3,840 frames."""
+"""Buckets of rows in memory at once: 3,840 frames."""
 
 
 @contextmanager

@@ -44,13 +44,13 @@ BATCH: Final = 10_000
 """Rows of a batch."""
 
 IN_NOTEBOOK: Final = 20
-"""Rows that a notebook shows of an answer."""
+"""Number of result rows shown in a notebook."""
 
 MAX_SQL: Final = 1 << 20
 """Longest statement of a user; characters."""
 
 _TO_A_TABLE: Final = re.compile(rf'Did you mean "{INSIDE}\.\w+"\?')
-"""What the database says of a name that it does not know: the tables beneath the views are nobody's to ask."""
+"""Hint in DuckDB errors at an internal table. Users can query only the views."""
 
 _READS: Final = {"SELECT", "EXPLAIN"}
 """Types of statements that only read: WITH, FROM, VALUES, TABLE, DESCRIBE, SHOW and SUMMARIZE are SELECT."""
@@ -503,7 +503,7 @@ _ARROW: Final = {
     "BOOLEAN": "bool_",
     "VARCHAR": "string",
 }
-"""Types of the database as functions of pyarrow; others are told by their values."""
+"""Database type → pyarrow function. Other types are inferred from values."""
 
 
 _ENUM: Final = re.compile(r"ENUM\(('([^']|'')*'(, )?)*\)")
@@ -513,7 +513,7 @@ _EXTRAS: Final = {
     "pandas": ("data frames", "pandas"),
     "polars": ("data frames of polars", "polars"),
 }
-"""Packages that only some have: what for, and the extra that brings them."""
+"""Optional packages: purpose, and the extra that installs them."""
 
 
 def _package(name: str) -> Any:
@@ -590,7 +590,7 @@ ROW_GROUP: Final = 122_880
 """Rows of a row group."""
 
 _TOGETHER: Final = 50_000
-"""Rows that are written at once, and tell the types of the columns where nobody else does."""
+"""Rows written at once. They also determine column types that are not given."""
 
 _TYPES: Final = ((bool, "BOOLEAN"), (int, "BIGINT"), ((int, float), "DOUBLE"))
 
@@ -855,7 +855,7 @@ def count_parquet(file: Path) -> tuple[int, tuple[str, ...]]:
 # Tables that a statement of a user's is given ------------------------------------------------------
 
 UserTablesGiven = Callable[[], Iterable[Given]]
-"""The function of the tables that a statement of a user's speaks of: asked while the store is open."""
+"""Function that returns the temporary tables of a user's statement. Called while the store is open."""
 
 
 def give_to_user(

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 INSIDE: Final = "inside"
-"""Schema of the tables of a store, with views of ours. Public views, and types of columns, are in ``main``."""
+"""Schema of a store's tables and internal views. Public views and column types are in ``main``."""
 
 _HEAD: Final = re.compile(r"-- sgstore: what is in a store, version (\d+)\.")
 
@@ -83,7 +83,7 @@ BEYOND: Final = {
         "gap_repeated",
     )
 }
-"""Tables of graphs, and those with the same columns for what is known beyond graphs."""
+"""Graph tables → tables of the data outside the graphs, with the same columns."""
 
 _VIEWS_BEYOND: Final[Mapping[str, Mapping[str, str]]] = {
     "nodes": BEYOND,
@@ -92,7 +92,7 @@ _VIEWS_BEYOND: Final[Mapping[str, Mapping[str, str]]] = {
     "criticality": {"state": "known_state"},
     "lane_dists": {"lane_state": "known_lane_state"},
 }
-"""Views of graphs, and tables in place of theirs: those of the views of what is known beyond graphs."""
+"""Views of graphs → replaced tables, which give the views with the data outside the graphs."""
 
 
 def _between(text: str, before: str, behind: str) -> str:
@@ -111,7 +111,7 @@ TEXT: Final = (
     "c4ef8af8b47110ce497451f3a336af2e903f6d7fa59c5abeb961dd8e24bdb895",
     "7535a0e47dd54aff42b430f36fcecb652340d281021f582733125e752a644a4c",
 )
-"""Digest of the text of ``schema.sql``, and that of its statements: to take these apart takes 10 ms."""
+"""Digests of the text and of the statements of ``schema.sql``. Parsing the statements takes 10 ms."""
 
 
 @cache
@@ -316,14 +316,14 @@ def _altered(connection: DuckDBPyConnection, database: str, objects: Objects) ->
 
 
 _compared: dict[Objects, tuple[str, ...]] = {}
-"""Faults of the objects of stores that were compared: those of one store are mostly those of the next."""
+"""Cached faults by store objects. Different stores mostly have equal objects."""
 
 _MOST_COMPARED: Final = 64
 
 KNOWN: Final = "05836dad03946c1db5d515a5db874ded16623d29bc1b39d0124b746a1007120f"
-"""Digest of the objects of a store as DuckDB 2 tells them: to compare words takes 30 ms.
+"""Digest of a store's objects in DuckDB 2. A comparison of tokens takes 30 ms.
 
-What another version tells otherwise is compared word by word.
+Objects of other versions are compared token by token.
 """
 
 
@@ -612,4 +612,4 @@ def _attached(connection: DuckDBPyConnection, database: str) -> Iterator[str]:
 
 
 SCHEMA_VERSION: Final = schema_version()
-"""Version of ``schema.sql``. A store of another version is refused: a store is a cache of its traces."""
+"""Version of ``schema.sql``. A store of another version is rejected: it can be rebuilt from its traces."""

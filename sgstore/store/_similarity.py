@@ -112,7 +112,7 @@ class Example:
 
 
 BESIDE_S: Final = 5.0
-"""Frames of the same trace that are nearer than this are beside an example, and like it for that reason; s."""
+"""Frames of the same trace within this time are near the example, and similar for that reason; s."""
 
 
 def example_of(file: StoreFile, ref: int | str, name: str, ignored: Sequence[str]) -> Example:

@@ -53,7 +53,7 @@ FILE: Final = "tables"
 
 _ALIGNED: Final = 8
 _HEAD: Final = 8
-"""Bytes that say how long the line is."""
+"""Size of the length field of a header line; bytes."""
 _PLAIN: Final = frozenset({"|b1", "|i1", "<i2", "<i4", "<i8", "<f4", "<f8"})
 
 
@@ -268,26 +268,26 @@ def _narrowed(values: NDArray[Any]) -> tuple[dict[str, Any], NDArray[Any] | None
 # Tables in memory, and in the file ----------------------------------------------------------------------------
 
 PART_ROWS: Final = 20_000
-"""Rows of all growing tables together that are kept in memory."""
+"""Rows of all growing tables in memory."""
 
 PIECE_ROWS: Final = 60_000
-"""Most rows of a table that are read and inserted together."""
+"""Largest number of rows read and inserted at once."""
 
 MERGE_ROWS: Final = 1 << 19
-"""Rows of a table with masks at which the pieces of masks are merged before a bucket is whole."""
+"""Number of rows at which partial masks are merged before their bucket is complete."""
 
 _GROWING: Final = (
     *("state", "lane_single", "gap_single", "node", "edge", "frame_class", "lane_role"),
     *("world_state", "world_lane_single", "world_gap_single", "world_node", "world_edge"),
     *("later_class", "derived_node", "derived_edge", "derived_gap", "message"),
 )
-"""The tables that grow with a trace."""
+"""Tables that grow with a trace."""
 
 _ALONG: Final = ("frame", "imported", "attribute")
-"""Tables that grow, too, and by which is not told whether there are many rows."""
+"""Tables that also grow, but do not count for the row limit."""
 
 _CUT: Final = frozenset({*_GROWING, *_ALONG})
-"""All tables that are cut into parts."""
+"""All tables split into parts."""
 
 _RUNS: Final = {
     "node": "kind",
@@ -295,7 +295,7 @@ _RUNS: Final = {
     "derived_node": "moves",
     "derived_edge": "relation",
 }
-"""Tables whose pieces of masks may be too many for memory; and the first column that tells their rows apart."""
+"""Tables whose partial masks may exceed memory → first sort column."""
 
 
 class StagedRows(NamedTuple):
@@ -509,7 +509,7 @@ class Staging:
 # Databases in memory ------------------------------------------------------------------------------------------
 
 MEMORY: Final = 48 << 20
-"""Most memory of a database that publishes; bytes. Beyond it its tables spill to disk."""
+"""Memory limit of a publishing database; bytes. Beyond it, the database writes temporary files."""
 
 
 def scratch(spill: Path, *, memory: int = 0, threads: int = 1) -> DuckDBPyConnection:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sgstore.store._packing import Columns
 
 MOST_FRAMES: Final = 20_000
-"""Frames whose states are given at once."""
+"""Largest number of frames per call."""
 
 _STATE: Final = {
     "node": "node_id",

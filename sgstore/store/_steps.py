@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 _LOOK_S: Final = 0.5
-"""How often is looked for a signal where waiting is not interrupted by one (on Windows); s."""
+"""Interval of signal checks if signals do not interrupt waiting (on Windows); s."""
 _AGAIN_S: Final = 0.01
-"""How often the database is interrupted until it has ended: one may come before the statement begins; s."""
+"""Interval of repeated interrupts: one may arrive before the statement begins; s."""
 
 
 def interruptible(connection: DuckDBPyConnection, step: Callable[[], T]) -> T:
@@ -64,7 +64,7 @@ def interruptible(connection: DuckDBPyConnection, step: Callable[[], T]) -> T:
 
 
 interrupted: Final[set[int]] = set()
-"""Connections whose statement is to end, by ``id``: DuckDB does not stop functions of ours, so they ask."""
+"""Ids of interrupted connections. Python functions check it, because DuckDB does not stop them."""
 
 
 def interrupt(connection: DuckDBPyConnection) -> None:

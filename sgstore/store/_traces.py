@@ -227,7 +227,7 @@ FROM trace t JOIN recording r ON r.recording_id = t.recording_id JOIN config c O
 
 
 ROOT: Final = "SGSTORE_ROOT"
-"""Variable of the environment: a folder in which recordings are looked for first."""
+"""Environment variable with the first folder to search for recordings."""
 
 
 def uri_of(path: Path) -> str:

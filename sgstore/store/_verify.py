@@ -261,7 +261,7 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
         WHERE n.kind IS DISTINCT FROM 'lane'""",
     ),
 )
-"""What is looked at, what is wrong where a statement gives rows, and that statement: ids of traces at fault."""
+"""Check name, fault text, and the SQL that returns the ids of faulty traces."""
 
 
 def verify_file(path: str | Path, *, recordings: bool = False) -> Verification:

@@ -64,7 +64,7 @@ class OnMap:
 
 
 _ROWS: Final[WeakKeyDictionary[RoadMap, StagedRows]] = WeakKeyDictionary()
-"""The rows of a road map, with its number, which is a digest of its text; forgotten with the map."""
+"""Cached table rows of each road map. An entry lives as long as its map."""
 
 
 class Segment:

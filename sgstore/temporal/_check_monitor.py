@@ -79,13 +79,13 @@ if TYPE_CHECKING:
 
 
 NEVER: Final = 1 << 62
-"""Later than any frame."""
+"""Frame number after all frames."""
 
 REMEMBERED: Final = 100_000
-"""Steps that are remembered before they are begun anew."""
+"""Largest number of cached transitions before a reset."""
 
 Duties = tuple["frozenset[Term] | Term | None", ...]
-"""For each part of a formula: what is open of an ``ALWAYS`` at former frames, or what is open of another."""
+"""Open obligations of each part of a formula: a list for an ``ALWAYS``, else one term."""
 
 
 class ObligationState:

@@ -49,17 +49,17 @@ if TYPE_CHECKING:
     from sgstore.lang.ir import BoundCheck
 
 STATE: Final = "state"
-"""An operation of no query: 0 if a value is known, 1 if it is unknown; NULL if its entities are absent."""
+"""Internal operation: 0 for a known value, 1 for an unknown value, NULL for absent entities."""
 
 POSSIBLY: Final = "possibly"
-"""An operation of no query: a condition, unknown parts of it counting as true."""
+"""Internal operation: a condition whose unknown parts count as true."""
 
 IN_FAVOUR: Final = "in favour"
-"""An operation of no query: a condition that counts absence as true."""
+"""Internal operation: a condition that counts absence as true."""
 
 FAVOURABLE: Final = "+"
 UNFAVOURABLE: Final = "-"
-"""Ends of the names of unknown propositions that count in the first and in the second evaluation."""
+"""Name suffixes of unknown propositions that count in the first or the second evaluation."""
 
 SIGNS: Final = (FAVOURABLE, UNFAVOURABLE)
 
@@ -92,13 +92,13 @@ class Reading:
 
 
 WHOLE: Final = Reading(FAVOURABLE)
-"""The reading of a check."""
+"""Reading of a whole check."""
 
 WITHOUT_ABSENCE: Final = Reading(FAVOURABLE, absent=True)
-"""The reading in which conditions on absent entities count in favour of a check."""
+"""Reading in which conditions on absent entities count in favour of a check."""
 
 CERTAIN: Final = Reading("", absent=False)
-"""The reading of what must be known to be true."""
+"""Reading of a condition that must be known to be true."""
 
 
 def base_name(name: str) -> str:
@@ -535,7 +535,7 @@ def _has_state(expression: b.Bound) -> bool:
 
 
 _OF_CONDITIONS: Final = frozenset({"run_length", "since_true", "robustness"})
-"""Courses of conditions."""
+"""Time functions of conditions."""
 
 
 def _with_possible(expression: b.Bound) -> b.Bound:
@@ -590,7 +590,7 @@ def _state_of(value: b.Bound) -> b.Operation:
 
 
 PlannedCheck = tuple[CheckPlan, f.Formula, "f.Formula | None", dict[int, f.Formula]]
-"""The plan of a check, its formula, what resets it, and what restricts quantifiers, by their numbers."""
+"""Plan, formula, reset formula and guards (by quantifier number) of a check."""
 
 
 def empty_plan(check: BoundCheck) -> CheckPlan:

@@ -83,11 +83,11 @@ if TYPE_CHECKING:
 
 
 VIOLATED, UNKNOWN, PENDING, HOLDS = range(4)
-"""What is known of a binding, in order: the smaller of two holds for both, the greater for either."""
+"""Verdict codes in order. The minimum is the code of a conjunction, the maximum of a disjunction."""
 
 
 NEWCOMER: Final = -(1 << 60)
-"""From here on ids of entities that are in no frame so far."""
+"""First id of placeholders for future entities."""
 
 
 # Quantifiers: which entities of a trace they are about, and what is true of all, or of some, of them ----
@@ -662,7 +662,7 @@ class Judged:
 
 
 _BindingVerdict = tuple[tuple[Violation, ...], "Statuses | None"]
-"""Violations of one binding, or of a check without quantifiers; and its status at each frame, if asked for."""
+"""Violations of one binding, or of a check without quantifiers; and its status at each frame, if requested."""
 
 
 class StoreCheck:

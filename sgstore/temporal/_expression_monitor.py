@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 
 _Group = tuple[int, "Key", int]
-"""Step that a match begins with, nodes by name, and the run: of each one match counts."""
+"""First step, nodes by name, and run of a match. Only one match per group counts."""
 
 _Standing = tuple["StepWay", int, "Binding", "StepFrame"]
-"""How far a match has come: its sequence, the number of the step there, nodes by name, and the frame."""
+"""Progress of a match: sequence, step number, nodes by name, and frame."""
 
 _ANY = -1
-"""In place of the step and of the run, where of all matches of a binding only the first one counts."""
+"""Placeholder for step and run if only the first match of a binding counts."""
 
 
 def sequence_monitor(

@@ -23,17 +23,17 @@ if TYPE_CHECKING:
     from sgstore.temporal._sequence_monitor import FrameTime
 
 MOST_EDGES: Final = 100_000
-"""Edges of the last graphs that are kept; some 30 MB."""
+"""Largest number of edges of stored graphs; about 30 MB."""
 
 MOST_FOLLOWED: Final = 8
-"""Matches and curves that are followed on, the last ones that were asked for."""
+"""Number of followed matches and curves, the latest requests."""
 
 LONGEST_CURVE: Final = 3000
-"""Frames of a curve."""
+"""Largest number of frames of a curve."""
 
 OF_NODE: Final = (*POSE, *INPUTS, "speed", "accel")
 OF_PAIR: Final = tuple(PAIR_FUNCTIONS)
-"""Numbers that have a curve."""
+"""Pair values that can be followed as a curve."""
 
 W = TypeVar("W", "FollowedMatch", "FollowedCurve")
 

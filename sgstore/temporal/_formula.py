@@ -41,7 +41,7 @@ class Bound:
 
 
 WHOLE: Final = Bound()
-"""From here to the end of the trace, or to its beginning."""
+"""Unlimited bound: to the end, or to the start, of the trace."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +212,7 @@ LOGIC: Final[dict[str, Callable[..., Formula]]] = {
     "XOR": _xor,
     "IMPLIES": _implies,
 }
-"""What makes a formula of operands, by word."""
+"""Constructors of logical formulas, by word."""
 
 
 def _next(operand: Formula, _: Bound) -> Formula:
@@ -239,7 +239,7 @@ TEMPORAL: Final[dict[str, Callable[..., Formula]]] = {
     "SINCE": Since,
     "RELEASE": release,
 }
-"""What makes a formula of operands and a bound, by word."""
+"""Constructors of temporal formulas from operands and bound, by word."""
 
 
 # As text, for ``explain`` -------------------------------------------------------------------------
@@ -480,10 +480,10 @@ def least(terms: Iterable[Term], word: str = "and") -> list[Term]:
 
 
 Entry = tuple[int, int, Term]
-"""A frame back (time, number) at which the right side of a bounded *since* stood, and what that still needs."""
+"""Past frame (time, number) of the right side of a bounded *since*, with its open term."""
 
 Past = tuple[tuple[Term, tuple[Entry, ...]], ...]
-"""What the operators of the past keep from one frame to the next: what stood for each, and its entries."""
+"""Memory of the past operators between frames: term and entries of each."""
 
 
 class Progression:

@@ -90,7 +90,7 @@ class ReturnedValues:
 
 
 AT_FRAME: Final = -1
-"""In place of the number of a step: the one frame that a value is of."""
+"""Placeholder for a step number: the single frame of a value."""
 
 
 # Over columns -------------------------------------------------------------------------------------

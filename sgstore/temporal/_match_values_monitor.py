@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     Entry = tuple[Memory, tuple[Fold, ...]]
 
 Span = tuple[int, int]
-"""Numbers of the first and the last frame of a part of a match."""
+"""First and last frame number of a part of a match."""
 
 
 class _Course:

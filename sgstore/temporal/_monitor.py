@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 
 LIVE: Final = "carla://"
 PORT: Final = 2000
-"""Where a CARLA server listens by default."""
+"""Default port of a CARLA server."""
 
 
 @dataclass(slots=True)

@@ -175,13 +175,13 @@ def words() -> NDArray[np.str_]:
 
 
 CELLS: Final = 4_000_000
-"""Bindings times frames that are worked on at once."""
+"""Product of bindings and frames processed at once."""
 
 ROW_BYTES: Final = 100
-"""Memory that a binding of two or three nodes in a frame takes while it is put in order; bytes."""
+"""Memory for sorting one row of two or three nodes; bytes."""
 
 EDGE_BYTES: Final = 100
-"""Memory that an edge of a binding takes beside its nodes, as a word; bytes."""
+"""Additional memory for one edge of a row; bytes."""
 
 BUCKET_SHIFT: Final = 6
 """``frame_id >> 6`` is the bucket of a frame."""
@@ -189,10 +189,10 @@ BUCKET_SHIFT: Final = 6
 _LAST: Final = (1 << 63) - 1
 
 MOST_BINDINGS: Final = 5_000_000
-"""Most combinations of nodes that are made of one trace, whatever frames they have."""
+"""Largest number of node combinations of one trace."""
 
 NODES_NAMED: Final = 1_000
-"""Most nodes that a question is narrowed to by their ids: each is a value of its statement."""
+"""Largest number of node ids that narrow a query: each id is a parameter."""
 
 
 @dataclass(slots=True)

@@ -470,7 +470,7 @@ MARGINS: Final[Mapping[str, Callable[[b.Bound, b.Bound], b.Bound]]] = {
     "=": _equal,
     "<>": _apart,
 }
-"""Margins of comparisons: how far they hold; below zero how far they fail."""
+"""Comparison → its margin: positive if it holds, negative if it fails."""
 
 
 def has_margin(comparison: b.Operation) -> bool:

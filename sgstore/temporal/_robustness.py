@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 
 MARGIN_CELLS: Final = 16
-"""Times the memory of a truth value that the margins of a formula take, some being held at once."""
+"""Memory of margins relative to truth values."""
 
 
 @dataclass(frozen=True, slots=True)

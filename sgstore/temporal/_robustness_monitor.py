@@ -71,11 +71,11 @@ if TYPE_CHECKING:
     Margins = NDArray[Any]
 
 MOST_OPEN: Final = 8
-"""Most operators that look ahead without a bound: each doubles the memory of a margin."""
+"""Largest number of unbounded forward operators: each doubles the memory of a margin."""
 
 
 MARGIN: Final = np.dtype([("value", "f8"), ("name", "i8"), ("frame", "i8"), ("time", "i8")])
-"""A margin, and its origin: the number of a proposition (-1: none), a frame, and its time (ns)."""
+"""Margin and its origin: proposition number (-1: none), frame, and time (ns)."""
 
 
 def _better(one: Margins, other: Margins, *, greatest: bool) -> Margins:

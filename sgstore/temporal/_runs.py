@@ -46,23 +46,23 @@ if TYPE_CHECKING:
     Keys = NDArray[np.int64]
 
 FIRST_WINDOW: Final = 2_048
-"""Buckets of the first window: each looks into most of the tables, and dense patterns take memory."""
+"""Buckets of the first window. Each window reads most tables, and dense patterns take memory."""
 
 ROWS_EACH: Final = 2
-"""So many rows of those that :class:`Windows` counts take the memory of one that is put in order here."""
+"""Weight of a sorted row, in rows as counted by :class:`Windows`."""
 
 TOGETHER: Final = 1_500_000
-"""Rows of several traces that are read together; where there are more, fewer traces are."""
+"""Largest number of rows of several traces to read at once."""
 
 VALUE_BYTES: Final = 20
-"""Memory that a value of a row takes beside its binding; bytes."""
+"""Additional memory for one value of a row; bytes."""
 
 LARGE: Final = 1e12
-"""Sums over windows of greater numbers are worked out one by one, so that they are rounded once."""
+"""Window sums of larger numbers are computed one by one, so that they are rounded once."""
 
 
 RunsTold = tuple["Ints", "Ints", "Keys", list[list[Any]]]
-"""Runs: ids of their first and last frames, their nodes and edges, and the values of each place."""
+"""Runs: ids of first and last frames, nodes and edges, and returned values."""
 
 
 @dataclass(frozen=True)

@@ -94,10 +94,10 @@ class MonitorEvent:
 # Where a step of a sequence holds, frame by frame: its pattern, its other conditions, its duration ----
 
 Needs = bool | tuple[tuple[Partial, Term], ...]
-"""Whether conditions hold, or what of them must still be shown: for some binding one of these."""
+"""Truth value of conditions, or the open terms of which one must become true."""
 
 NEVER: Final = 1 << 62
-"""Later than any frame."""
+"""Frame number after all frames."""
 
 
 @dataclass(slots=True)
@@ -255,7 +255,7 @@ class StepState:
 
 
 Binding = dict[str, int]
-"""What variables are bound to."""
+"""Variable → node."""
 
 
 def joined(one: Binding, names: tuple[str, ...], key: Key, apart: frozenset[str]) -> Binding | None:
@@ -277,11 +277,11 @@ def joined(one: Binding, names: tuple[str, ...], key: Key, apart: frozenset[str]
 FAILED: Final = "failed"
 OPEN: Final = "open"
 Ways = tuple[StepFrame, ...] | str
-"""The places of the steps from one on; :data:`FAILED`: there are none; :data:`OPEN`: it is not known yet."""
+"""Frames of the remaining steps; :data:`FAILED`: none; :data:`OPEN`: not yet known."""
 
 
 FoundMatch = tuple[StepWay, Binding, tuple[StepFrame, ...]]
-"""A sequence that a query stands for, what its variables are bound to, and the places of its steps."""
+"""Match: alternative sequence, binding, and frames of its steps."""
 
 
 class SequenceMonitor:

@@ -260,7 +260,7 @@ def _one_a_run(line: BindingLine, first: Ints, possible: Ints) -> Ints:
 # Bindings of several steps together: those that agree on the variables that they share ----------
 
 ROWS: Final = 2_000_000
-"""Rows of all steps together that are looked at at once."""
+"""Rows of all steps processed at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -357,10 +357,10 @@ def _pairs(left: Keys, right: Keys) -> tuple[Ints, Ints]:
 
 
 MOST_MATCHES: Final = 2_000_000
-"""Most matches of one trace over several frames: each takes some 300 bytes until the database has it."""
+"""Largest number of multi-frame matches of one trace: each takes about 300 bytes."""
 
 _Part = tuple["Ints", "Ints", "Keys", list[list[Any]]]
-"""Some matches: ids of their first and last frames, their nodes and edges, and the values of each place."""
+"""Matches: ids of first and last frames, nodes and edges, and returned values."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

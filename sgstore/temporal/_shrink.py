@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from sgstore.temporal._offline import TraceReader
 
 Span = tuple["FrameRef", "FrameRef"]
-"""The first and the last frame of a clip."""
+"""First and last frame of a clip."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +229,7 @@ def _of_one_frame(
 
 
 _AHEAD: Final = frozenset({"ALWAYS", "EVENTUALLY", "NEXT", "WEAKNEXT", "UNTIL", "RELEASE"})
-"""Operators of time that look ahead: at the end of a clip they see less."""
+"""Forward time operators. They see fewer frames at the end of a clip."""
 
 
 def _looks_ahead(condition: Bound | None) -> bool:

@@ -440,4 +440,4 @@ _TOLERANT: Final[Mapping[str, Callable[[Array, Array, float], Array]]] = {
     ">": lambda one, other, by: one > other + by,
     ">=": lambda one, other, by: one >= other - by,
 }
-"""Comparisons of times, those that differ by no more than a tolerance being the same."""
+"""Comparisons of times with a tolerance for equality."""

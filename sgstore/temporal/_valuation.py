@@ -170,7 +170,7 @@ class BindingTable(Generic[T]):
 # What checks and patterns ask of one frame: each question once, whoever asks it -----------------
 
 Key = tuple[int, ...]
-"""What some variables are bound to, in their order."""
+"""Nodes of some variables, in order."""
 
 
 def answerer(ask: Ask) -> Callable[[FrameView, NodeNames], Mapping[Key, Any]]:
@@ -343,13 +343,13 @@ def _told(query: b.Query) -> tuple[Any, ...]:
 # on from what is remembered of those that were never seen.
 
 TIMES: Final = 1001
-"""Times between frames of which the median is taken, the latest ones."""
+"""Number of latest frame intervals for the median."""
 
 NEVER: Final = 1 << 62
-"""Later than any frame."""
+"""Frame number after all frames."""
 
 Memory = tuple[Any, ...]
-"""What a binding remembers: for each course, and each condition in one, what it needs of former frames."""
+"""Memory of a binding: data of earlier frames for each time function and its conditions."""
 
 
 class StreamClock:
@@ -731,10 +731,10 @@ class _Now(SignalValues):
 
 
 _Point = tuple[int, float, float, int]
-"""A frame in which a value was known: its number, the value, how far it had turned, since when it is known."""
+"""Known angle in a frame: frame number, value, total turn, and start of the known run."""
 
 _Trail = tuple[_Point, tuple[_Point, ...]]
-"""The last frame in which a value was known, and those of them that are still looked back to."""
+"""Last known point of an angle, and the earlier points still needed."""
 
 
 def _moved(old: _Trail | None, value: float | None, here: int, oldest: int) -> _Trail | None:

@@ -207,7 +207,7 @@ def _joined(courses: list[PrefixVerdicts], join: Any) -> PrefixVerdicts:
 
 
 Decided = tuple["Places", "Places"]
-"""From which frame on it is known of each frame, (F,), that something is true, and that it is not; F: never."""
+"""Frames (F,) from which on each value is certainly true, and certainly false; F: never."""
 
 
 def known(  # noqa: PLR0911 - a case each
@@ -406,13 +406,13 @@ def _most(values: Places, start: Places, end: Places | None) -> Places:
 # What no frame can refute, only the end of the trace (``EVENTUALLY p``), is violated at its last frame.
 
 STATUS: Final = ("false", "presumably_false", "presumably_true", "true")
-"""What is known at a frame, in order: the smaller of two holds for both, the greater for either."""
+"""Status words in code order. The minimum is the code of a conjunction, the maximum of a disjunction."""
 
 FALSE, PRESUMABLY_FALSE, PRESUMABLY_TRUE, CERTAINLY_TRUE = range(4)
 
 
 Violation = tuple[int, int, bool]
-"""First and last frame in which a formula is violated, and whether only the end of the trace made it so."""
+"""First and last frame of a violation, and True if only the trace end caused it."""
 
 
 class Settled:

@@ -143,13 +143,13 @@ def _counts(known: NDArray[np.bool_], first: Places, end: Places) -> NDArray[np.
 # Frame by frame -----------------------------------------------------------------------------------
 
 Point = tuple[int, int, float]
-"""A frame in which a value was known: its number, its time (ns), and the value."""
+"""Known value: frame number, time (ns), and value."""
 
 Window = tuple[tuple[Point, ...], int]
-"""What a stream keeps of a window: points, and their exact sum in units of the smallest number there is."""
+"""Window of a stream: points, and their exact sum as a multiple of the smallest positive float."""
 
 _UNIT: Final = 1074
-"""The smallest number above 0 is 2 to the power of minus this."""
+"""The smallest positive float is 2 to the power of minus this number."""
 
 
 def next_window(
