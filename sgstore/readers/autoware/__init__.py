@@ -1,4 +1,4 @@
-"""Recordings of Autoware, in rosbag2's MCAP."""
+"""Reader of Autoware recordings (rosbag2 in MCAP)."""
 
 import lazy_loader
 

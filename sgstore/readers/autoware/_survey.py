@@ -1,7 +1,7 @@
-"""The first reading of an Autoware recording: which objects lead, what they are, where the ego's pose is told.
+"""First reading of an Autoware recording: leading objects, their classes, and the ego's pose.
 
-Topics are free and tell nothing; schemas do. The class of an object may change from message to message: it is
-what it is called most often.
+Topics are arbitrary, so only the schemas count. The class of an object may change between messages; the most
+frequent one is used.
 
 Source: autoware_msgs (message definitions), Autoware Foundation, Apache-2.0.
 """
@@ -92,14 +92,14 @@ CLASS_COLUMNS: Final = (*_UUID, *_CLASSES)
 
 @dataclass(slots=True)
 class ObjectLead(Lead):
-    """A channel of objects; ``order``: of the kind of list; ``objects``: how many it tells in all."""
+    """Channel of objects. ``order``: priority of its list type; ``objects``: total number of objects."""
 
     order: int = 0
     objects: int = 0
 
 
 def content_of(recording: Recording, channel: int) -> str:
-    """Kind of content that the messages of a channel have; empty where the reader does not know them."""
+    """Return the content type of a channel's messages; empty if the reader does not support them."""
     record = recording.channels[channel]
     schema = recording.schemas.get(record.schema_id)
     if schema is None or not _is_ros(record, schema):
@@ -112,7 +112,10 @@ def _is_ros(channel: Channel, schema: Schema) -> bool:
 
 
 def idents_of(table: Floats) -> list[str]:
-    """Ids of objects as hexadecimal digits; empty: none. The columns begin with :data:`CLASS_COLUMNS`."""
+    """Return the ids of objects as hexadecimal digits; empty without an id.
+
+    The columns begin with :data:`CLASS_COLUMNS`.
+    """
     uuids = table[:, : len(_UUID)]
     known = np.all(np.isfinite(uuids), axis=1, keepdims=True)[:, 0]
     rows = np.nan_to_num(uuids).astype(np.uint8)
@@ -120,7 +123,7 @@ def idents_of(table: Floats) -> list[str]:
 
 
 def labels_of(table: Floats) -> list[str]:
-    """The most probable class of each object; columns as in :func:`idents_of`."""
+    """Return the most probable class of each object. The columns are as in :func:`idents_of`."""
     classes = table[:, len(_UUID) : len(CLASS_COLUMNS)].reshape(len(table), _MOST_CLASSES, 2)
     likely = np.argmax(np.nan_to_num(classes[:, :, 1], nan=-1.0), axis=1)
     label = np.nan_to_num(classes[np.arange(len(table)), likely, 0]).astype(np.int64)
@@ -128,25 +131,25 @@ def labels_of(table: Floats) -> list[str]:
 
 
 def stamp_at(told: dict[str, Any], path: str) -> int | None:
-    """The time at a path of a message; ns. ``None`` if it is beyond all clocks."""
+    """Return the time at a path of a message; ns. ``None`` means missing or out of range."""
     seconds, nanos = (number(told, f"{path}.{part}") for part in ("sec", "nanosec"))
     there = 0 <= seconds < 1 << 32 and 0 <= nanos < 1 << 32
     return int(seconds) * 1_000_000_000 + int(nanos) if there else None
 
 
 class AutowareSurvey(Survey[ObjectLead]):
-    """Findings of the first reading of a recording.
+    """First reading of an Autoware recording.
 
     Attributes
     ----------
     contents : dict
-        Channel id → kind of content of its messages, such as :data:`OBJECTS`.
+        Channel id → content type of its messages, such as :data:`OBJECTS`.
     structures : dict
         Channel id → structure of its messages.
     pose_channel : int
-        The channel that tells the pose of the ego; -1: none does.
+        Id of the channel with the pose of the ego; -1 without one.
     world, ego_axes : str
-        The axes that stand still, and those that move with the ego.
+        The fixed axes, and the axes that move with the ego.
     """
 
     def __init__(self, recording: Recording, wanted: str) -> None:
@@ -166,16 +169,16 @@ class AutowareSurvey(Survey[ObjectLead]):
     # What was found ----------------------------------------------------------------------------------
 
     def rank(self, lead: ObjectLead) -> tuple[int, ...]:
-        """Order by whether there are objects at all, then by the kind of list, then by frames."""
+        """Return the sort key of a candidate: non-empty, then the list type, then the number of frames."""
         return lead.objects > 0, lead.order, lead.frames
 
     def label_of(self, ident: str, first: str) -> str:
-        """The class that an object is called most often; ``first``: the one that it is called now."""
+        """Return the most frequent class of an object; ``first`` if it is unknown."""
         counts = self._classes.get(ident)
         return max(counts, key=counts.__getitem__) if counts else first
 
     def no_frames(self) -> str:
-        """The reason why no channel leads."""
+        """Return the reason for a recording without a leading channel."""
         lost = self.lost.losses()
         return lost[0].reason if lost else "no list of objects can be read"
 
@@ -203,22 +206,22 @@ class AutowareSurvey(Survey[ObjectLead]):
         return self.wanted or (EGO if there else "")
 
     def role(self, channel: int) -> str:
-        """The role of a channel."""
+        """Return the role of a channel, ``lasting`` for static transforms."""
         static = self.contents.get(channel) == TRANSFORMS and self.topic(channel).endswith(STATIC)
         return "lasting" if static else super().role(channel)
 
     def context(self) -> list[Ref]:
-        """Messages that later ones depend on: transforms that hold for ever, calibrations."""
+        """Return the messages that later ones depend on: static transforms and calibrations."""
         return [*self._static, *super().context()]
 
     # Channels ----------------------------------------------------------------------------------------
 
     def meet(self, channel: int) -> bool:
-        """Return whether the messages of a channel are objects, poses or transforms."""
+        """True if the messages of a channel are objects, poses or transforms."""
         return self._content(channel) in {OBJECTS, POSE_OF_EGO, TRANSFORMS}
 
     def keeps(self, channel: int) -> bool:
-        """Return whether the frames need the messages of a channel."""
+        """True if the reading of the frames needs the messages of a channel again."""
         return bool(self._content(channel))
 
     def _content(self, channel: int) -> str:
@@ -245,7 +248,7 @@ class AutowareSurvey(Survey[ObjectLead]):
     # One message -------------------------------------------------------------------------------------
 
     def look(self, run: Messages, row: int) -> None:
-        """Look at one message; what cannot be read is reported when the frames are read."""
+        """Examine one message. Unreadable messages are reported during the reading of the frames."""
         channel = int(run.channel[row])
         content = self.contents[channel]
         if content == OBJECTS:

@@ -1,18 +1,18 @@
-"""Recordings of Autoware: ``ros2 bag record -s mcap`` of ``autoware_perception_msgs`` and what stands beside.
+"""Reader of Autoware recordings (``autoware_perception_msgs`` and related messages).
 
-A frame is one list of objects: tracked ones, else predicted, else detected ones. Its time is the stamp of the
-list.
+They are recorded with ``ros2 bag record -s mcap``. A frame is one list of objects: tracked objects if present,
+else predicted, else detected ones. Its time is the stamp of the list.
 
-* Objects may be told in axes that move. They are carried into those that stand still by the pose of the ego at
-  that time and the tree of transforms, interpolated; what is logged before the next list counts. Behind the
-  last pose the ego goes on as it did, for half a second at most.
-* Twists and accelerations of objects are in their own axes, those of the ego in its own. Of an object whose
-  heading is only known up to its sign the nose is where it moves to.
-* The origin of the vehicle is the middle of its rear axle on the ground. How large it is stands nowhere in a
-  recording: a mapping tells it, else it is that of Autoware's sample vehicle.
-* Detected objects have no ids: one is followed from list to list while the nearest of its class, by place and
-  velocity, is near enough.
-* A traffic light group stands where the road map has the regulatory element of its id.
+* Objects may be given in moving axes. They are converted into fixed axes by the interpolated pose of the ego
+  and the tree of transforms; messages logged before the next list count. After the last pose, the motion of the
+  ego is extrapolated for at most half a second.
+* Velocities and accelerations of objects are in their own axes, those of the ego in its own. If the sign of an
+  object's heading is unknown, its front points in the direction of motion.
+* The origin of the vehicle is the middle of its rear axle on the ground. A recording does not contain the size
+  of the vehicle. It comes from a mapping, or equals that of Autoware's sample vehicle.
+* Detected objects have no ids. A detection continues the nearest one of the same class in the previous list, by
+  position and velocity, if it is close enough.
+* The position of a traffic light group is that of the regulatory element with its id in the road map.
 
 Source: autoware_msgs (message definitions) and sample_vehicle_description (vehicle_info.param.yaml), Autoware
 Foundation, Apache-2.0.
@@ -97,7 +97,7 @@ _CIRCLE, _OFF, _FLASHING = 1, 1, 3
 
 
 def _columns(predicted: bool) -> tuple[str, ...]:  # noqa: FBT001 (one of two definitions)
-    """Numbers that are read of every object."""
+    """Return the paths of the used numbers of an object."""
     pose = f"{_TOLD[predicted]}.pose"
     twist = f"kinematics.{_TURNED[predicted]}.twist"
     pushed = f"kinematics.{_PUSHED[predicted]}.accel.linear"
@@ -117,26 +117,26 @@ def _columns(predicted: bool) -> tuple[str, ...]:  # noqa: FBT001 (one of two de
 
 @dataclass(slots=True)
 class AutowareRawFrame:
-    """A list of objects, whose places are still as they were told, and what else holds then.
+    """Frame with the objects in their original axes, and the other facts of its time.
 
     Attributes
     ----------
     time_ns, log_time_ns : int
     node : (n,) int64
     objects : (n, 19) float64
-        Columns of the objects behind their classes.
+        Columns of the objects after their classes.
     axes : str
-        Those that the objects are told in.
+        Axes of the objects.
     lights : dict
-        Node id of each traffic light group → code of what it shows.
+        Node id of each traffic light group → code of its state.
     signals, gear
-        Lights and gear of the ego; -1 and NaN: not told.
+        Lights and gear of the ego; -1 and NaN mean unknown.
     base, ego : Pose or None
-        The poses of ``axes`` and of the ego in the world, once they are known.
+        Poses of ``axes`` and of the ego in the world, once they are known.
     motion : (7,) float64
         Velocity, yaw rate and acceleration of the ego in its own axes.
     kinds : dict
-        As :class:`~sgstore.readers._blocks.FrameRows` has them.
+        As in :class:`~sgstore.readers._blocks.FrameRows`.
     """
 
     time_ns: int
@@ -155,7 +155,7 @@ class AutowareRawFrame:
 
 @dataclass(slots=True)
 class _Detection:
-    """An object without an id, as it was in the last list."""
+    """Detected object without an id, as in the last list."""
 
     ident: str
     label: str
@@ -164,21 +164,21 @@ class _Detection:
 
 
 class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
-    """Messages → frames, with what must be remembered from one to the next.
+    """Converter of Autoware messages into frames.
 
-    The class of an object is a guess of the perception, and the one that it has most often counts.
+    The class of an object is a guess of the perception. The most frequent class is used.
 
     Parameters
     ----------
     survey : AutowareSurvey
     ego : Ego
-        How large the ego is.
+        Size of the ego.
     types : mapping
-        Classes of objects that the user says to mean something else.
+        Classes of objects with a meaning from the user.
     places : mapping
-        Id of a traffic light of the road map → where it stands.
+        Traffic light id in the road map → position.
     report : TraceReport
-        Takes up what cannot be used.
+        Receives losses and warnings.
     """
 
     sure_kinds: ClassVar[bool] = False
@@ -210,7 +210,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
         self._followed = 0
 
     def decode(self, run: Messages, row: int) -> AutowareRawFrame | None:
-        """The frame that a message is; ``None`` if it is none, cannot be read, or lies outside the window."""
+        """Return the frame of a message. ``None`` means not a frame, unreadable or outside the window."""
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
         if channel in self._leading:
             self._stamps.next()
@@ -228,13 +228,13 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
         return None
 
     def complete(self, frames: list[AutowareRawFrame]) -> list[FrameRows]:
-        """Frames with their numbers, in the axes that stand still."""
+        """Return the frames with their numbers, in fixed axes."""
         if frames and frames[-1] is self._open:  # the last one
             self._settle_open()
         return [self._rows(frame) for frame in frames]
 
     def settle(self) -> None:
-        """Report what could not be used, once all frames are read."""
+        """Report the losses, after all frames are read."""
         self._untimed = self._stamps.untimed
         super().settle()
         warn = self._report.warnings.append
@@ -254,7 +254,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
         return "Predicted" in self._survey.structures[self._survey.leading].name
 
     def _takers(self) -> dict[int, Callable[[int, int, memoryview], None]]:
-        """Channel → what takes up its messages."""
+        """Return the function that processes the messages of each channel."""
         takers = {
             TRANSFORMS: self._take_transforms,
             LIGHTS: self._take_lights,
@@ -274,7 +274,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
         return decode(self._survey.structures[channel], data)
 
     def _stamp(self, told: dict[str, Any], path: str, log_time: int) -> int:
-        """The time in a message of a channel that does not lead."""
+        """Return the time of a message outside the leading channel; ns."""
         return self._stamps.beside(log_time, stamp_at(told, path))
 
     def _take_transforms(self, channel: int, log_time: int, data: memoryview) -> None:
@@ -389,7 +389,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
         return state if abs(stamp - told) <= _LIT_NS else LIGHT_STATE_CODE["unknown"]
 
     def _reported(self, stamp: int) -> tuple[int, float]:
-        """Mask of the lights of the ego, and its gear."""
+        """Return the light mask and the gear of the ego at a time."""
         now = {
             what: value
             for what, (told, value) in self._reports.items()
@@ -404,7 +404,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
         return mask, _gear_of(now.get(GEAR, 0))
 
     def _follow(self, stamp: int, labels: list[str], table: Floats, told: list[str]) -> list[str]:
-        """Ids of detections: of those of the last list that they are nearest to, else new ones."""
+        """Return the ids of detections: that of the nearest previous detection, else a new id."""
         before_ns, before = self._seen
         lapse = min(max(stamp - before_ns, 0), _LIT_NS) / 1e9
         places = table[:, _BOX_BEGINS : _BOX_BEGINS + 2]
@@ -435,7 +435,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
         return idents
 
     def _measure(self, table: Floats, data: memoryview) -> None:
-        """Length and width of objects that are polygons, and their middles, from their corners."""
+        """Set length, width and centre of polygon objects from their corners."""
         told = records(self._decoded(self._survey.leading, data), "objects")
         for row, one in enumerate(told[: len(table)]):
             corners = records(one, "shape.footprint.points")
@@ -452,7 +452,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
     # Places ------------------------------------------------------------------------------------------
 
     def _settle_open(self) -> None:
-        """Find the poses that belong to the frame that is open, by all that was told until now."""
+        """Compute the poses of the open frame from the messages so far."""
         frame, self._open = self._open, None
         if frame is None:
             return
@@ -484,7 +484,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
         return place + rotated(turn, motion[:3]) * (late / 1e9), product(turn, further)
 
     def _base_at(self, frame: AutowareRawFrame) -> Pose | None:
-        """The pose of the axes of the objects in those that stand still."""
+        """Return the pose of the objects' axes in fixed axes, or ``None`` if it is unknown."""
         survey = self._survey
         if frame.axes == survey.world:
             return np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
@@ -546,9 +546,10 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
 
 
 def _numbers(objects: Floats, base: Pose | None) -> tuple[Floats, Bools]:
-    """Poses (n, 16), columns :data:`sgstore.world.POSE`, and which of them are usable.
+    """Return the poses (n, 16) of objects, and a mask of the usable ones.
 
-    ``objects``: columns of the objects behind their classes; ``base``: the pose of their axes.
+    The columns are :data:`sgstore.world.POSE`. ``objects``: columns of the objects after their classes;
+    ``base``: the pose of their axes.
     """
     values = np.full((len(objects), len(POSE)), np.nan)
     if base is None:
@@ -577,7 +578,7 @@ def _numbers(objects: Floats, base: Pose | None) -> tuple[Floats, Bools]:
 
 
 def _rotations(turns: Floats) -> tuple[Floats, Floats]:
-    """Matrices (n, 3, 3) of quaternions (n, 4) x, y, z, w, and their angles (n, 3); NaN where one is none."""
+    """Return the matrices (n, 3, 3) and angles (n, 3) of quaternions (x, y, z, w); NaN if invalid."""
     with np.errstate(invalid="ignore", over="ignore"):
         norm = np.sqrt((turns * turns).sum(axis=1))
         norm[~((norm > 0.5) & (norm < 2))] = np.nan
@@ -592,7 +593,7 @@ def _rotations(turns: Floats) -> tuple[Floats, Floats]:
 
 
 def _angles(matrices: Floats) -> Floats:
-    """Heading, pitch (positive with the nose down) and roll (n, 3) of rotations (n, 3, 3); rad."""
+    """Return heading, pitch (positive with the nose down) and roll (n, 3) of rotations (n, 3, 3); rad."""
     heading = np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])
     pitch = np.arcsin(np.clip(-matrices[:, 2, 0], -1.0, 1.0))
     roll = np.arctan2(matrices[:, 2, 1], matrices[:, 2, 2])
@@ -607,7 +608,7 @@ def _pose_at(told: dict[str, Any], place: str, turn: str) -> Pose | None:
 
 
 def _state_of(elements: Iterable[dict[str, Any]]) -> str:
-    """What a group of lights shows: its round lights, else its arrows."""
+    """Return the state of a group of lights: of its round lights, else of its arrows."""
     told = [{key: number(one, key) for key in ("color", "shape", "status")} for one in elements]
     told = [one for one in told if one["shape"] == _CIRCLE] or told
     if any(one["status"] == _FLASHING for one in told):
@@ -621,7 +622,7 @@ def _state_of(elements: Iterable[dict[str, Any]]) -> str:
 
 
 def _gear_of(report: int) -> float:
-    """The gear that a ``GearReport`` tells: 1, 2, … forward, 0 neutral and parked, -1, -2 backwards."""
+    """Return the gear of a ``GearReport``: 1, 2, … forward, 0 neutral or parked, -1, -2 reverse."""
     if 2 <= report <= 19:
         return float(report - 1)
     return {1: 0.0, 20: -1.0, 21: -2.0, 22: 0.0, 23: 1.0, 24: 2.0}.get(report, NAN)
@@ -631,7 +632,7 @@ def _gear_of(report: int) -> float:
 
 
 class AutowareTrace(SurveyedTrace[AutowareSurvey]):
-    """A recording of Autoware.
+    """Recording of Autoware.
 
     Parameters
     ----------
@@ -639,21 +640,20 @@ class AutowareTrace(SurveyedTrace[AutowareSurvey]):
     ego : str
         ``ego``, or the id of an object; empty: ``ego``, the vehicle itself.
     digest : str
-        SHA-256 of the file, if it is known; else the file is hashed.
+        SHA-256 of the file if known; empty: the file is hashed.
     mapping : str or Path
-        A TOML file whose parts ``[ego]`` and ``[types]`` say how large the vehicle is, and what classes mean.
+        A TOML file with the size of the vehicle in ``[ego]``, and the meanings of classes in ``[types]``.
 
     Attributes
     ----------
     info : TraceInfo
     report : TraceReport
-        Filled while blocks are read.
+        Filled during the reading of blocks.
 
     Raises
     ------
     TraceError
-        The definition of the objects is malformed, no frame can be read, or nothing bears the name given for
-        the ego.
+        The definition of the objects is malformed, no frame can be read, or the given ego does not exist.
     """
 
     name: ClassVar[str] = "autoware"
@@ -671,11 +671,11 @@ class AutowareTrace(SurveyedTrace[AutowareSurvey]):
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:
-        """Return whether one of the channels carries lists of objects."""
+        """True if a channel contains lists of objects."""
         return any(content_of(recording, channel) == OBJECTS for channel in recording.channels)
 
     def on_map(self, road_map: RoadMap | None) -> None:
-        """Find the places of traffic lights in the road map that the recording is read with."""
+        """Find the positions of traffic lights in the road map of the ingest."""
         if road_map is None:
             return
         nodes = road_map.nodes
@@ -687,7 +687,7 @@ class AutowareTrace(SurveyedTrace[AutowareSurvey]):
         }
 
     def decoder(self, report: TraceReport) -> AutowareDecoder:
-        """A decoder that has read nothing yet."""
+        """Return a new decoder."""
         self._survey.tell(report)
         if self._box is SAMPLE_VEHICLE and self.info.ego == EGO:
             report.warnings.append(

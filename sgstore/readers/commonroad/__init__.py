@@ -1,4 +1,4 @@
-"""sgstore.readers.commonroad."""
+"""Reader of CommonRoad scenarios."""
 
 import lazy_loader
 

@@ -1,9 +1,9 @@
-"""CommonRoad scenarios (XML, 2018b and 2020a) → obstacles, lights, signs and lanelets as plain values.
+"""Parser of CommonRoad scenarios (XML, 2018b and 2020a) into obstacles, lights, signs and lanelets.
 
-A small tree is built of each part of the document (an obstacle, a lanelet, …), which is read and let go
-when that part ends. What is untrusted in XML is bounded by :mod:`sgstore.markup`, and so are texts, parts
-and states. A part that is not what it must be is left out, and named as a loss; of an obstacle those states
-are used that are sound.
+Each part of the document (an obstacle, a lanelet, …) becomes a small tree, which is read and freed at the end
+of the part. :mod:`sgstore.markup` limits the untrusted features of XML. Texts, parts and states are limited,
+too. An invalid part is dropped and reported as a loss. Of an obstacle with invalid states, the valid ones are
+used.
 
 Source: CommonRoad: XML format documentation, versions 2018b and 2020a (Technical University of Munich).
 """
@@ -43,7 +43,7 @@ Place = tuple[float, float, float]
 
 
 class State(NamedTuple):
-    """A state of an obstacle at a step; NaN: not told. m, rad, m/s, m/s², rad/s."""
+    """State of an obstacle at a step; NaN means unknown. m, rad, m/s, m/s², rad/s."""
 
     x: float
     y: float
@@ -56,7 +56,7 @@ class State(NamedTuple):
 
 
 class ObstacleBox(NamedTuple):
-    """The box around a shape: its size, its centre and how it is turned, in the obstacle's axes."""
+    """Bounding box of a shape in the obstacle's axes: size, centre and rotation."""
 
     length: float
     width: float
@@ -67,7 +67,7 @@ class ObstacleBox(NamedTuple):
 
 @dataclass(slots=True)
 class Obstacle:
-    """An obstacle: its states by step, and which of its lights are on, by step."""
+    """Obstacle with its states and its active lights by step."""
 
     ident: str
     type: str
@@ -79,7 +79,7 @@ class Obstacle:
 
 @dataclass(frozen=True, slots=True)
 class ScenarioLight:
-    """A traffic light, which shows one state after another: (steps, state)."""
+    """Traffic light with a cycle of states: (steps, state)."""
 
     ident: str
     place: Place | None
@@ -88,7 +88,7 @@ class ScenarioLight:
     active: bool = True
 
     def shows(self, step: int) -> str:
-        """The state at a step; empty where none is told."""
+        """Return the state at a step; empty if it is unknown."""
         if not self.active:
             return "inactive"
         total = sum(steps for steps, _ in self.cycle)
@@ -104,7 +104,7 @@ class ScenarioLight:
 
 @dataclass(frozen=True, slots=True)
 class ScenarioSign:
-    """A traffic sign and the plates below it: (code, value)."""
+    """Traffic sign with its plates: (code, value)."""
 
     ident: str
     place: Place | None
@@ -114,7 +114,7 @@ class ScenarioSign:
 
 @dataclass(frozen=True, slots=True)
 class Lanelet:
-    """A lanelet: its borders in its direction of travel, (x, y, z) each, and what it refers to."""
+    """Lanelet with its borders (x, y, z) in driving direction, and its references."""
 
     ident: str
     left: tuple[Place, ...]
@@ -135,22 +135,22 @@ class Lanelet:
 
 @dataclass(slots=True)
 class TrafficScenario:
-    """A scenario.
+    """Contents of a CommonRoad scenario.
 
     Attributes
     ----------
     name : str
         The id of the benchmark.
     step : float
-        From one step to the next; s.
+        Time between steps; s.
     obstacles, lights, signs, lanelets : dict
         By their ids.
     junction_of : dict
-        Id of a lanelet → id of the intersection that it leads through.
+        Id of a lanelet → id of its intersection.
     lost : list of str
-        What was left out, and why.
+        Dropped parts with the reasons.
     more_lost : int
-        How much else was.
+        Number of further losses.
     """
 
     name: str = ""
@@ -165,7 +165,7 @@ class TrafficScenario:
     states: int = 0
 
     def lose(self, what: str) -> None:
-        """Take note of something that is left out."""
+        """Add a loss."""
         if len(self.lost) < MAX_LOST:
             self.lost.append(what)
         else:
@@ -173,12 +173,12 @@ class TrafficScenario:
 
 
 def read_scenario(data: bytes) -> TrafficScenario:
-    """The scenario that a document tells.
+    """Parse a document into a scenario.
 
     Raises
     ------
     TraceError
-        It is no XML, no CommonRoad scenario of a version that is known, or exceeds a bound.
+        The document is not XML, not a CommonRoad scenario of a supported version, or exceeds a limit.
     """
     reader = _Reader()
     parser = MarkupParser(
@@ -193,7 +193,7 @@ def read_scenario(data: bytes) -> TrafficScenario:
 
 
 class _Node:
-    """An element: its tag, attributes, text and elements."""
+    """XML element with its tag, attributes, text and children."""
 
     __slots__ = ("attributes", "children", "tag", "text")
 
@@ -207,7 +207,7 @@ class _Node:
         return [child for child in self.children if child.tag == tag]
 
     def get(self, *path: str) -> _Node | None:
-        """The first element at the end of a path of tags."""
+        """Return the first element at a path of tags, or ``None``."""
         found: _Node | None = self
         for tag in path:
             found = next((child for child in found.children if child.tag == tag), None)
@@ -216,7 +216,7 @@ class _Node:
         return found
 
     def word(self, *path: str) -> str:
-        """The text there; empty if there is none."""
+        """Return the text at a path of tags; empty if it is missing."""
         found = self.get(*path)
         return found.text.strip() if found else ""
 
@@ -224,12 +224,12 @@ class _Node:
         return tuple(child.text.strip() for child in self.all(tag))
 
     def refs(self, tag: str) -> tuple[str, ...]:
-        """What elements of a tag refer to."""
+        """Return the ids that child elements with a tag refer to."""
         return tuple(_ident(child, "ref") for child in self.all(tag))
 
 
 class _Reader:
-    """Handler of expat's events."""
+    """Handler of XML events that builds a scenario."""
 
     def __init__(self) -> None:
         self.scenario = TrafficScenario()
@@ -237,7 +237,7 @@ class _Reader:
         self._part = 0
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
-        """An element starts."""
+        """Handle the start of an element."""
         self._part += 1
         if self._part > MAX_PART:
             raise TraceError(f"<{self._open[1].tag}> has more than {MAX_PART:,} elements")
@@ -251,13 +251,13 @@ class _Reader:
         self._open.append(node)
 
     def end(self, _tag: str) -> None:
-        """An element ends."""
+        """Handle the end of an element."""
         node = self._open.pop()
         if len(self._open) == 1:
             _take(self.scenario, node)
 
     def characters(self, text: str) -> None:
-        """Text of an element, or a part of it."""
+        """Add text to the current element."""
         node = self._open[-1]
         if text.strip():
             node.text += text
@@ -284,7 +284,7 @@ def _begin(scenario: TrafficScenario, root: _Node) -> None:
 
 
 def _take(scenario: TrafficScenario, node: _Node) -> None:
-    """Read a part of the document, or name it as lost."""
+    """Read a part of the document. An invalid part becomes a loss."""
     if node.tag not in _PARTS:
         return
     try:
@@ -321,7 +321,7 @@ def _whole(text: str, what: str) -> int:
 
 
 def _value(node: _Node | None) -> float:
-    """An exact value, or the middle of an interval; NaN where there is none."""
+    """Return an exact value, or the middle of an interval; NaN if it is missing."""
     if node is None:
         return math.nan
     if node.get("exact"):
@@ -347,7 +347,7 @@ def _point(node: _Node) -> Place:
 
 
 def _position(node: _Node | None) -> Place | None:
-    """A place; the middle of an area, if one is told."""
+    """Return a position, or the centre of an area; ``None`` if it is missing."""
     if node is None or not node.children:
         return None
     point = node.get("point")
@@ -358,7 +358,7 @@ def _position(node: _Node | None) -> Place | None:
 
 
 def _corners(shapes: _Node) -> Iterator[tuple[float, float]]:
-    """Points around which a box lies that holds all shapes of an element."""
+    """Yield points whose bounding box contains all shapes of an element."""
     for shape in shapes.children:
         if shape.tag == "polygon":
             yield from (_point(point)[:2] for point in shape.all("point"))
@@ -392,7 +392,7 @@ def _size(shape: _Node, name: str) -> float:
 def _around(
     corners: list[tuple[float, float]],
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Size and middle of the box around points, along the axes."""
+    """Return the size and centre of the axis-aligned box around points."""
     if not corners:
         raise ValueError("a shape without points")
     low, high = ((end(x for x, _ in corners), end(y for _, y in corners)) for end in (min, max))
@@ -426,7 +426,7 @@ _LIGHTS: Final = {
 
 
 def _state(node: _Node) -> State | None:
-    """A state; ``None`` where no place is told."""
+    """Return a state, or ``None`` without a position."""
     place = _position(node.get("position"))
     if place is None:
         return None
@@ -470,7 +470,7 @@ def _obstacle(scenario: TrafficScenario, node: _Node) -> None:
 
 
 def _follow(scenario: TrafficScenario, node: _Node, found: Obstacle) -> None:
-    """Take up the states of a trajectory, as far as they are sound."""
+    """Add the valid states of a trajectory. Invalid states are losses."""
     trajectory = node.get("trajectory")
     if node.get("occupancySet") is not None:
         told = "it has a set of places where it may be, and no trajectory: its first state counts"
@@ -502,7 +502,7 @@ def _signal(node: _Node, found: Obstacle) -> None:
 
 
 def _surroundings(scenario: TrafficScenario, node: _Node) -> None:
-    """An obstacle that is told by its shape alone, in the axes of the map."""
+    """Add an environment obstacle, defined only by its shape in map axes."""
     ident = _ident(node)
     if ident in scenario.obstacles:
         raise ValueError("there are two of this id; the first one counts")

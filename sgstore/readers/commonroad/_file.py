@@ -1,9 +1,9 @@
-"""CommonRoad scenarios in the words of an MCAP file: a message for the road map, and one for each step.
+"""CommonRoad scenarios with the interface of an MCAP file: one message for the map, one per step.
 
-A scenario tells each obstacle with all of its states, one obstacle after another. So the file is read as a
-whole when it is first asked for, and its messages are made of that, always the same ones: JSON, of which the
-first one is the road map, as text of lanes, and each further one is all that the scenario tells of a step. In
-a clip these are the messages of an MCAP file, which is read like the scenario itself.
+A scenario contains each obstacle with all of its states. The file is therefore read as a whole at the first
+access. Its messages are JSON and always the same. The first one is the road map as a text of lanes; each
+further one contains one step. In a clip, these are the messages of an MCAP file, which is read like the
+scenario itself.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _RUN: Final = 256
 
 
 def is_scenario(path: Path) -> bool:
-    """Return whether a file begins as a CommonRoad scenario does, by its name and its first element."""
+    """True if a file is a CommonRoad scenario, by its suffix and first element."""
     if not path.name.lower().endswith(ENDINGS):
         return False
     try:
@@ -58,7 +58,7 @@ def is_scenario(path: Path) -> bool:
 
 
 class CommonRoadFile(MessageFile):
-    """A CommonRoad scenario that is read once or more often, in the words of an MCAP file.
+    """CommonRoad scenario with the interface of an MCAP file, for one or more readings.
 
     Parameters
     ----------
@@ -67,16 +67,16 @@ class CommonRoadFile(MessageFile):
     Attributes
     ----------
     path, size, mtime_ns
-        The file, its size in bytes, its time of change.
+        The file, its size in bytes, its modification time.
     schemas, channels : dict
         ``/commonroad/map`` and ``/commonroad/steps``, with their schemas.
     counts : dict
-        Messages of each channel.
+        Number of messages by channel.
 
     Raises
     ------
     TraceError
-        The file cannot be opened, or is no scenario.
+        The file cannot be opened, or is not a scenario.
     """
 
     def __init__(self, path: Path) -> None:
@@ -121,9 +121,10 @@ class CommonRoadFile(MessageFile):
         keep: Callable[[int], bool] | None = None,
         rank: Callable[[int], int] | None = None,
     ) -> Iterator[Messages]:
-        """All messages: the map, then step after step; what was left out goes to ``report``.
+        """Yield all messages: the map, then the steps. Losses are added to ``report``.
 
-        ``offset`` of a message is its number. Nothing is read again, so ``keep`` changes nothing.
+        The ``offset`` of a message is its number. ``keep`` has no effect, because messages are already in
+        memory.
         """
         del keep, rank
         for reason in self._scenario.lost:
@@ -140,19 +141,19 @@ class CommonRoadFile(MessageFile):
             start = stop
 
     def message(self, number: int) -> bytes:
-        """The data of a message: the map is number 0, the steps follow.
+        """Return the data of a message by number. Number 0 is the map; the steps follow.
 
         Raises
         ------
         IndexError
-            There is none of this number.
+            The number is too large.
         """
         if number == 0:
             return self._map
         return _step_message(self._scenario, self._steps[number - 1], self._first(number))
 
     def _first(self, number: int) -> list[Obstacle]:
-        """What stands, which is told with the first step."""
+        """Return the static obstacles for the first step; empty for other steps."""
         return self._standing if number == 1 else []
 
     def _messages(self, numbers: range) -> Messages:
@@ -171,19 +172,21 @@ class CommonRoadFile(MessageFile):
         )
 
     def _time(self, number: int) -> int:
-        """The time of a message; that of the map is the one of the first step. ns."""
+        """Return the time of a message; ns. The map has the time of the first step."""
         steps = self._steps
         step = steps[max(number - 1, 0)] if steps else 0
         return round(step * self._scenario.step * 1e9)
 
 
 def read_messages(path: Path, places: Iterator[tuple[int, int]]) -> Iterator[bytes]:
-    """The data of messages of a scenario: (offset, length) of each, as :meth:`CommonRoadFile.walk` tells them.
+    """Yield the data of messages of a scenario, by offset and length as in a walk.
+
+    See :meth:`CommonRoadFile.walk`.
 
     Raises
     ------
     TraceError
-        The file cannot be read, or there is no message of that length there: the file was replaced.
+        The file cannot be read, or a message does not match, because the file was replaced.
     """
     with CommonRoadFile(path) as recording:
         for offset, length in places:
@@ -201,7 +204,7 @@ def read_messages(path: Path, places: Iterator[tuple[int, int]]) -> Iterator[byt
 
 
 def _steps(scenario: TrafficScenario) -> list[int]:
-    """The steps at which anything is told, in order; a scenario of standing obstacles alone has one."""
+    """Return the steps with states, in order. A scenario with only static obstacles has one step."""
     moving = {step for one in scenario.obstacles.values() if not one.static for step in one.states}
     if not moving and scenario.obstacles:
         return [0]
@@ -209,7 +212,7 @@ def _steps(scenario: TrafficScenario) -> list[int]:
 
 
 def _step_message(scenario: TrafficScenario, step: int, standing: list[Obstacle]) -> bytes:
-    """All that a scenario tells of a step, as JSON; what is not told is left out."""
+    """Return all facts of a step as JSON, without unknown values."""
     told = {
         "time": round(step * scenario.step, 9),
         "step": step,
@@ -281,7 +284,7 @@ def _about(meaning: Any) -> dict[str, str]:
 
 @cache
 def _schema(name: str) -> bytes:
-    """A JSON schema of the messages, for viewers."""
+    """Return a JSON schema of the messages, for viewers."""
     number, text = {"type": "number"}, {"type": "string"}
     box = dict.fromkeys(("x", "y", "z", "heading", "length", "width"), number)
     motion = dict.fromkeys(("vx", "vy", "ax", "ay", "yaw_rate"), number)

@@ -1,8 +1,8 @@
-"""Lanelets, signs and lights of a CommonRoad scenario → text of a road map.
+"""Conversion of the lanelets, signs and lights of a CommonRoad scenario into a road map.
 
-A lanelet is a lane whose borders have as many points on both sides: its cross sections. Lanelets side by side
-are one road, those that an intersection names as ways through it lie in that junction. What a traffic sign
-says holds for the lanelets that refer to it.
+A lanelet is a lane. Its borders have the same number of points, which are its cross sections. Adjacent lanelets
+form one road. Lanelets of an intersection belong to that junction. A traffic sign applies to the lanelets that
+refer to it.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ _CODES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class SignMeaning:
-    """Kind of a sign, the rest of its meaning in a word or two, and a speed limit, if it is one; m/s."""
+    """Kind of a sign, a short text, and the speed limit of a speed limit sign; m/s."""
 
     kind: str
     subkind: str
@@ -93,7 +93,7 @@ class SignMeaning:
 
 
 def meaning_of(sign: ScenarioSign) -> SignMeaning:
-    """Return what a sign with its plates means: the first plate whose kind is known, else its codes."""
+    """Return the meaning of a sign: that of its first plate with a known kind, else its codes."""
     for code, value in sign.plates:
         kind = _CODES.get(code)
         if kind == "speed_limit" and 0 < value < 200:
@@ -107,7 +107,7 @@ def meaning_of(sign: ScenarioSign) -> SignMeaning:
 
 
 def light_place(scenario: TrafficScenario, light: ScenarioLight) -> Place | None:
-    """Return where a light stands: as told, else where the right border of its first lanelet ends."""
+    """Return the position of a light; by default, the end of the right border of its first lanelet."""
     if light.place is not None:
         return light.place
     lanes = (one for one in scenario.lanelets.values() if light.ident in one.lights)
@@ -115,7 +115,7 @@ def light_place(scenario: TrafficScenario, light: ScenarioLight) -> Place | None
 
 
 def map_text(scenario: TrafficScenario) -> str:
-    """Return the text of the road map; empty if there are no lanelets.
+    """Return the text of the road map; empty without lanelets.
 
     Raises
     ------
@@ -159,7 +159,7 @@ def map_text(scenario: TrafficScenario) -> str:
 
 
 def _evened(left: Floats, right: Floats) -> tuple[Floats, Floats]:
-    """Both borders with as many points, at even shares of their lengths."""
+    """Return both borders with the same number of points, evenly spaced along their lengths."""
     count = max(len(left), len(right))
     shares = np.linspace(0.0, 1.0, count)
 
@@ -194,7 +194,7 @@ def _line(scenario: TrafficScenario, lanelet: Lanelet, left: Floats, right: Floa
 
 
 def _lane_type(lanelet: Lanelet) -> str:
-    """The type of a lane: by a type of its lanelet that is not of driving, else by who may use it."""
+    """Return the type of a lane from its lanelet types, else from its permitted users."""
     for word in lanelet.types:
         if word in _TYPES:
             return _TYPES[word]
@@ -205,14 +205,14 @@ def _lane_type(lanelet: Lanelet) -> str:
 
 
 def _limit(scenario: TrafficScenario, lanelet: Lanelet) -> float:
-    """The lowest speed limit of a lanelet; NaN without one."""
+    """Return the lowest speed limit of a lanelet; NaN without one; m/s."""
     signs = (scenario.signs[name] for name in lanelet.signs if name in scenario.signs)
     limits = [lanelet.speed_limit, *(meaning_of(sign).limit for sign in signs)]
     return min((one for one in limits if 0 < one < 1000), default=math.nan)
 
 
 def _signals(scenario: TrafficScenario, lanes: Sequence[PlainLane]) -> Iterator[PlainSignal]:
-    """Signs and lights on the lanes that refer to them, and stop lines."""
+    """Yield the signs and lights of the lanes that refer to them, and the stop lines."""
     row_of = {lane.name: row for row, lane in enumerate(lanes)}
     stops = _stops(scenario, lanes, row_of)
     users: dict[str, list[int]] = {}
@@ -241,7 +241,7 @@ def _signals(scenario: TrafficScenario, lanes: Sequence[PlainLane]) -> Iterator[
 def _stops(
     scenario: TrafficScenario, lanes: Sequence[PlainLane], row_of: dict[str, int]
 ) -> dict[int, float]:
-    """Lanes with a stop line, and where along them it lies; m."""
+    """Return the position of the stop line along each lane that has one; m."""
     found: dict[int, float] = {}
     told: dict[int, Floats] = {}
     for lanelet in scenario.lanelets.values():

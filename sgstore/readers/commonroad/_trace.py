@@ -1,4 +1,4 @@
-"""CommonRoad scenarios: the flavour of files ``.xml``, and of clips of them.
+"""Reader of CommonRoad scenarios (``.xml``), and of clips of them.
 
 Source: CommonRoad: XML format documentation, versions 2018b and 2020a (Technical University of Munich).
 """
@@ -51,7 +51,7 @@ _STILL: Final = dict.fromkeys(("vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"), 
 
 
 class CommonRoadTrace(FramesTrace):
-    """A CommonRoad scenario, or a clip of one.
+    """CommonRoad scenario, or a clip of one.
 
     Parameters and attributes are those of :class:`~sgstore.readers.FramesTrace`.
     """
@@ -67,11 +67,11 @@ class CommonRoadTrace(FramesTrace):
 
     @staticmethod
     def role(channel: Channel) -> str:
-        """The steps are frames; what else is in a clip is none."""
+        """Return the role of a channel: ``ground_truth`` for steps, ``map``, else ``payload``."""
         return {STEP: "ground_truth", MAP: "map"}.get(channel.schema, "payload")
 
     def frame(self, message: TraceMessage) -> Frame:
-        """The frame that a step is. A scenario says of nobody that it is the ego."""
+        """Return the frame of a step, without an ego because scenarios do not define one."""
         told = json.loads(message.data)
         frame = Frame(round(told["time"] * 1e9))
         for one in told["obstacles"]:

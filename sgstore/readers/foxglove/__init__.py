@@ -1,4 +1,4 @@
-"""sgstore.readers.foxglove."""
+"""Reader of Foxglove scenes."""
 
 import lazy_loader
 

@@ -1,8 +1,8 @@
-"""Mapping of a Foxglove scene: the places of kind, id, speed and ego in it, as a TOML file gives them.
+"""Mapping of a Foxglove scene: a TOML file with the places of kind, id, speed and ego.
 
-A ``foxglove.SceneUpdate`` is made to be drawn: it has boxes, but no word of what they are, how fast they
-move or which of them is the ego. Every producer has habits of its own for that, so they are data.
-``docs/flavours.md`` explains the file; ``foxglove_*.toml`` beside this module are those that are shipped.
+A ``foxglove.SceneUpdate`` is made for drawing. Its boxes lack types, speeds and the ego. Every producer stores
+these facts in its own way, so a mapping describes them. ``docs/flavours.md`` explains the file. The included
+mappings are ``foxglove_*.toml``.
 """
 
 from __future__ import annotations
@@ -41,25 +41,25 @@ METADATA: Final = "metadata."
 
 @dataclass(frozen=True, slots=True)
 class Recognise:
-    """By what a recording is known that a shipped mapping fits: it has all these topics."""
+    """Condition for an included mapping: the recording contains all these topics."""
 
     topics: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class SceneMapping:
-    """Choice of the messages that make the scene.
+    """Choice of the messages that form the scene.
 
     Attributes
     ----------
     topics : tuple of str
-        Channels of ``foxglove.SceneUpdate``; empty: all there are.
+        Channels of ``foxglove.SceneUpdate``; empty: all of them.
     axes : str
-        Name of the axes (``frame_id``) that stand still and that positions are given in; empty: those that no
-        transform leads away from, or else those of most entities.
+        Name of the fixed axes (``frame_id``) for positions; empty: the root of the transforms, or else the axes
+        of most entities.
     snapshot : bool
-        Whether a message tells all that there is; otherwise what it does not tell stays, until it is deleted
-        or its lifetime ends, as Foxglove has it.
+        True if a message contains the complete scene. Otherwise, an entity stays until it is deleted or its
+        lifetime ends, as defined by Foxglove.
     """
 
     topics: tuple[str, ...] = ()
@@ -69,18 +69,18 @@ class SceneMapping:
 
 @dataclass(frozen=True, slots=True)
 class EntityMapping:
-    """Places of an entity's values: ``id``, or ``metadata.KEY``; empty: nowhere.
+    """Places of an entity's values: ``id``, or ``metadata.KEY``; empty without a place.
 
     Attributes
     ----------
     id, type : str
-        What tells one entity from another, and what it is.
+        Identity and type of the entity.
     speed : str
         m/s, along the heading.
     velocity, acceleration : tuple of str
         Three numbers, m/s and m/s², along the entity's own axes of reference (``frame_id``).
     light_state : str
-        What a traffic light shows: one of :data:`sgstore.vocabulary.LIGHT_STATES`.
+        State of a traffic light: one of :data:`sgstore.vocabulary.LIGHT_STATES`.
     """
 
     id: str = "id"
@@ -91,11 +91,11 @@ class EntityMapping:
     light_state: str = ""
 
     def ident_of(self, box: Box) -> str:
-        """The id of an entity; its own where the mapping's place for it is empty."""
+        """Return the id of an entity from its mapped place, else its own id."""
         return _text(self.id, box) or box.id
 
     def type_of(self, box: Box) -> str:
-        """The type of an entity, or the empty string."""
+        """Return the type of an entity, or an empty string."""
         if self.type:
             told = _text(self.type, box)
             if told or self.type != "metadata.type":
@@ -104,20 +104,20 @@ class EntityMapping:
         return next((lowered[key] for key in _TYPE_KEYS if lowered.get(key)), "")
 
     def number_of(self, place: str, box: Box) -> float:
-        """The number at a place of an entity; NaN if there is none."""
+        """Return the number at a place of an entity; NaN if it is missing."""
         try:
             return float(_text(place, box) or math.nan)
         except ValueError:
             return math.nan
 
     def shown(self, box: Box) -> str:
-        """State that a traffic light shows, as it is told; empty if nothing is."""
+        """Return the state of a traffic light as in the recording; empty if it is missing."""
         return _text(self.light_state, box)
 
 
 @dataclass(frozen=True, slots=True)
 class Ego:
-    """Choice of the ego: an entity, or axes that move with it.
+    """Choice of the ego: an entity, or a box in axes that move with it.
 
     Attributes
     ----------
@@ -144,15 +144,15 @@ class Ego:
 
 @dataclass(frozen=True, slots=True)
 class Mapping:
-    """All that a mapping file says.
+    """Contents of a mapping file.
 
     Attributes
     ----------
     recognise, scene, entity, ego
-        See there.
+        See the classes of these names.
     types : dict
-        Type name in lower case → what it means; what stands nowhere is looked up in ``vocabulary.toml``, and
-        then among the names of kinds.
+        Type name in lower case → its meaning. Other names are looked up in ``vocabulary.toml``, and then among
+        the names of kinds.
     """
 
     recognise: Recognise = field(default_factory=Recognise)
@@ -162,7 +162,7 @@ class Mapping:
     types: Map[str, TypeMeaning] = field(default_factory=dict[str, TypeMeaning])
 
     def meaning(self, type_name: str) -> TypeMeaning:
-        """Meaning of a type name; kind ``unknown``, or ``vehicle``, if nobody knows more."""
+        """Return the meaning of a type name; kind ``unknown`` or ``vehicle`` without a mapping."""
         name = type_name.lower()
         if name in self.types:
             return self.types[name]
@@ -192,7 +192,7 @@ _SECTIONS: Final[dict[str, type[Any]]] = {
 
 
 def _text(place: str, box: Box) -> str:
-    """Text at a place of an entity."""
+    """Return the text at a place of an entity; empty if it is missing."""
     if place.startswith(METADATA):
         return box.metadata.get(place.removeprefix(METADATA), "")
     return box.id if place == "id" else ""
@@ -200,7 +200,7 @@ def _text(place: str, box: Box) -> str:
 
 @cache
 def shipped() -> Map[str, Mapping]:
-    """The mappings that come with sgstore, by name."""
+    """Return the included mappings by name."""
     return {
         file.name.removeprefix(PREFIX).removesuffix(".toml"): _read(file.name, file.read_bytes())
         for file in sorted(resources.files("sgstore.readers").iterdir(), key=lambda f: f.name)
@@ -209,20 +209,20 @@ def shipped() -> Map[str, Mapping]:
 
 
 def mapping_for(given: str | Path, topics: Iterable[str]) -> Mapping:
-    """The mapping that a user names, or the one that fits a recording.
+    """Return the requested mapping, or the one that fits a recording.
 
     Parameters
     ----------
     given : str or Path
-        Name of a mapping that is shipped, or the path of a file; empty: the shipped one whose topics the
-        recording has, or a general one, which takes the type from metadata of the usual names.
+        Name of an included mapping, or the path of a file. Empty: the included mapping whose topics the
+        recording has, or a general one that reads the type from the usual metadata keys.
     topics : iterable of str
-        Those of the recording.
+        Topics of the recording.
 
     Raises
     ------
     TraceError
-        There is no such mapping, or it is malformed.
+        The mapping does not exist or is malformed.
     """
     if not str(given):
         here = set(topics)
@@ -268,7 +268,7 @@ def _section(name: str, values: Any) -> Any:
 
 
 def _value(name: str, kind: str, value: Any) -> Any:
-    """A value of the type that a field has, which is told by its text."""
+    """Convert a value to the type of a field, given as a text."""
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     match kind:
         case "str" if isinstance(value, str):

@@ -1,9 +1,8 @@
-"""Foxglove messages in protobuf and JSON, and the tree of coordinate frames.
+"""Decoder of Foxglove messages in protobuf and JSON, and the tree of coordinate axes.
 
-Axes that move in other axes: a tree of ``foxglove.FrameTransform``, asked for the pose of any at any time.
-
-Between two transforms a pose is interpolated: places along the line, turns along the shorter arc. Before the
-first and behind the last transform it is the nearest one.
+The tree of ``foxglove.FrameTransform`` contains axes that move in other axes. It returns the pose of any axes
+at any time. Between two transforms, a pose is interpolated: positions linearly, rotations along the shorter
+arc. Before the first and after the last transform, the nearest one is used.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ ORIGIN: Final = np.zeros(3)
 
 @dataclass(slots=True)
 class _Track:
-    """Poses of axes in their parent over time; the times ascend."""
+    """Poses of axes in their parent over time, in order of time."""
 
     parent: str
     times: list[int] = field(default_factory=list[int])
@@ -65,19 +64,19 @@ class _Track:
 
 @dataclass(slots=True)
 class Axes:
-    """The axes of a recording.
+    """Coordinate axes of a recording, as a tree.
 
     Attributes
     ----------
     parents : dict
-        Axes → the axes that they move in, as was told first.
+        Axes → their parent axes, from the first transform.
     """
 
     parents: dict[str, str] = field(default_factory=dict[str, str])
     _tracks: dict[str, _Track] = field(default_factory=dict[str, _Track])
 
     def tell(self, child: str, parent: str, time_ns: int, pose: Pose) -> bool:
-        """Take up where axes are in others; ``False`` if that contradicts what was told, or is too much."""
+        """Add a transform. Return False if it contradicts earlier ones or exceeds a limit."""
         track = self._tracks.get(child)
         if track is None:
             if len(self._tracks) >= MAX_AXES or child == parent:
@@ -101,7 +100,7 @@ class Axes:
         return True
 
     def pose(self, axes: str, root: str, time_ns: int) -> Pose | None:
-        """The pose of axes in others that they move in, directly or not; ``None`` if they do not."""
+        """Return the pose of axes in an ancestor, or ``None`` without a connection."""
         place, turn = ORIGIN, STILL
         for _ in range(MAX_DEPTH):
             if axes == root:
@@ -116,12 +115,12 @@ class Axes:
         return None
 
     def root(self) -> str:
-        """The axes that move in no others, if there is one such; else the empty string."""
+        """Return the only axes without a parent; empty if there are several or none."""
         roots = set(self.parents.values()) - set(self.parents)
         return roots.pop() if len(roots) == 1 else ""
 
     def forget(self, before_ns: int) -> None:
-        """Forget what is not needed any more to know poses from a time on."""
+        """Drop the transforms that are not needed for poses from a time on."""
         for track in self._tracks.values():
             keep = bisect_right(track.times, before_ns) - 1
             if keep > 0:
@@ -129,7 +128,7 @@ class Axes:
 
 
 def normed(turn: Floats) -> Floats:
-    """A quaternion of length 1; the one that turns nothing for one of no length."""
+    """Return a quaternion scaled to length 1; the identity for length 0."""
     largest = float(np.abs(turn).max())
     if not 0 < largest < np.inf:
         return STILL
@@ -138,7 +137,7 @@ def normed(turn: Floats) -> Floats:
 
 
 def product(a: Floats, b: Floats) -> Floats:
-    """The turn b followed by the turn a."""
+    """Return the rotation b followed by the rotation a."""
     ax, ay, az, aw = a.tolist()
     bx, by, bz, bw = b.tolist()
     return np.array(
@@ -152,7 +151,7 @@ def product(a: Floats, b: Floats) -> Floats:
 
 
 def rotated(turn: Floats, vectors: Floats) -> Floats:
-    """Vectors (3,) or (n, 3), turned."""
+    """Return vectors (3,) or (n, 3) after a rotation."""
     x, y, z, w = turn.tolist()
     matrix = np.array(
         [
@@ -165,9 +164,9 @@ def rotated(turn: Floats, vectors: Floats) -> Floats:
 
 
 def angles(turn: Floats) -> tuple[float, float, float]:
-    """Heading, pitch and roll of a quaternion; rad. Pitch is positive with the nose down, as in OSI.
+    """Return heading, pitch and roll of a quaternion; rad. Pitch is positive with the nose down, as in OSI.
 
-    With the nose straight up or down heading and roll turn about one axis: then the roll is 0.
+    At a pitch of ±90°, heading and roll have the same axis; the roll is then 0.
     """
     x, y, z, w = turn.tolist()
     sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))
@@ -216,23 +215,23 @@ _DELETE_ALL: Final = 1
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """An entity of a scene, as far as it has a body.
+    """Entity of a scene that has a body.
 
     Attributes
     ----------
     id, axes : str
-        Its id, and the axes (``frame_id``) that its pose is given in.
+        Its id, and the axes (``frame_id``) of its pose.
     time_ns : int or None
-        When it was so; ``None``: not told.
+        Time of the state; ns. ``None`` means unknown.
     lifetime_ns : int
-        How long it stays; 0: until it is replaced.
+        Lifetime; ns. 0: until it is replaced.
     locked : bool
-        Whether it moves with its axes.
+        True if it moves with its axes.
     metadata : dict
     pose : (place, turn), or None
-        ``None`` if that is unusable.
+        ``None`` means unusable.
     size : tuple of float
-        Length, width, height; m. NaN if it has no size.
+        Length, width, height; m. NaN without a size.
     """
 
     id: str
@@ -247,9 +246,9 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Deletion:
-    """A ``SceneEntityDeletion``: of the entity ``id``, or of all (``None``), that are older than ``time_ns``.
+    """``SceneEntityDeletion`` of the entity ``id``, or of all (``None``), that are older than ``time_ns``.
 
-    ``time_ns`` is ``None`` if it is not told: then of any age.
+    ``time_ns`` is ``None`` for a deletion without a time, which applies to any age.
     """
 
     id: str | None
@@ -258,9 +257,9 @@ class Deletion:
 
 @dataclass(frozen=True, slots=True)
 class SceneUpdate:
-    """A ``SceneUpdate``: what is there, and what is there no more.
+    """``SceneUpdate`` message with new and deleted entities.
 
-    ``bodiless``: entities that are lines, texts or arrows only.
+    ``bodiless``: number of entities with only lines, texts or arrows.
     """
 
     boxes: list[Box]
@@ -270,7 +269,7 @@ class SceneUpdate:
 
 @dataclass(frozen=True, slots=True)
 class Transform:
-    """Pose of axes (``child``) in others (``parent``)."""
+    """Pose of the axes ``child`` in the axes ``parent``."""
 
     parent: str
     child: str
@@ -283,7 +282,7 @@ DERIVED: Final = {"sgstore": "derived"}
 
 
 def encoding_of(recording: Recording, channel: int) -> str:
-    """``protobuf`` or ``json`` for a channel whose messages are read here, else the empty string."""
+    """Return ``protobuf`` or ``json`` for a channel with supported messages, else an empty string."""
     record = recording.channels[channel]
     if DERIVED.items() <= record.metadata.items():
         return ""
@@ -294,7 +293,7 @@ def encoding_of(recording: Recording, channel: int) -> str:
 
 
 class ChannelReader:
-    """Reads the messages of a channel.
+    """Decoder of the messages of a channel.
 
     Parameters
     ----------
@@ -314,7 +313,7 @@ class ChannelReader:
         self._class = message_class(schema, fields) if encoding == "protobuf" else None
 
     def scene(self, data: bytes) -> SceneUpdate:
-        """A ``SceneUpdate``.
+        """Decode a ``SceneUpdate``.
 
         Raises
         ------
@@ -333,7 +332,7 @@ class ChannelReader:
         )
 
     def transforms(self, data: bytes) -> list[Transform]:
-        """A ``FrameTransform``, or several in one message.
+        """Decode a message with one or more ``FrameTransform``.
 
         Raises
         ------
@@ -367,7 +366,7 @@ class ChannelReader:
 
 
 def _get(part: Any, name: str, otherwise: Any) -> Any:
-    """A field of a message or of a JSON object; a sub-message that is missing is ``otherwise``."""
+    """Return a field of a message or JSON object, or ``otherwise`` for a missing one."""
     if isinstance(part, dict):
         return part.get(name, otherwise)
     if part is None:
@@ -408,7 +407,7 @@ def _box(entity: Any) -> Box | None:
 
 
 def _body(entity: Any) -> tuple[Pose | None, tuple[float, float, float]] | None:
-    """Pose and size of what an entity is: of its largest box, else of another solid, else of a model."""
+    """Return pose and size of an entity's largest box, else of another solid, else of a model."""
     for name in ("cubes", "cylinders", "spheres"):
         solids = _list(entity, name)
         if solids:
@@ -449,9 +448,9 @@ def _deletion(gone: Any) -> Deletion:
 
 
 def _time(part: Any) -> int | None:
-    """A timestamp or duration; ns. Protobuf has ``seconds`` and ``nanos``, JSON ``sec`` and ``nsec``.
+    """Return a timestamp or duration; ns. ``None`` means missing or out of range.
 
-    ``None``: it is not there, or beyond all clocks.
+    Protobuf has ``seconds`` and ``nanos``, JSON ``sec`` and ``nsec``.
     """
     if part is None:
         return None

@@ -1,15 +1,15 @@
-"""Recordings of Foxglove scenes: ``foxglove.SceneUpdate`` and ``FrameTransform``, protobuf or JSON, in MCAP.
+"""Reader of Foxglove scenes: ``foxglove.SceneUpdate`` and ``FrameTransform`` (protobuf or JSON) in MCAP.
 
-They are recognised by the schemas of their channels. A scene is made to be drawn, so what its boxes are, how
-fast they move and which is the ego, a mapping says (:mod:`sgstore.readers.foxglove._mapping`). A frame is one
-message of the leading scene, the one with most messages that hold boxes, in file order.
+A recording is recognised by the schemas of its channels. A scene is made for drawing. A mapping therefore
+defines the types and speeds of its boxes, and the ego (:mod:`sgstore.readers.foxglove._mapping`). A frame is
+one message of the leading scene, in file order. The leading scene is the one with the most messages with boxes.
 
-* What other scenes tell stays until they tell something else.
-* An entity stays until it is replaced, deleted, or its lifetime ends; or, if messages tell all that there is
-  (``snapshot``), until the next message.
-* Poses are carried to the axes that stand still by the transforms of the recording, at the time of the frame
-  for what is locked to its axes, else at the time of the entity.
-* Foxglove knows no velocity: what no metadata tells is derived.
+* The contents of other scenes stay valid until their next message.
+* An entity stays until it is replaced or deleted, or its lifetime ends. If each message contains the complete
+  scene (``snapshot``), it stays until the next message.
+* Poses are converted into fixed axes by the transforms of the recording: at the time of the frame for entities
+  locked to their axes, else at the time of the entity.
+* Foxglove has no velocities. A velocity missing in the metadata is derived.
 
 Source: foxglove-sdk, schemas.
 """
@@ -71,17 +71,17 @@ _HEADING, _VELOCITY, _ACCELERATION, _SIZE = 3, 6, 9, 13
 
 
 class FoxgloveSurvey(Survey[Lead]):
-    """The first reading of a recording: what must be known before its frames can be read.
+    """First reading of a Foxglove recording.
 
     The weight of a frame is 1 if it has boxes.
 
     Attributes
     ----------
     readers : dict
-        Channel id → reader, of the scenes that the mapping names and of the transforms.
+        Channel id → decoder, for the scenes of the mapping and the transforms.
     mapping : Mapping
     ego : tuple of str
-        Id of the entity, and name of the axes, that are the ego; empty where they are not.
+        Id of the ego's entity, and name of its axes; empty for an unused one.
     """
 
     def __init__(self, recording: Recording, wanted: str, mapping: Mapping) -> None:
@@ -96,20 +96,20 @@ class FoxgloveSurvey(Survey[Lead]):
         self._axes = Axes()
 
     def root(self) -> str:
-        """The axes that stand still."""
+        """Return the fixed axes."""
         if self.mapping.scene.axes:
             return self.mapping.scene.axes
         most = [axes for axes, _ in self._entity_axes.most_common(1)]
         return self._axes.root() or (most or [""])[0]
 
     def no_frames(self) -> str:
-        """The reason why no channel leads."""
+        """Return the reason for a recording without a leading channel."""
         named = ", ".join(self.mapping.scene.topics)
         where = f" on the topics of the mapping: {named}" if named else ""
         return f"no {SCENE} can be read{where}"
 
     def find_ego(self) -> str:
-        """Find the entity or the axes that are the ego, and return their name."""
+        """Find the entity or axes of the ego, and return the name."""
         self.ego = self._named(self.wanted) if self.wanted else self._meant()
         return self.ego[0] or self.ego[1]
 
@@ -145,7 +145,7 @@ class FoxgloveSurvey(Survey[Lead]):
         return "", axes
 
     def context(self) -> list[Ref]:
-        """Messages that later ones depend on: what comes once, with the first frame or to stay."""
+        """Return the messages that later ones depend on: single messages, and lasting entities."""
         lasting = self._transforms
         if not self.mapping.scene.snapshot:
             lasting = self._entities | self._transforms
@@ -153,11 +153,11 @@ class FoxgloveSurvey(Survey[Lead]):
         return [*self.once(first), *(ref for count, ref in lasting.values() if count == 1)]
 
     def keeps(self, channel: int) -> bool:
-        """Return whether the frames need the messages of a channel."""
+        """True if the reading of the frames needs the messages of a channel again."""
         return bool(encoding_of(self.recording, channel))
 
     def meet(self, channel: int) -> bool:
-        """Return whether the messages of a channel are read; make ready for one that is met first."""
+        """True if the messages of a channel are read. A new channel is prepared for reading."""
         if channel in self.readers:
             return True
         encoding = encoding_of(self.recording, channel)
@@ -174,7 +174,7 @@ class FoxgloveSurvey(Survey[Lead]):
         return True
 
     def look(self, run: Messages, row: int) -> None:
-        """Look at a scene, or at transforms."""
+        """Examine a scene or transforms."""
         channel = int(run.channel[row])
         reader = self.readers[channel]
         if reader.name == SCENE:
@@ -200,7 +200,7 @@ class FoxgloveSurvey(Survey[Lead]):
 
 
 def time_of(scene: SceneUpdate) -> int | None:
-    """The time of a message: that of its latest entity; ``None``: none tells it."""
+    """Return the time of a message, that of its latest entity; ``None`` without a time."""
     return max((box.time_ns for box in scene.boxes if box.time_ns is not None), default=None)
 
 
@@ -209,10 +209,10 @@ def time_of(scene: SceneUpdate) -> int | None:
 
 @dataclass(slots=True)
 class FoxgloveRawFrame:
-    """A frame whose poses are still in the axes that they were told in.
+    """Frame with the poses in their original axes.
 
-    ``boxes``: each with its node id and log time of the frame that it was told with. ``kinds``: as
-    :class:`~sgstore.readers._blocks.FrameRows` has them.
+    ``boxes``: each with its node id and the log time of its message. ``kinds``: as in
+    :class:`~sgstore.readers._blocks.FrameRows`.
     """
 
     time_ns: int
@@ -222,7 +222,7 @@ class FoxgloveRawFrame:
 
 
 class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
-    """Messages → frames, with what must be remembered from one to the next.
+    """Converter of Foxglove messages into frames.
 
     Parameters
     ----------
@@ -251,7 +251,7 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
         self._stamps = survey.leads[survey.leading].stamps.reading()
 
     def decode(self, run: Messages, row: int) -> FoxgloveRawFrame | None:
-        """The frame that a message of the leading scene is; of others ``None``."""
+        """Return the frame of a message in the leading scene; ``None`` for other messages."""
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
         reader = self._readers[channel]
         if channel in self._leading:
@@ -289,7 +289,7 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
         return frame
 
     def _fill(self, frame: FoxgloveRawFrame) -> None:
-        """Give a frame all that stands at its time."""
+        """Add all current entities to a frame."""
         time_ns, frame.boxes = frame.time_ns, []
         for source, standing in self._standing.items():
             ended = [
@@ -307,14 +307,14 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
             frame.kinds = {node: told for node, told in self._kinds.items() if node in here}
 
     def complete(self, frames: list[FoxgloveRawFrame]) -> list[FrameRows]:
-        """Frames with the poses of their boxes in the axes that stand still."""
+        """Return the frames with the poses of their boxes in fixed axes."""
         done = [self._rows(frame) for frame in frames]
         if frames:
             self._axes.forget(frames[-1].time_ns - REMEMBERED)
         return done
 
     def settle(self) -> None:
-        """Report what could not be used, once all frames are read."""
+        """Report the losses, after all frames are read."""
         self._untimed = self._stamps.untimed
         super().settle()
         self._report.losses += self._left_out.losses()
@@ -337,7 +337,7 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
                 self._odd_axes += 1
 
     def _time(self, channel: int, scene: SceneUpdate, log_time: int) -> int | None:
-        """The time of a message."""
+        """Return the time of a message; ns."""
         if channel not in self._leading or not self.is_inside(log_time):
             return self._stamps.beside(log_time, time_of(scene))
         return self._stamps.time(log_time, time_of(scene))
@@ -345,7 +345,7 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
     def _take_scene(
         self, channel: int, scene: SceneUpdate, time_ns: int, log_time: int, *, goes_on: bool
     ) -> None:
-        """Take a message. ``goes_on``: it adds to a message of another channel."""
+        """Process a scene message. ``goes_on``: it adds to a message of another channel."""
         standing = self._standing.setdefault(channel, {})
         if self._mapping.scene.snapshot and not goes_on:
             standing.clear()
@@ -373,14 +373,14 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
             standing[ident] = (told, box)
 
     def _delete(self, standing: dict[str, tuple[int, Box]], gone: Deletion, log_time: int) -> None:
-        """Delete what is older than a deletion."""
+        """Delete the entities that are older than a deletion."""
         before = None if gone.time_ns is None else self._stamps.beside(log_time, gone.time_ns)
         for ident in [*standing] if gone.id is None else [gone.id]:
             if ident in standing and (before is None or standing[ident][0] < before):
                 del standing[ident]
 
     def _see_kind(self, node: int, box: Box) -> None:
-        """Take note of what an entity is called now, if that is another kind than when it was entered."""
+        """Record the current type of an entity, if its kind differs from the first one."""
         first, type_name = self.roster.entered(node), self._mapping.entity.type_of(box)
         self._kinds.pop(node, None)
         if type_name != first.type_name:
@@ -446,7 +446,7 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
         )
 
     def _values(self, box: Box, time_ns: int) -> list[float] | None:
-        """The columns of :data:`POSE` of a box; ``None`` if it has no pose in the axes that stand still."""
+        """Return the pose columns of a box; ``None`` without a pose in fixed axes."""
         at = time_ns if box.locked or box.time_ns is None else box.time_ns
         outer = self._axes.pose(box.axes or self._root, self._root, at)
         if box.pose is None or outer is None:
@@ -489,29 +489,28 @@ def _size(ego: Ego) -> tuple[float, float, float]:
 
 
 class FoxgloveTrace(SurveyedTrace[FoxgloveSurvey]):
-    """A recording of Foxglove scenes.
+    """Recording of Foxglove scenes.
 
     Parameters
     ----------
     recording : Recording
     ego : str
-        Id of an entity, or name of the axes that move with the ego; empty: as the mapping says.
+        Id of an entity, or name of the axes that move with the ego; empty: the ego of the mapping.
     digest : str
-        SHA-256 of the file, if it is known; else the file is hashed.
+        SHA-256 of the file if known; empty: the file is hashed.
     mapping : str or Path
-        Name of a mapping that is shipped or path of a TOML file; empty: the shipped one that fits.
+        Name of an included mapping or path of a TOML file; empty: the included mapping that fits.
 
     Attributes
     ----------
     info : TraceInfo
     report : TraceReport
-        Filled while blocks are read.
+        Filled during the reading of blocks.
 
     Raises
     ------
     TraceError
-        A schema or the mapping is malformed, there is no scene that can be read, or nothing bears the name
-        given for the ego.
+        A schema or the mapping is malformed, no scene can be read, or the given ego does not exist.
     """
 
     name: ClassVar[str] = "foxglove"
@@ -531,7 +530,7 @@ class FoxgloveTrace(SurveyedTrace[FoxgloveSurvey]):
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:
-        """Return whether one of the channels carries Foxglove scenes."""
+        """True if a channel contains Foxglove scenes."""
         for number, record in recording.channels.items():
             schema = recording.schemas.get(record.schema_id)
             if schema is not None and schema.name == SCENE and encoding_of(recording, number):
@@ -539,6 +538,6 @@ class FoxgloveTrace(SurveyedTrace[FoxgloveSurvey]):
         return False
 
     def decoder(self, report: TraceReport) -> FoxgloveDecoder:
-        """A decoder that has read nothing yet."""
+        """Return a new decoder."""
         self._survey.tell(report)
         return FoxgloveDecoder(self._survey, report)

@@ -1,4 +1,4 @@
-"""SUMO's floating-car data."""
+"""Reader of SUMO floating-car data."""
 
 import lazy_loader
 

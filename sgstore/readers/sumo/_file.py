@@ -1,8 +1,8 @@
-"""Files of SUMO's floating-car data (``--fcd-output``) in the words of an MCAP file: a message for each step.
+"""SUMO floating-car data (``--fcd-output``) with the interface of an MCAP file: one message per step.
 
-The file is one XML document, of any length, plain or in gzip. It is read piece by piece, and cut where a time
-step begins and ends; what is in one is understood by whoever reads the message. A step that is larger than a
-bound, and what stands behind a cut, is a loss.
+The file is one XML document of any length, plain or gzip-compressed. It is read in pieces and split at the
+start and end of each time step. The contents of a step are parsed later. A step above the size limit, or bytes
+after damage, are a loss.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _DAMAGED: Final = (OSError, EOFError, zlib.error)
 
 
 def is_fcd(path: Path) -> bool:
-    """Return whether a file is floating-car data of SUMO, by its name and its first element."""
+    """True if a file is SUMO floating-car data, by its suffix and first element."""
     if not path.name.lower().endswith(ENDINGS):
         return False
     try:
@@ -64,12 +64,12 @@ def is_fcd(path: Path) -> bool:
 
 
 def opened(path: Path) -> BufferedIOBase:
-    """A file that SUMO wrote, as plain bytes: unpacked while it is read, if it is in gzip.
+    """Open a SUMO file as plain bytes; gzip is decompressed during the reading.
 
     Raises
     ------
     TraceError
-        It cannot be opened.
+        The file cannot be opened.
     """
     file = open_regular(path)
     packed = file.read(2) == _GZIP
@@ -78,7 +78,7 @@ def opened(path: Path) -> BufferedIOBase:
 
 
 class _Unpacked(gzip.GzipFile):
-    """A file in gzip, which closes the file beneath it."""
+    """Gzip file that also closes its underlying file."""
 
     def __init__(self, file: BufferedIOBase) -> None:
         super().__init__(fileobj=file, mode="rb")
@@ -90,14 +90,14 @@ class _Unpacked(gzip.GzipFile):
 
 
 def time_ns(step: bytes) -> int | None:
-    """The time of a time step; ns. ``None``: it tells none. SUMO writes seconds, or as an option ``h:m:s``."""
+    """Return the time of a time step; ns. ``None`` means missing. SUMO writes seconds or ``h:m:s``."""
     found = _TIME.search(step[:1000])
     seconds = seconds_of(found and found[1].decode())
     return None if math.isnan(seconds) else round(seconds * 1e9)
 
 
 def seconds_of(text: str | None) -> float:
-    """A time that SUMO writes; s. NaN: it is none."""
+    """Return the seconds of a SUMO time; NaN if it is invalid."""
     seconds = 0.0
     try:
         for part in (text or "none").split(":"):
@@ -108,7 +108,7 @@ def seconds_of(text: str | None) -> float:
 
 
 class SumoFile(MessageFile):
-    """Floating-car data, read once or more often, in the words of an MCAP file.
+    """SUMO floating-car data with the interface of an MCAP file, for one or more readings.
 
     Parameters
     ----------
@@ -117,11 +117,11 @@ class SumoFile(MessageFile):
     Attributes
     ----------
     path, size, mtime_ns
-        The file, its size in bytes, its time of change.
+        The file, its size in bytes, its modification time.
     schemas, channels : dict
         One channel, ``/sumo/fcd``, with its schema.
     counts : None
-        How many steps there are is known when they were read.
+        The number of steps is unknown before the reading.
 
     Raises
     ------
@@ -158,9 +158,9 @@ class SumoFile(MessageFile):
         keep: Callable[[int], bool] | None = None,
         rank: Callable[[int], int] | None = None,
     ) -> Iterator[Messages]:
-        """All time steps, in order; what cannot be used goes to ``report``.
+        """Yield all time steps, in order. Losses are added to ``report``.
 
-        ``offset`` of a message is its place in the file.
+        ``offset`` of a message is its position in the file.
         """
         del keep, rank
         if wanted is not None and not wanted(-1):
@@ -182,12 +182,14 @@ class SumoFile(MessageFile):
 
 
 def read_messages(path: Path, places: Iterable[tuple[int, int]]) -> Iterator[bytes]:
-    """The data of time steps of a file: (offset, length) of each, as :meth:`SumoFile.walk` tells them.
+    """Yield the data of time steps of a file, by offset and length as in a walk.
+
+    See :meth:`SumoFile.walk`.
 
     Raises
     ------
     TraceError
-        The file cannot be read, or there is no step of that length there: the file was replaced.
+        The file cannot be read, or a step does not match, because the file was replaced.
     """
     with opened(path) as file:
         for offset, length in places:
@@ -218,7 +220,7 @@ def _messages(held: list[tuple[int, int, bytes]], number: int) -> Messages:
 
 
 def _pieces(file: BufferedIOBase, report: Findings) -> Iterator[bytes]:
-    """The bytes of a file, and an empty piece at its end, unless it is damaged before."""
+    """Yield the bytes of a file in pieces, and an empty piece at its undamaged end."""
     while True:
         try:
             piece = file.read1(_PIECE)
@@ -231,7 +233,7 @@ def _pieces(file: BufferedIOBase, report: Findings) -> Iterator[bytes]:
 
 
 def _steps(file: BufferedIOBase, report: Findings) -> Iterator[tuple[int, bytes]]:
-    """Place and bytes of each time step, from its tag to its end."""
+    """Yield position and bytes of each time step, from its start tag to its end tag."""
     file.seek(0)
     rest, place = b"", 0  # what was read and not used, and where it begins in the file
     for piece in _pieces(file, report):

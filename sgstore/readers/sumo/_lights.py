@@ -1,7 +1,7 @@
-"""States of traffic lights that SUMO writes beside its floating-car data: the output ``tlsStates``.
+"""Traffic light states from a separate SUMO output file (``tlsStates``).
 
-A state is a text with a letter for each link of a traffic light. A signal of the road map is one or several
-links that always change together (:mod:`sgstore.sumo_net`), and bears the number of the first.
+A state is a text with a letter for each link of a traffic light. A signal of the road map is one or more links
+that always change together (:mod:`sgstore.sumo_net`). It has the number of the first link.
 
 Source: SUMO documentation, "Traffic Lights: Signal state definitions" and "Output: Traffic Lights" (Eclipse,
 EPL-2.0).
@@ -37,7 +37,10 @@ _PIECE: Final = 1 << 20
 
 
 def lights_beside(path: Path) -> Path | None:
-    """The file of states beside a recording, ``drive.tls.xml`` of ``drive.fcd.xml``, if there is one."""
+    """Return the file with the light states of a recording, or ``None``.
+
+    For ``drive.fcd.xml``, this is ``drive.tls.xml``.
+    """
     name = path.name
     for ending in (*ENDINGS, ".fcd"):
         if name.lower().endswith(ending):
@@ -56,7 +59,7 @@ class LightStates:
     Raises
     ------
     TraceError
-        The file cannot be read, or is something else.
+        The file cannot be read, or has another format.
     """
 
     def __init__(self, path: Path) -> None:
@@ -95,7 +98,7 @@ class LightStates:
         self._depth -= 1
 
     def of(self, signal: str, time_ns: int) -> str | None:
-        """What a signal of the road map shows: a state of the vocabulary; ``None``: nobody tells."""
+        """Return the state of a map signal at a time, as in the vocabulary; ``None`` means unknown."""
         name, link = signal, 0
         if name not in self._times:
             name, _, number = signal.rpartition("/")

@@ -1,10 +1,10 @@
-"""SUMO's floating-car data: ``sumo --fcd-output drive.fcd.xml``.
+"""Reader of SUMO floating-car data: ``sumo --fcd-output drive.fcd.xml``.
 
-A frame is a time step, at its own time. SUMO tells where the middle of the front bumper is, and a direction
-clockwise from north; our position is the middle of the box. How large a vehicle is stands in no step: it is
-what SUMO takes for its kind, unless attributes ``length``, ``width`` and ``height`` tell it. What a vehicle is,
-is told by the name of its type. What traffic lights show is told by a file beside, ``drive.tls.xml``; they
-stand where the road map has them.
+A frame is a time step, at its own time. SUMO stores the centre of the front bumper, and a direction clockwise
+from north; in sgstore, the position is the centre of the box. Time steps do not contain the size of a vehicle.
+It is SUMO's default for its kind, unless attributes ``length``, ``width`` and ``height`` exist. The type name
+determines the kind of a vehicle. The states of traffic lights come from a separate file, ``drive.tls.xml``;
+their positions come from the road map.
 
 Source: SUMO documentation, "FCDOutput", "Vehicle Type Parameter Defaults" and "Vehicle Signaling" (Eclipse,
 EPL-2.0).
@@ -63,7 +63,7 @@ _SPECIAL: Final = (("emergency", "emergency"), ("police", "emergency"), ("taxi",
 
 
 def meaning_of(type_name: str, *, walks: bool) -> TypeMeaning:
-    """Meaning of a type: that which the vocabulary has, else by words in its name."""
+    """Return the meaning of a type: from the vocabulary, else from words in its name."""
     name = type_name.lower().partition("@")[0]
     known = type_meanings().get(name)
     if known is not None:
@@ -76,7 +76,7 @@ def meaning_of(type_name: str, *, walks: bool) -> TypeMeaning:
 
 
 class SumoTrace(FramesTrace):
-    """Floating-car data of SUMO. Nobody is the ego unless ``ego`` names a vehicle."""
+    """Floating-car data of SUMO. Without the argument ``ego``, the frames have no ego."""
 
     name: ClassVar[str] = "sumo"
 
@@ -89,11 +89,11 @@ class SumoTrace(FramesTrace):
             self.info = replace(self.info, mapping=digest_of(beside))
 
     def start(self) -> None:
-        """Forget which element has which id."""
+        """Reset the assignment of ids to elements."""
         self._owners: dict[str, str] = {}
 
     def on_map(self, road_map: RoadMap | None) -> None:
-        """Find the places of traffic lights in the road map that the recording is read with."""
+        """Find the positions of traffic lights in the road map of the ingest."""
         if road_map is None or self._lights is None:
             return
         nodes = road_map.nodes
@@ -110,7 +110,7 @@ class SumoTrace(FramesTrace):
         return "ground_truth" if channel.schema == STEP else "payload"
 
     def frame(self, message: TraceMessage) -> Frame:
-        """Return the frame that a time step tells."""
+        """Return the frame of a time step."""
         time = time_ns(message.data)
         frame = Frame(message.log_time_ns if time is None else time)
         step = _TimeStep(frame, self._owners)
@@ -136,9 +136,9 @@ class SumoTrace(FramesTrace):
 
 
 class _TimeStep:
-    """Handler of events of XML: vehicles, persons and containers become entities of a frame.
+    """Handler of XML events that adds vehicles, persons and containers to a frame.
 
-    SUMO has vehicles and persons of one name. ``owners``: the element that had a name first.
+    SUMO may have a vehicle and a person with the same name. ``owners``: the first element with each name.
     """
 
     def __init__(self, frame: Frame, owners: dict[str, str]) -> None:
@@ -146,7 +146,7 @@ class _TimeStep:
         self._idents: set[str] = set()
 
     def start(self, tag: str, told: dict[str, str]) -> None:
-        """An element starts."""
+        """Handle the start of an element."""
         if tag not in {"vehicle", "person", "container"} or "x" not in told:
             return
         ident = told["id"]
@@ -192,11 +192,11 @@ class _TimeStep:
         )
 
     def end(self, _tag: str) -> None:
-        """An element ends."""
+        """Handle the end of an element."""
 
 
 def _lights(told: dict[str, str]) -> list[str] | None:
-    """Lights that are on, where ``--fcd-output.signals`` tells them."""
+    """Return the active lights from ``--fcd-output.signals``. ``None`` means unknown."""
     if "signals" not in told:
         return None
     mask = int(told["signals"])
