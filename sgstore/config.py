@@ -552,7 +552,7 @@ def _checked_relations(given: Mapping[str, Mapping[str, Any]]) -> dict[str, dict
     return checked
 
 
-# Configs with names: the default, and those that do what other tools do -------------------------
+# Presets: the default, and configs that reproduce other tools -----------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -808,7 +808,7 @@ def _built(cls: Any, values: Mapping[str, Any], prefix: str) -> Any:
     return cls(**{name: _value(hints[name], v, f"{prefix}{name}") for name, v in values.items()})
 
 
-# Configs as commented TOML, and the page that tells of all settings -----------------------------
+# Configs as commented TOML, and the page of all settings ----------------------------------------
 
 WIDTH: Final = 98
 """Line width of comments; characters."""

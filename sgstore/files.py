@@ -72,7 +72,7 @@ class HeldFolder:
         self._owner = os.getpid()
         self._lock: int | None = None
         self.path = parent / f"{prefix}{self._owner}"
-        # An interrupt may come before whoever needs it can remove it.
+        # An interrupt may come before the caller can remove the folder.
         atexit.register(self.remove)
         try:
             while True:
@@ -119,7 +119,7 @@ class HeldFolder:
             with suppress(OSError):  # closed by a removal that was interrupted
                 os.close(self._lock)
             self._lock = None
-        # A process of ours may outlive us for a moment, and write into the folder while it is removed.
+        # A child process may outlive this process briefly, and write into the folder during its removal.
         sweep(self._parent, self._prefix)
         atexit.unregister(self.remove)
 
@@ -205,9 +205,9 @@ def _root() -> Path:
         return Path(os.environ.get("TMPDIR") or "/tmp").resolve()  # noqa: S108  only names it
 
 
-# How files are written: beside, under a name of their own, and renamed when all is there --------
-# So a full disk, a crash or an interrupt loses nothing of a file that was there before, and nobody ever reads
-# half a file. What cannot be replaced by a renaming (a pipe, a device, ``/dev/stdout``) is written into.
+# Atomic output: files are written under a temporary name, then renamed --------------------------
+# A full disk, a crash or an interrupt does not damage the previous file, and readers never see half a file.
+# Places that a rename cannot replace (a pipe, a device, ``/dev/stdout``) are written directly.
 
 FILE_PREFIX: Final = ".sgstore-held-"
 """Prefix of the temporary folders next to output files."""

@@ -705,7 +705,7 @@ class SceneGraph:
         return graph
 
 
-# Columns of many frames → scene graphs, one after another: out of a store, or of a generator ----
+# Columns of many frames → scene graphs, from a store or a generator -----------------------------
 
 
 class MapRecords:

@@ -312,7 +312,7 @@ class Matches(Tabular):
         with self._compiled() as compiled:
             statement = compiled.bindings(Window(bucket, bucket + 1))
             rows = self._file.rows(**self._asked(statement)).values
-        # A variable that is called like a column of frames, such as t, has ".id" behind it there.
+        # A variable with the name of a frame column, such as t, has the suffix ".id" there.
         names = {
             i - 1: name.removesuffix(".name")
             for i, name in enumerate(statement.columns)

@@ -177,8 +177,8 @@ _OWN_FOLDED: Final[Mapping[str, Mapping[str, str]]] = {
     "light_state": {normalize_name(name): name for name in OWN_LIGHT_STATES},
 }
 
-# Codes are the process's, names are not: a name that a store has is one for who asks that store. Those of this
-# package, and those that other packages, settings, readers and imports made known, are names for everybody.
+# Codes belong to the process, but names have a scope. A name from a store is valid only for queries on that
+# store. Built-in names, and names registered by plugins, settings, readers and imports, are always valid.
 
 NAMES: Final[Mapping[str, Sequence[str]]] = {
     "kind": KINDS,

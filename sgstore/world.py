@@ -737,7 +737,7 @@ class Clip:
         return Clip(self.trace, self.start_ns - by, self.end_ns + by)
 
 
-# What a store keeps of it: float32 about an origin
+# Stored values: float32 relative to an origin
 
 KEPT: Final = (
     *("pitch", "roll", "vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"),
@@ -797,14 +797,14 @@ def _as_kept(states: States, origin: Origin) -> States:
     """
     if not len(states):
         return states
-    # All columns at once: a frame that comes alone is a few dozen rows.
+    # All columns are processed at once, because a single frame has only a few dozen rows.
     names = (*KEPT, "heading", "x", "y", "z")
     shift = np.array([0.0] * (len(names) - 3) + [origin.x, origin.y, origin.z])[:, None]
     given = [getattr(states, name) for name in KEPT]
     given += [turned(states.heading), states.x, states.y, states.z]
     kept = number(np.stack(given) - shift).astype(np.float64)
     kept[~np.isfinite(kept)] = np.nan
-    # A traffic light changes, so it has states; but it stands for ever.
+    # A traffic light has states, because it changes, but its position is constant.
     velocity = kept[_VELOCITY]
     kept[_VELOCITY] = np.where((states.light_state >= 0) & np.isnan(velocity), 0.0, velocity)
     gear, hand_brake = np.rint(kept[_GEAR]), kept[_HAND_BRAKE]

@@ -53,7 +53,7 @@ _SORTED: Final = frozenset({*STATES, *REPEATED, *REPEATED.values(), "frame", *MA
 """Large tables, sorted in a bundle."""
 
 
-# Traces of stores → a store of their own ------------------------------------------------------
+# Copy of traces into a new store --------------------------------------------------------------
 
 
 def write_bundle(
@@ -216,7 +216,7 @@ def _chosen(table: str, database: str) -> str:
     return f"SELECT * FROM {inside}.{table} WHERE {_TRACE_OF[column]} IN (SELECT key FROM chosen)"
 
 
-# What the catalogue of a collection says of a bundle ---------------------------------------------
+# Catalogue rows of a bundle ----------------------------------------------------------------------
 
 CATALOGUE: Final[dict[str, dict[str, str]]] = {
     "bundle": {

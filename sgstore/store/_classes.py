@@ -97,7 +97,7 @@ class TraceClasses:
 
     def _named(self, seen: GraphColumns) -> list[tuple[str, ...]]:
         """Return the classes of the frames for each abstraction."""
-        # Not those of a crowd together, which would take the memory.
+        # Crowded frames are processed one abstraction at a time, to limit memory.
         together = len(self._of) if len(seen.frame) < _FEW_EDGES else 1
         named: list[str] = []
         for first in range(0, len(self._of), together):
@@ -212,7 +212,7 @@ class Abstracted:
                         staging.insert(_LATER, classes.columns(seen, trace_id, seq))
                     staging.seal()
             with writing(self._access) as connection:
-                # Another process may have been faster, or have removed a trace.
+                # Another process may have added the classes, or removed a trace.
                 missing = _missing(connection, name, "store.inside.")
                 for trace_id, staging in made.items():
                     if trace_id in missing:
@@ -377,7 +377,7 @@ def _missing(connection: DuckDBPyConnection, name: str, catalog: str = "") -> di
     return dict(connection.execute(_MISSING.format(catalog), {"name": name}).fetchall())
 
 
-# Classes of all frames as numbers, and the features of graphs: what coverage is made of -----------
+# Input of coverage: classes of all frames as numbers, and features of graphs ----------------------
 
 _CLASSES: Final = """
   SELECT class, bucket, mask FROM frame_class WHERE abstraction = $name

@@ -206,7 +206,7 @@ class Deriving:
         about |= {(src, "follows", dst): {"gap": gap} for src, dst, gap in gaps}
         about |= {(dst, "leads", src): {"gap": gap} for src, dst, gap in gaps}
         edges = [(a, r, b, dict(about.get((a, r, b), {}))) for a, r, b in drawn]
-        # What is left is edges of the map.
+        # The remaining edges belong to the map.
         old = set(before)
         edges += [e for e in whole.edges if e[:3] not in old and {e[0], e[2]} <= nodes.keys()]
         return SceneGraph(

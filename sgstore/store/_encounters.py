@@ -197,7 +197,7 @@ def show_recorded(connection: DuckDBPyConnection, sql: str) -> None:
     token = next(_tokens)
     _questions[token] = _MeasuredQuestion(connection, known)
     with suppress(duckdb.CatalogException, duckdb.NotImplementedException):  # it is there
-        # What has side effects is not moved before other conditions.
+        # DuckDB does not move a function with side effects before other conditions.
         connection.create_function(
             _FUNCTION,
             _recorded,

@@ -82,7 +82,7 @@ SELECT trace_id, origin_x, origin_y, origin_z, coalesce(map_id, -1) AS map_id
 FROM trace WHERE trace_id BETWEEN $first >> 24 AND $last >> 24 ORDER BY trace_id
 """
 
-# Of scene graphs there are all columns of the views.
+# Scene graphs need all columns of the views.
 _SCENES: Final = f"""
 SELECT f.frame_id, f.seq, f.time_ns, f.ego, t.name, f.map_id, m.digest
 FROM frame f JOIN {_WANTED} ON f.frame_id = w.frame_id JOIN trace t ON t.trace_id = f.trace_id
@@ -211,7 +211,7 @@ class Graphs:
         moving["heading"] = filled(moving["heading"])
         map_id = traces.map_id[trace]
         maps = np.unique(map_id if trace_id is None else traces.map_id).tolist()
-        # The fewer bits a number has, the sooner it is sorted.
+        # Numbers with fewer bits sort faster.
         number = np.searchsorted(maps, map_id).astype(np.min_scalar_type(len(maps)))
         divided = [_by_map(of, number, len(maps)) for of in (moving, standing, edges, own)]
         parts = [

@@ -284,7 +284,7 @@ def _reading(connection: DuckDBPyConnection, name: str, given: object) -> str:
 
 
 def _literal(path: Path) -> str:
-    # A name may hold what stands for other names in a pattern of names.
+    # A name can contain wildcard characters.
     text = re.sub(r"([*?\[])", r"[\1]", str(path.resolve()))
     return literal(text)
 

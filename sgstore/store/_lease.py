@@ -230,7 +230,8 @@ class OpenFile:
     def let_go(self, token: object) -> None:
         """Unregister a user object of the file. Close the file after the last object."""
         self.holders.discard(token)
-        # An object may go at any time and in any thread: nobody is waited for. The watcher looks, too.
+        # An object may be deleted at any time and in any thread, so this code must not wait. The watcher also
+        # checks.
         if not self.holders and self.changed.acquire(blocking=False):
             try:
                 self.close()
@@ -238,7 +239,7 @@ class OpenFile:
                 self.changed.release()
 
 
-# The thread that gives files back ---------------------------------------------------------------
+# Thread that closes idle files ------------------------------------------------------------------
 
 
 class _Watch:
@@ -308,7 +309,7 @@ def give_back(patience_s: float = 0.0) -> None:
                 file.changed.release()
 
 
-# At the end of the process the thread must not be within the database.
+# At process exit, the thread must not be inside the database.
 @atexit.register
 def _end() -> None:
     give_back(5.0)

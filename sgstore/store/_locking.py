@@ -114,7 +114,7 @@ def shut_in(connection: DuckDBPyConnection, path: Path, folders: tuple[Path, ...
     connection.execute("SET lock_configuration = true")
 
 
-# A folder beside a store for what is on its way into it, called ``STORE.segment-…`` -------------
+# Folder of unpublished segments next to a store, named ``STORE.segment-…`` ----------------------
 
 _NAME: Final = ".segment-"
 
@@ -168,7 +168,7 @@ def refuse_odd_name(store: Path) -> None:
     )
 
 
-# What is said of errors of the database that are no fault of the question -----------------------
+# Messages for database errors that the query did not cause --------------------------------------
 
 
 def engine_fault(error: duckdb.Error) -> str | None:
@@ -189,10 +189,10 @@ def spill_fault(message: str) -> str | None:
     )
 
 
-# How readers and writers share one DuckDB file: within a process, and among processes -----------
-# DuckDB lets one process write a file, or many read it, and refuses everyone else at once. Here nobody is
-# refused: whoever comes waits, for a bounded time. The file is held while it is read or published to, and for a
-# short while after it was read, unless somebody waits to write (see :mod:`sgstore.store._lease`).
+# Shared access of readers and writers to a DuckDB file, within and among processes --------------
+# DuckDB lets one process write a file, or many read it, and rejects other processes at once. Here, a process
+# waits for a limited time instead. The file is open during reading and publication, and for a short time after
+# a reading, unless a writer waits (see :mod:`sgstore.store._lease`).
 #
 # * *Among processes* DuckDB's own lock decides. A writer that waits for readers holds a second lock, the
 #   *gate* (``STORE.gate``), that new readers pass first, so that a stream of them cannot keep it out for ever.
@@ -253,7 +253,7 @@ def without_faults(connection: DuckDBPyConnection) -> None:
     if old:
         return
     with suppress(duckdb.CatalogException):  # a later version may have no such setting
-        # GLOBAL: every reading has a session of its own.
+        # GLOBAL is necessary, because every reading has its own session.
         connection.execute("SET GLOBAL enable_caching_operators = false")
 
 
@@ -523,7 +523,7 @@ class Access:
         return instance
 
     def _opened(self, deadline: _Deadline) -> DuckDBPyConnection | AttachedFile:
-        # One configuration for all readers: they share the instance, users' statements among them.
+        # All readers have one configuration, because they share the instance, also for user statements.
         config: dict[str, str | bool | int | float | list[str]] = {
             "memory_limit": memory_setting(self._memory),
             "temp_directory": str(spill_folder()),
@@ -549,7 +549,7 @@ class Access:
     ) -> DuckDBPyConnection:
         """Open a database that can read only its own file, user tables and the given folders."""
         connection = duckdb.connect(place, read_only=read_only, config=config)
-        # Among the settings above DuckDB might take these before the folder, and refuse that.
+        # If these were in the config above, DuckDB might apply them before the folder and reject it.
         seen = [str(folder) for folder in (self._file.folder, *folders)]
         connection.execute("SET allowed_directories = $1", [seen])
         without_faults(connection)
@@ -590,7 +590,7 @@ class Access:
                 with translated(self.path):
                     yield
             finally:
-                # What failed has been raised already; the caller closes the connection anyway.
+                # The error was already raised, and the caller closes the connection anyway.
                 with suppress(duckdb.Error):
                     connection.execute("DETACH store")
                     if checked:  # what came into it is ours
@@ -646,7 +646,7 @@ def transaction(connection: DuckDBPyConnection) -> Generator[None]:
         with suppress(duckdb.Error):  # a transaction that broke has been undone already
             connection.execute("ROLLBACK")
         raise
-    # So that no write-ahead log is left at rest. If it fails, it is left, and what is in it is safe.
+    # The checkpoint removes the write-ahead log. If it fails, the log stays, and its data are safe.
     with suppress(duckdb.Error):
         connection.execute("CHECKPOINT store")
 
@@ -695,7 +695,7 @@ def translated(path: Path) -> Generator[None]:
 
 
 def _reason(message: str) -> str:
-    # A name that ends in .csv or the like makes DuckDB think of a table that it could read.
+    # DuckDB may treat a name that ends in .csv as a table file.
     phrases = (
         "not a valid DuckDB database file",
         "Is a directory",
@@ -783,7 +783,7 @@ class _Gate:
                 _lock(self._lock, fcntl.LOCK_EX, self._path, deadline)
             if self._is_there():
                 return
-            # Who had it before has taken its name away, so that nobody would find it closed.
+            # The previous owner has deleted the file, so other processes would not see this lock.
             os.close(self._lock)
             self._lock = -1
 

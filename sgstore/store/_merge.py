@@ -134,7 +134,7 @@ def write_part(
 
 
 def _making(sql: str, columns: int) -> str:
-    # Names of columns may differ in case alone, which neither a table nor Parquet tells apart.
+    # Column names may differ only in case, which tables and Parquet do not distinguish.
     names = ", ".join(f"c{number}" for number in range(columns))
     return f"CREATE OR REPLACE TEMP TABLE {_PART} AS SELECT * FROM (\n{sql}\n) AS t({names})"
 
@@ -143,7 +143,7 @@ def _written(connection: DuckDBPyConnection) -> Written:
     """Write the table of a part to a file in the allowed folder. A small table stays in memory."""
     described = connection.execute(f"DESCRIBE {_PART}").fetchall()
     kinds = {str(row[0]): str(row[1]) for row in described}
-    # A column of which nothing is known is of no type, and a table has none such.
+    # A column with only NULL has no type, which a table does not support.
     whole = [name for name, kind in kinds.items() if kind == "INTEGER"]
     counted = ", ".join(["count(*)", *(f"count({name})" for name in whole)])
     rows, *known = connection.execute(f"SELECT {counted} FROM {_PART}").fetchall()[0]

@@ -237,13 +237,13 @@ def _edge_columns(
     graph: GraphBlock | WorldBlock, edges: Edges, trace_id: int, kinds: NodeKinds
 ) -> Columns:
     seq, ego = graph.frames.seq, graph.frames.ego
-    # Without an ego it is -1, and so is a node of the map.
+    # Without an ego, the value is -1, which is also a map node.
     of = np.where(ego < 0, MISSING, ego).astype(edges.src.dtype)[edges.frame]
     of_ego = (edges.src == of).view(np.int8) * np.int8(2) + (edges.dst == of)
-    # In few bytes, for there are many edges; of buckets there are few in a block.
+    # Small types save memory: a block has many edges, but few buckets.
     bucket = (seq // BUCKET_FRAMES - seq[0] // BUCKET_FRAMES).astype(np.int32)[edges.frame]
     bit = (seq % BUCKET_FRAMES).astype(np.int8)[edges.frame]
-    # Kinds follow from the nodes: the table is sorted by them when it is published.
+    # Kinds follow from the nodes. The publication sorts the table by kind.
     first, mask = masks_of((edges.relation, of_ego, bucket, edges.src, edges.dst), bit)
     src, dst = edges.src[first], edges.dst[first]
     return {

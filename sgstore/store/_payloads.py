@@ -244,7 +244,7 @@ def _no_payload(connection: DuckDBPyConnection, frame: FrameRef, channel: str) -
     return StoreError(f"no message of {channel!r} belongs to {frame.trace}#{frame.seq}: {reason}")
 
 
-# Events of a trace → rows, each with the frame that is nearest in time --------------------------
+# Events of a trace → rows, each with the nearest frame in time ----------------------------------
 
 MOST_WAITING: Final = 100_000
 """Largest number of held-back events. Beyond it, they are assigned to the last frame so far."""

@@ -134,7 +134,7 @@ def _put(
 
 def widen(connection: DuckDBPyConnection, words: Mapping[str, Iterable[str]]) -> None:
     """Add missing enumeration values to the attached store."""
-    # Every store has those of ``schema.sql``; to look which others it has takes a while.
+    # Every store has the values of ``schema.sql``. Reading other values takes time.
     new = {
         enum: [name for name in names if name not in shape.own_labels(enum)]
         for enum, names in words.items()
@@ -194,7 +194,7 @@ def insert(
 ) -> None:
     """Insert the staged rows of a table, with values that only the store can assign."""
     given = given or {}
-    # The same arrays for all rows: until it ends, the transaction keeps whatever it has been given.
+    # The arrays are reused, because a transaction keeps all arrays until its end.
     staged = _buffers(tables, table)
     size = len(next(iter(staged.values())))
     connection.register("staged", staged)
@@ -343,7 +343,7 @@ def copy_sorted(connection: DuckDBPyConnection) -> None:
         )
 
 
-# What is added to traces that are in a store already: built aside, brought in by one transaction, noted ----
+# Additions to stored traces: built outside, added in one transaction, with checksums -----------------------
 
 STEP: Final = 64
 """Buckets of rows in memory at once: 3,840 frames."""
@@ -405,6 +405,6 @@ def _ranges(
         return
     first = trace_id << BUCKET_BITS
     behind = first + -(-frames // BUCKET_FRAMES)
-    # In the last range, behind the last frame, there should be nothing.
+    # The last range, after the last frame, should be empty.
     for low, high in pairwise([*range(first, behind, STEP), behind, (trace_id + 1) << BUCKET_BITS]):
         yield f"{column} >= ? AND {column} < ?", [low << bits[column], high << bits[column]]

@@ -284,7 +284,7 @@ def _object(text: object) -> dict[str, Any]:
     return {str(key): one for key, one in value.items()}  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
 
 
-# An empty store -------------------------------------------------------------------------------
+# Empty stores ---------------------------------------------------------------------------------
 
 
 def create(path: Path) -> None:
@@ -372,7 +372,7 @@ def _make_empty(place: Path) -> None:
         connection.execute("DETACH fresh")
 
 
-# A store that is written anew beside the old one, and then put in its place ---------------------
+# Rewritten store that replaces the old file -----------------------------------------------------
 
 
 def compact(path: Path, access: Access, memory: int) -> None:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# What a statement gives: rows in memory, arrays, or a stream of rows ----------------------------
+# Results of a statement: rows in memory, arrays, or a stream of rows ----------------------------
 
 BATCH: Final = 10_000
 """Rows of a batch."""
@@ -301,7 +301,7 @@ class Batches:
         def begin() -> list[tuple[Any, ...]]:
             return connection.execute(sql, parameters or None).fetchmany(size)
 
-        # Faults of the statement come before its first row is given.
+        # Errors of the statement are raised before its first row.
         self._next = interruptible(connection, begin)
         self.columns, self.types = _described(connection)
         self._single = [i for i, kind in enumerate(self.types) if kind == "FLOAT" and shortened]
@@ -493,7 +493,7 @@ def _interrupted_after(connection: DuckDBPyConnection, timeout_s: float | None) 
         watcher.join()
 
 
-# Rows → packages for tables, which are imported when they are asked for, and CSV ----
+# Rows → tables of optional packages (imported on demand), and CSV -------------------
 
 _ARROW: Final = {
     "BIGINT": "int64",
@@ -584,7 +584,7 @@ def _cell(value: Any) -> Any:
     return "" if value is None else without_controls(value) if isinstance(value, str) else value
 
 
-# Columns or rows → Parquet, block by block, by DuckDB, so that nobody needs another package for it ----
+# Columns or rows → Parquet, block by block, written by DuckDB without another package -----------------
 
 ROW_GROUP: Final = 122_880
 """Rows of a row group."""
@@ -852,7 +852,7 @@ def count_parquet(file: Path) -> tuple[int, tuple[str, ...]]:
         raise ExportError(f"{file.name}: cannot be read back: {str(error).strip()}") from error
 
 
-# Tables that a statement of a user's is given ------------------------------------------------------
+# Temporary tables of a user's statement ------------------------------------------------------------
 
 UserTablesGiven = Callable[[], Iterable[Given]]
 """Function that returns the temporary tables of a user's statement. Called while the store is open."""

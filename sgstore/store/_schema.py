@@ -359,7 +359,7 @@ def _changed(objects: Objects, views: dict[str, Tokens]) -> Iterator[str]:
     )
 
 
-# Kinds, relations, states of lights: a store made before holds a new one ------------------------------------
+# New kinds, relations and light states in an existing store -------------------------------------------------
 
 
 @cache
@@ -459,7 +459,7 @@ def others(objects: Objects) -> list[str]:
     )
 
 
-# Words ------------------------------------------------------------------------------------------------------
+# Tokens -----------------------------------------------------------------------------------------------------
 
 
 @cache
@@ -505,13 +505,13 @@ def _with_types(words: Tokens, types: dict[str, Tokens]) -> Iterator[str]:
     """Yield the tokens of a table, with each enumeration expanded to all its values, as DuckDB prints it."""
     before = ""
     for number, word in enumerate(words):
-        # A type stands behind the name of a column, which may be called like it.
+        # A type follows the name of a column. Both can be equal.
         named = number > 3 and before not in {"(", ","}
         yield from types[word] if named and word in types else (word,)
         before = word
 
 
-# What is there ----------------------------------------------------------------------------------------------
+# Objects of a store -----------------------------------------------------------------------------------------
 
 
 def objects_of(connection: DuckDBPyConnection, database: str) -> Objects:

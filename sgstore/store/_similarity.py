@@ -260,7 +260,7 @@ class _RunSearch:
         run, self._last = self._last, None
         if run is None or not self._wanted(run.trace, run.similarity):
             return
-        # Those that come later are worse, if they are as like.
+        # Among equally similar runs, a later one ranks lower.
         entry = (run.similarity + (run.same is True), -run.trace, -run.seq, run)
         if self._each is not None:
             if run.trace not in self._each or entry > self._each[run.trace]:

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from sgstore.store._packing import Columns
 
 
-# A file of tables: pieces one behind the other, each a line that says what it is, and its columns -------------
+# File of tables: consecutive pieces, each with a header line and its columns ----------------------------------
 
 FILE: Final = "tables"
 
@@ -536,7 +536,7 @@ def scratch(spill: Path, *, memory: int = 0, threads: int = 1) -> DuckDBPyConnec
     return connection
 
 
-# A trace that is ready to be published: a file of tables in a folder, and what is said of them ----------------
+# Trace ready for publication: a folder with a file of tables and metadata -------------------------------------
 
 _SAID: Final = "sealed.json"
 

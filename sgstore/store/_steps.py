@@ -79,7 +79,7 @@ class _Task(Generic[T]):
     def __init__(self, step: Callable[[], T]) -> None:
         self.ended = threading.Event()
         self._step = step
-        # One turn, for whoever takes it first: the thread that does the step, or who wants it no more.
+        # One token: the running thread takes it, or the thread that cancels the task.
         self._turns = [None]
         self._found: list[T] = []
         self._error: BaseException | None = None
@@ -136,7 +136,7 @@ class _StepThread:
 
     def begin(self, task: _Task[Any]) -> bool:
         """Queue a task. False if the thread cannot start."""
-        # A process that was forked off has no thread, and its queue may be locked for ever.
+        # A forked process lacks this thread, and its queue may be locked forever.
         if self._thread is None or not self._thread.is_alive():
             self._tasks = SimpleQueue()
             thread = threading.Thread(target=_do_all, args=(self._tasks,), daemon=True)

@@ -356,7 +356,7 @@ class Segment:
 
     def _insert_graph(self, graph: GraphBlock, trace_id: int, origin: Origin) -> None:
         kinds, insert = self._kinds, self._staging.insert
-        # First of all, while little waits: of a crowd what is made on the way takes most.
+        # Crowded frames need most memory here, so this runs first, while few rows wait.
         abstracted = self._on_map.classes.tables(graph, trace_id, kinds.entities)
         of_frames = packing.frame_columns(graph, trace_id)
         if self._road_map is not None:

@@ -289,7 +289,7 @@ class Automaton:
         ended = False
         if word == "broken" and self._reset is not None and frame.now(self._reset) is true:
             word, ended = "begins", True
-        # Of what will not change any more the past does not matter either, but to guards.
+        # A final state needs no past, except for guards.
         past = self._progression.begun if self._lasts(word) and not self._guards else frame.past()
         return ObligationStep(self._state(word, past, duties), started, ended, guards)
 
@@ -342,7 +342,7 @@ def _part(formula: Formula) -> tuple[bool, Formula]:
     return True, body
 
 
-# One ``CHECK``, frame by frame ------------------------------------------------------------------
+# Online monitor of one ``CHECK`` ----------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -485,7 +485,7 @@ class CheckMonitor:
         """Name of the check."""
         return self._check.name
 
-    # Frame by frame
+    # Online, frame by frame
 
     def step(self, here: FrameTime) -> list[MonitorEvent]:
         """Process the next frame after its queries, and return the new events."""
@@ -608,7 +608,7 @@ class CheckMonitor:
         entry = self._known.of(row)
         return None if entry.final else entry.memory
 
-    # What is known
+    # Results
 
     def _events(self, here: FrameTime, changed: list[Partial]) -> Iterator[MonitorEvent]:
         """Yield events of bindings with a new status. A new entity leads to events of all bindings."""
@@ -674,7 +674,7 @@ class CheckMonitor:
         names = {name: self._domains[name][node] for name, node in nodes.items()}
         return MonitorEvent(kind, self.name, here, start, end, nodes, names, at_end=at_end)
 
-    # The end
+    # End of the trace
 
     @property
     def robustness(self) -> Robustness | None:
@@ -732,7 +732,7 @@ class CheckMonitor:
         if entry.since is not None:
             found.append((entry.since, last))
         elif not self._compat and self._ends(entry.state) == VIOLATED:
-            # Of what SGSM reports every violation is told already: the last frame's, too.
+            # In SGSM mode, all violations are already reported, also at the last frame.
             found.append((last, last))
         return found
 

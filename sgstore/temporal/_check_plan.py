@@ -218,7 +218,7 @@ class CheckPlan(Plan):
             return (("FORALL", others),)
         (first, nodes), *rest = self.words
         word = "FORALL" if first == "false" else first
-        # The ego of a check that reads its variables in the old way is not one of these.
+        # The ego of a check with old-style variables is not included.
         return ((word, others), (first, nodes), *rest) if others else self.words
 
     # Conditions on one frame
@@ -392,7 +392,7 @@ class CheckPlan(Plan):
                 word in b.WINDOWS
             ):
                 yield b.SignalCall("max_over", _state_of(operand), by, frames)
-                # A window without its whole past has no frame so long ago.
+                # A window without its full length has no frame that old.
                 back = by - 1 if frames else by
                 if back > 0:
                     yield b.SignalCall("delta", _state_of(_number(0)), back, frames)

@@ -90,7 +90,7 @@ NEWCOMER: Final = -(1 << 60)
 """First id of placeholders for future entities."""
 
 
-# Quantifiers: which entities of a trace they are about, and what is true of all, or of some, of them ----
+# Quantifiers: their entities in a trace, and the values for all or some of them -------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,7 +252,7 @@ def folded_margins(levels: Sequence[Level], values: Floats) -> tuple[float, int 
     return float(values[0]), int(rows[0]) if rows[0] >= 0 else None
 
 
-# ``CHECK`` over a store: verdicts of its traces, where they are violated, and by whom -----------
+# ``CHECK`` over a store: verdicts, violations, and their entities -------------------------------
 
 
 @dataclass(frozen=True, slots=True)

@@ -161,7 +161,7 @@ class ExpressionMonitor(SequenceMonitor):
             return following + 1, link, undecided or not self._closed(place, plain, None, NEVER)
         return following + 1, way.links[following], undecided
 
-    # What is kept
+    # Stored data
 
     def _forget(self) -> None:
         """Drop the step frames that no match can use any more."""

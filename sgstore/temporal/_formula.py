@@ -323,7 +323,7 @@ class Term:
         if word == "duty":
             formula, since, _ = operands
             self.timed: bool = since is not None
-            # Who keeps to the bound that ends first keeps to the other; if they begin here, both do.
+            # The tighter bound implies the other; both apply if they begin here.
             if since is not None and not formula.bound.low:
                 self.sense, self.shape, self.begins = 1, id(formula), (since,)
             return
@@ -675,7 +675,7 @@ class ProgressionFrame:
         """Evaluate a *since* with known sides. Its entries are the frames in which the right side was true."""
         bound = part.bound
         if right is self._terms.true:
-            # Without a lower bound the latest of them is as good as any before it.
+            # Without a lower bound, the latest entry suffices.
             here = (self._tick.time, self._tick.number, right)
             entries = (*entries, here) if bound.low else (here,)
         old = 0

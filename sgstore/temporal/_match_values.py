@@ -93,7 +93,7 @@ AT_FRAME: Final = -1
 """Placeholder for a step number: the single frame of a value."""
 
 
-# Over columns -------------------------------------------------------------------------------------
+# Offline, over columns ----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +221,7 @@ def _summed(word: str, values: Any, known: Bools, starts: Ints) -> Objects:
     return found
 
 
-# Frame by frame -----------------------------------------------------------------------------------
+# Online, frame by frame ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)

@@ -93,7 +93,7 @@ class TemporalMatches(Matches):
         with super()._compiled() as ready:
             steps = bool(ready.query.steps)
             if steps or _has_braces(ready.query):
-                # Where time begins, and in braces, what is unknown is false, and would find what nobody knows.
+                # Before the first frame and in braces, unknown counts as false, and would match unknown data.
                 unknowing = frozenset(self._lacking(ready))
                 knowing = replace(ready, catalog=replace(ready.catalog, unknowing=unknowing))
                 yield replace(knowing, finder=self._finder(knowing)) if steps else knowing

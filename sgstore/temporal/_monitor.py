@@ -194,7 +194,7 @@ def _live(source: str, ego: str, sensors: Sequence[Sensor]) -> Generator[FrameSo
         yield told
 
 
-# The loop of a monitor: frame in, graph made, questions asked, checks and patterns told ---------
+# Monitor loop: frame, graph, queries, checks and patterns ---------------------------------------
 
 
 class Monitor:

@@ -165,7 +165,7 @@ def refuse_many(bindings: int, told: str) -> None:
         )
 
 
-# Traces as a plan needs them: the clock, and the relations of atoms and signals, several traces a question
+# Trace data for a plan: clock, and relations of atoms and signals, for several traces per query
 # ------------------------------------------------------------------------------------------------
 
 

@@ -180,7 +180,7 @@ def margin_columns(
     return found
 
 
-# Over columns -------------------------------------------------------------------------------------
+# Offline, over columns ----------------------------------------------------------------------------
 
 
 class MarginTable:
@@ -248,7 +248,7 @@ class MarginTable:
         first, last = (near, far) if forward else (far, near)
         return np.clip(first, 0, frames), np.clip(last + 1, 0, frames)
 
-    # What decides
+    # Deciding frames
 
     def decisive(self, formula: Formula, row: int, frame: int) -> tuple[str, int] | None:  # noqa: PLR0911
         """Return the proposition and frame whose margin equals the margin of a formula.
@@ -287,7 +287,7 @@ class MarginTable:
         right = self._at(formula.right, row)[frames]
         way = np.arange(frame, end - 1) if forward else np.arange(frame, first, -1)
         left = self._at(formula.left, row)[way]
-        # On the way to the first frame of the bound the left side counts, too.
+        # The left side also counts before the first frame of the bound.
         least = np.minimum.accumulate(np.concatenate(([np.inf], left)))[
             len(way) + 1 - len(frames) :
         ]
@@ -316,7 +316,8 @@ def until(left: Floats | None, right: Floats, first: Places, end: Places) -> Flo
     hit = _greatest_of(right, first, end)
     if left is None:
         return hit
-    # Within a bound is what is met within it, and what goes on until it is met (Donzé, Ferrère and Maler 2013).
+    # A bounded *until* is the minimum of a bounded *eventually* and an unbounded *until* (Donzé, Ferrère and
+    # Maler 2013).
     onward = np.take(_behind(_unbounded(left, right)), first, axis=1)
     found = np.minimum(hit, onward)
     here = np.arange(frames)

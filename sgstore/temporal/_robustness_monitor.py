@@ -268,7 +268,7 @@ class MarginStream:
             self._parts.append(replace(part, tape=_Tape(0, np.zeros((0, 1, 1), MARGIN))))
         return self._known[key]
 
-    # Frame by frame
+    # Online, frame by frame
 
     def step(self, columns: Mapping[str, Floats], tick: Tick, parents: Ints) -> None:
         """Process the next frame.
@@ -472,7 +472,7 @@ class MarginStream:
             right = self._right(part)
             found = right.between(first, last + 1)
             if left is not None and first < at:
-                # Behind each frame of the bound, up to here, the left side counts.
+                # The left side counts after each frame of the bound, up to here.
                 since = left.between(first + 1, at + 1)[::-1]
                 way = _best_so_far(since, greatest=not part.positive)[::-1]
                 found = (
@@ -502,7 +502,7 @@ class MarginStream:
     def _time(self, frame: int) -> int:
         return self._times[frame - self._start]
 
-    # What nobody asks for any more
+    # Cleanup of data that no formula needs
 
     def _forget(self) -> None:
         needed = [part.tape.end - (isinstance(part.formula, Since)) for part in self._parts]

@@ -279,7 +279,7 @@ class RowValues(SignalValues):
             at, room = line.times[rows.frames], course.by + line.tolerances
             limit = at - room[owners]
             guess = here - (room // np.maximum(line.periods, 1))[owners]
-        # Where no frame is missing, and a clock goes evenly, the window has as many rows as frames.
+        # Without missing frames and with an even clock, a window has one row per frame.
         found = np.maximum(guess, begun)
         early = (found == begun) | (at[found - 1] < limit)
         wrong = np.flatnonzero((at[found] < limit) | ~early)
@@ -356,7 +356,7 @@ class RunFinder:
             Values to compute for each run.
         within : Window or None
         """
-        # By their ids, which are digests: each window has traces of all kinds, and a part of each table.
+        # Ids are digests, so their order mixes traces, and each window reads a part of each table.
         every = sorted(extents(self._catalog))
         asked = [one for one in every if within is None or one[0] in within]
         steps = Windows(asked, first=FIRST_WINDOW, whole_traces=True)

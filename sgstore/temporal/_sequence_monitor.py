@@ -91,7 +91,7 @@ class MonitorEvent:
     values: Mapping[str, Any] = field(default_factory=dict[str, "Any"])
 
 
-# Where a step of a sequence holds, frame by frame: its pattern, its other conditions, its duration ----
+# Frames of a step, online: its pattern, conditions and duration ---------------------------------------
 
 Needs = bool | tuple[tuple[Partial, Term], ...]
 """Truth value of conditions, or the open terms of which one must become true."""
@@ -272,7 +272,7 @@ def joined(one: Binding, names: tuple[str, ...], key: Key, apart: frozenset[str]
     return both
 
 
-# One ``MATCH``, frame by frame: a pattern of one frame, or a sequence ---------------------------
+# Online monitor of one ``MATCH``: a single-frame pattern, or a sequence -------------------------
 
 FAILED: Final = "failed"
 OPEN: Final = "open"
@@ -316,7 +316,7 @@ class SequenceMonitor:
         self._conditions = _Conditions(query, self._steps, questions, pulse)
         self._columns = [self._projected(number) for number in range(len(self._steps))]
         self._held: list[dict[Key, StepState]] = [{} for _ in self._steps]
-        # Parts have seen to it which nodes differ; several may be absent.
+        # The parts already check which nodes must differ. Several nodes may be absent.
         differ = query.injective and not query.stages
         self._apart = self._tied if differ else frozenset[str]()
         self._told: dict[tuple[int, ...], int] = {}
@@ -330,7 +330,7 @@ class SequenceMonitor:
         self._values = MatchValues(parts, plan, questions, pulse, bridge=bridge)
         self._pending: list[FoundMatch] = []
 
-    # Frame by frame
+    # Online, frame by frame
 
     def step(self, here: FrameTime, people: NodeNames) -> list[MonitorEvent]:
         """Process the next frame after its queries, and return the new events."""
@@ -596,7 +596,7 @@ class SequenceMonitor:
         time = self._pulse.told(place.time)
         return FrameTime(place.number, time, seconds_of(time - self._pulse.start))
 
-    # What is kept
+    # Stored data
 
     def _forget(self) -> None:
         """Drop the step frames that no match can use any more."""
@@ -637,7 +637,7 @@ class SequenceMonitor:
         link, absent = self.query.links[0], self._steps[1].absent
         open_ended = link.kind == "until" or (link.kind == "then" and link.within is None)
         if open_ended and not absent and self.query.policy != "longest":
-            # Whatever follows a later frame of a run follows its first one.
+            # Each continuation of a later frame of a run also continues its first frame.
             runs: dict[int, StepFrame] = {}
             for place in places:
                 runs.setdefault(place.run.number, place)

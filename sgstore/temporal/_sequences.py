@@ -53,12 +53,12 @@ if TYPE_CHECKING:
 
 
 # Sequences over columns ---------------------------------------------------------------------------
-# A match is a frame for each step, each frame within the bounds that the link before it sets. There is one
-# match for each binding and maximal run of frames of the first step: of all that begin in the run, the one
-# whose frames are the earliest, compared from the first step on.
+# A match has one frame per step, each within the bounds of the link before it. Each binding and each run of the
+# first step has one match: among all that begin in the run, the one with the earliest frames, compared from the
+# first step on.
 #
-# All frames of all bindings stand in one line, with room between bindings, so that every step is one search in
-# a sorted array.
+# All frames of all bindings share one index, with space between bindings. So every step is one search in a
+# sorted array.
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,7 +257,7 @@ def _one_a_run(line: BindingLine, first: Ints, possible: Ints) -> Ints:
     return possible[np.diff(runs, prepend=-1) != 0] if len(possible) else possible
 
 
-# Bindings of several steps together: those that agree on the variables that they share ----------
+# Joint bindings of several steps that agree on their shared variables ---------------------------
 
 ROWS: Final = 2_000_000
 """Rows of all steps processed at once."""
@@ -353,7 +353,7 @@ def _pairs(left: Keys, right: Keys) -> tuple[Ints, Ints]:
     return rows, order[np.repeat(low, counts) + offset]
 
 
-# The matches of a query over several frames -------------------------------------------------------
+# Matches of a multi-frame query -------------------------------------------------------------------
 
 
 MOST_MATCHES: Final = 2_000_000

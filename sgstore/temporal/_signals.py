@@ -162,7 +162,7 @@ class PropositionTable:
         low, high = bound.low, bound.high
         period = None if bound.frames else self._period
         if bound.frames or period:
-            # Of a clock that goes evenly, too, it is enough to count.
+            # With an even clock, counting frames is enough.
             unit = period or 1
             near = here + sign * min(-(-low // unit), len(here)) if low else None
             far = None if high is None else here + sign * min(high // unit, len(here))
@@ -224,7 +224,7 @@ def _at(places: Places, frame: Places | None) -> Places:
 # Values over time as columns: ``prev``, ``delta``, windows, ``run_length``, ``since_true``, ``age``, and terms
 # of them --------------------------------------------------------------------------------------------
 # A column of values, :class:`sgstore.lang.Column`, has a row for each binding and a column for each frame.
-# Gaps in a recording are not bridged: behind one, ``prev`` and ``delta`` are unknown, runs and windows begin.
+# Values do not cross gaps: after a gap, ``prev`` and ``delta`` are unknown, and runs and windows restart.
 
 NS: Final = 1e9
 

@@ -167,7 +167,7 @@ class BindingTable(Generic[T]):
         self.held = held
 
 
-# What checks and patterns ask of one frame: each question once, whoever asks it -----------------
+# Single-frame queries of checks and patterns, without duplicates --------------------------------
 
 Key = tuple[int, ...]
 """Nodes of some variables, in order."""
@@ -378,7 +378,7 @@ class StreamClock:
         self._last_ns = 0
         self.start = 0
         self.gap = self.jump = False
-        # Of each jump back: the time of the tick behind it, by how much ticks are later, and its number.
+        # Each backward jump: corrected time of the first frame after it, time shift, and frame number.
         self._jumps: list[tuple[int, int, int]] = []
 
     @property
@@ -762,7 +762,7 @@ def column_of(values: list[Any]) -> Column:
     return Column(told[:, None], np.array(known, np.bool_)[:, None])
 
 
-# What is true of bindings in a frame: the atoms and tests of a plan, a bit each -----------------
+# Truth of bindings in a frame: one bit per atom and test of a plan ------------------------------
 
 
 class Valuation:

@@ -135,7 +135,7 @@ def _shown(formula: Until, at: int, table: PropositionTable) -> Bools:
         return np.zeros(frames, np.bool_)
     found = _course(formula.right, table)
     places = slice(first, last + 1)
-    # One more is true, or one less, from an end on.
+    # From this end on, one more frame is true, or one less.
     change = np.zeros(frames + 1, np.int64)
     true = found.start[places]
     np.add.at(change, table.frames[places][true], 1)
@@ -195,15 +195,14 @@ def _joined(courses: list[PrefixVerdicts], join: Any) -> PrefixVerdicts:
     return PrefixVerdicts(start, kept[: int(np.sum(kept < frames, axis=0).max(initial=0))])
 
 
-# When the value of a formula is certain: the first frame that shows it, whatever may follow -----
-# For each frame of a trace two numbers: from which frame on it is known that a formula is true there, and from
-# which on that it is false; the number of frames, if the trace ends before that is known. They are made of
-# those of the parts, as logic without search tells: a conjunction is false once one of its parts is known to
-# be, and true once all are. It is what :mod:`sgstore.temporal._formula` knows frame by frame, for all
-# frames at once.
+# Decision frame of a formula: the first frame after which its value is certain ------------------
+# Each frame of a trace has two numbers: the first frame from which the formula is certainly true there, and the
+# first from which it is certainly false. Undecided values get the number of frames. The numbers follow from
+# those of the operands: a conjunction is false once one operand is false, and true once all are.
+# :mod:`sgstore.temporal._formula` computes the same online.
 #
-# An *until* asks at each frame of its bound the same, so what is known of it is a chain of the least and the
-# greatest of numbers; chains of 2, 4, 8, … frames are put together for all frames, in O(n log n).
+# The decision of an *until* is a chain of minima and maxima over its bound. Chains of 2, 4, 8, … frames are
+# combined for all frames, in O(n log n).
 
 
 Decided = tuple["Places", "Places"]
@@ -267,7 +266,7 @@ def _known_until(formula: Until, table: PropositionTable, *, ended: int | None) 
     right = known(formula.right, table, ended=ended)
     true = met(right[0], left[0], bound, table)
     start, end = _asked(bound, table)
-    # What is behind the bound is known to be nothing when a frame comes that is behind it.
+    # The first frame after the bound decides that nothing else follows in it.
     closed = np.full_like(here, len(here)) if end is None else end
     if ended is not None:
         closed = np.where(_is_over(bound, table, ended), np.minimum(closed, len(here) - 1), closed)
@@ -370,7 +369,7 @@ def _chained(
         found_low[takes] = np.maximum(a, np.minimum(b, low[places]))
         found_high[takes] = np.maximum(a, np.minimum(b, high[places]))
         at[takes] += size
-        # Of the last places, behind which there is nothing, no longer chain is asked for.
+        # The last positions need no longer chains, because nothing follows.
         joined = np.minimum(high[:-size], low[size:]), np.minimum(high[:-size], high[size:])
         low[:-size], high[:-size] = (np.maximum(low[:-size], one) for one in joined)
         size *= 2
@@ -386,7 +385,7 @@ def _most(values: Places, start: Places, end: Places | None) -> Places:
     length = np.maximum(end - start, 0)
     most, size, longest = values.copy(), 1, int(length.max(initial=0))
     found = np.full(len(start), nothing, values.dtype)
-    # The greatest of so many places is that of two stretches that may overlap.
+    # The maximum of an interval is the maximum of two overlapping intervals.
     while size <= longest:
         takes = np.flatnonzero((length >= size) & (length < 2 * size))
         first, second = start[takes], end[takes] - size
@@ -396,14 +395,13 @@ def _most(values: Places, start: Places, end: Places | None) -> Places:
     return found
 
 
-# Verdicts of formulas over columns: what is known when, where a trace violates a formula, and for how long
+# Offline verdicts of formulas: decision frames, violations and their durations
 # ------------------------------------------------------------------------------------------------
-# A *violation* begins at the first frame from which on nothing that may follow can make the formula true (a
-# trap of its automaton). It ends where the trace does or, with a formula for *reset*, at the first frame from
-# there on at which that is true; from the next frame on the formula is asked anew. Operators of the past see
-# what was before all the same.
+# A *violation* begins at the first frame after which no later frame can make the formula true (a trap of its
+# automaton). It ends at the trace end or, with a *reset* formula, at the first later frame with a true reset.
+# The evaluation restarts at the next frame. Past operators still see earlier frames.
 #
-# What no frame can refute, only the end of the trace (``EVENTUALLY p``), is violated at its last frame.
+# A formula that only the trace end can refute (``EVENTUALLY p``) is violated at the last frame.
 
 STATUS: Final = ("false", "presumably_false", "presumably_true", "true")
 """Status words in code order. The minimum is the code of a conjunction, the maximum of a disjunction."""

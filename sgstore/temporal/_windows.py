@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     Places = NDArray[np.int32 | np.int64]
 
 
-# Over columns -------------------------------------------------------------------------------------
+# Offline, over columns ----------------------------------------------------------------------------
 
 
 def over_columns(word: str, column: Column, first: Places) -> Column:
@@ -77,7 +77,7 @@ def greatest(values: Floats, first: Places, end: Places) -> Floats:
     found = np.full((len(values), len(first)), -np.inf)
     longest, size = int(length.max(initial=0)), 1
     most = values
-    # The greatest of so many values is that of two stretches that may overlap.
+    # The maximum of an interval is the maximum of two overlapping intervals.
     while size <= longest:
         takes = np.flatnonzero((length >= size) & (length < 2 * size))
         whole = len(takes) == len(first)
@@ -140,7 +140,7 @@ def _counts(known: NDArray[np.bool_], first: Places, end: Places) -> NDArray[np.
     return total[:, end] - total[:, first]
 
 
-# Frame by frame -----------------------------------------------------------------------------------
+# Online, frame by frame ---------------------------------------------------------------------------
 
 Point = tuple[int, int, float]
 """Known value: frame number, time (ns), and value."""
