@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 from builders import frame_of, thing
 from recordings import Recorder, car
+from thorough import LONG, some
 
 import sgstore
 from sgstore.errors import SgstoreError
@@ -48,10 +49,10 @@ STEPS = f"{NOTHING} AS a THEN WITHIN 2s MATCH (v) WHERE v.speed < 1 AS b"
 
 
 def constructs() -> Iterator[str]:
-    """Statements of the docs, the library and the examples, and each kind of result of no match."""
-    for page in sorted((HERE.parent / "docs").glob("*.md")):
-        yield from BLOCK.findall(page.read_text())
-    yield from (f"MATCH {name}()" for name in patterns())
+    """Statements of the docs and the library, one in three of them, and each kind of result of no match."""
+    pages = sorted((HERE.parent / "docs").glob("*.md"))
+    written = [text for page in pages for text in BLOCK.findall(page.read_text())]
+    yield from some([*written, *(f"MATCH {name}()" for name in patterns())], 3)
     yield from (f"{NOTHING} RETURN {value}" for value in VALUES)
     yield from (f"{NOTHING} RETURN {word}(v.speed) OVER match AS x" for word in OVER)
     yield from (f"{NOTHING} RETURN INTERVALS, {word}(v.speed) OVER match AS x" for word in OVER)
@@ -113,7 +114,7 @@ def test_nothing_but_errors_of_sgstore_is_raised_where_nothing_matches(alone: St
                     raise AssertionError(text) from error
                 else:
                     answered += 1
-    assert answered > 400
+    assert answered > (400 if LONG else 200)
     assert refused < answered
 
 
