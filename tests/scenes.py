@@ -33,6 +33,7 @@ from opendrive_maps import (
 )
 
 from sgstore.config import Config
+from sgstore.lang import looked_up
 from sgstore.opendrive import read_map
 from sgstore.query import Store
 from sgstore.sgg import SceneGraphGenerator
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
+    from sgstore.lang import FrameView
+    from sgstore.lang.ir import Query
     from sgstore.roads import RoadMap
     from sgstore.store import Sealed
 
@@ -458,6 +461,18 @@ def store_of(
         ]
         assert file.publish_each(sealed) == [*traces]
     return Store(where)
+
+
+def seen_by(store: Store, frame: int, query: Query) -> FrameView:
+    """The view of a frame that a pattern in memory has; made once for each scope of a store that stays open."""
+    assert not looked_up(query), "what only the store knows is of one query"
+    at = store, frame, query.world
+    if at not in _views:
+        _views[at] = store._view(store.file.frame(frame), query)
+    return _views[at]
+
+
+_views: dict[tuple[Store, int, bool], FrameView] = {}
 
 
 def _sealed(

@@ -4,11 +4,25 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
 import pytest
-from scenes import Scene, actor, along, crossroads, ego, light, path, store_of, street, through
+from scenes import (
+    Scene,
+    actor,
+    along,
+    crossroads,
+    ego,
+    light,
+    path,
+    seen_by,
+    store_of,
+    street,
+    through,
+)
 from thorough import LONG
+from thorough import some as some_of
 
 from sgstore.config import Config, RangeSettings
 from sgstore.demo import RECORDING
@@ -19,6 +33,7 @@ from sgstore.step import replayed
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
 WAYS: Final = street("driving", "driving")
@@ -72,27 +87,34 @@ def stored(path: Path, radius: float, world: float) -> Store:
     return store_of(path, SCENES, dict.fromkeys(SCENES, config))
 
 
+def kept(store: Store) -> Iterator[Store]:
+    """The store, open as long as it is asked: to open one takes longer than many an answer."""
+    with store.file.snapshot():
+        yield store
+
+
 @pytest.fixture(scope="module")
-def near(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def near(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     """Graphs of 50 m, and the world out to 200 m."""
-    return stored(tmp_path_factory.mktemp("near") / "s.sgstore", 50, 200)
+    yield from kept(stored(tmp_path_factory.mktemp("near") / "s.sgstore", 50, 200))
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     """Graphs of 50 m, and nothing else."""
-    return stored(tmp_path_factory.mktemp("alone") / "s.sgstore", 50, 0)
+    yield from kept(stored(tmp_path_factory.mktemp("alone") / "s.sgstore", 50, 0))
 
 
 @pytest.fixture(scope="module")
-def wide(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def wide(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     """Graphs of 200 m."""
-    return stored(tmp_path_factory.mktemp("wide") / "s.sgstore", 200, 0)
+    yield from kept(stored(tmp_path_factory.mktemp("wide") / "s.sgstore", 200, 0))
 
 
-def verdicts(store: Store, text: str) -> dict[str, Any]:
-    """Verdict, first violation and witnesses of each trace."""
-    found: dict[str, Any] = {}
+@cache
+def verdicts(store: Store, text: str) -> dict[Any, Any]:
+    """Verdict, first violation and witnesses of each trace; asked once of each store."""
+    found: dict[Any, Any] = {}
     for one in store.check(text):
         first = one.first_violation
         witnesses = sorted(
@@ -323,7 +345,7 @@ def test_two_beyond_the_graph_are_near(tmp_path: Path, limit: float, expected: s
 # Recordings ----------------------------------------------------------------------------------------
 
 
-def _same_rules(recording: Path, folder: Path, names: list[str]) -> int:
+def _same_rules(recording: Path, folder: Path, names: Sequence[str]) -> int:
     """How many verdicts of rules are the same with 50 m and a world of 200 m as with graphs of 200 m."""
     told: list[Store] = []
     for radius, world in ((50, 200), (200, 0)):
@@ -331,9 +353,10 @@ def _same_rules(recording: Path, folder: Path, names: list[str]) -> int:
         (found,) = ingest(where, [recording], config=ranged(radius, world))
         assert found.error is None
         told.append(Store(where))
-    for name in names:
-        near, wide = (verdicts(store, patterns()[name].text) for store in told)
-        assert near == wide, name
+    with told[0].file.snapshot(), told[1].file.snapshot():
+        for name in names:
+            near, wide = (verdicts(store, patterns()[name].text) for store in told)
+            assert near == wide, name
     return len(names)
 
 
@@ -342,7 +365,8 @@ SEEN: Final = {name for name in CHECKS if "[:sees]" in patterns()[name].query}
 
 
 def test_rules_say_the_same_of_the_bundled_recording(tmp_path: Path) -> None:
-    assert _same_rules(RECORDING, tmp_path, sorted({*CHECKS} - SEEN)) > 40
+    names = some_of(sorted({*CHECKS} - SEEN), 4)
+    assert _same_rules(RECORDING, tmp_path, names) == len(names) > 10
 
 
 RECORDINGS: Final = (
@@ -379,7 +403,7 @@ def test_a_search_in_memory_finds_what_the_database_finds(
         found = {tuple(row[place] for place in places) for row in matches if row[0] in some}
         seen = set[tuple[int, ...]]()
         for frame in some:
-            at = Binding(near._view(near.file.frame(frame), query))
+            at = Binding(seen_by(near, frame, query))
             for _ in ScopeSearch(query.scope, injective=True).run(at):
                 seen.add((frame, *(at.nodes[name] for name in names)))
         assert seen == found
@@ -400,12 +424,16 @@ USING SCOPE graph CHECK graph: FORALL (v:Vehicle) ALWAYS NOT lead(ego, v)
 @pytest.mark.parametrize("trace", sorted(SCENES))
 def test_a_monitor_says_of_the_world_what_a_store_says(near: Store, trace: str) -> None:
     (scene,) = SCENES[trace]
-    text = ";".join([MONITORED, *(patterns()[name].text for name in CHECKS)])
-    monitor = Monitor(text, scene.road, ranged(50, 200), trace=trace, period_s=1 / scene.rate)
+    texts = [MONITORED, *(patterns()[name].text for name in CHECKS)]
+    monitor = Monitor(
+        ";".join(texts), scene.road, ranged(50, 200), trace=trace, period_s=1 / scene.rate
+    )
     for frame in replayed([scene.block()]):
         monitor.step(frame)
     told = {one.check: one for one in monitor.finish()}
-    for (name, where), (verdict_, first, _) in verdicts(near, text).items():
+    stored_ = {key: one for text in texts for key, one in verdicts(near, text).items()}
+    assert {name for name, where in stored_ if where == trace} == told.keys()
+    for (name, where), (verdict_, first, _) in stored_.items():
         if where == trace:
             assert told[name].verdict == verdict_, name
             found = told[name].first_violation
