@@ -9,8 +9,12 @@ from __future__ import annotations
 from typing import Final
 
 SECONDS: Final = {
-    "order": 50,
+    "lang_scope": 60,
     "explorer": 60,
+    "order": 50,
+    "lang_beyond": 30,
+    "lang_empty": 20,
+    "compiled": 20,
     "importing": 25,
     "cli_ending": 33,
     "exports": 25,
@@ -26,6 +30,7 @@ SECONDS: Final = {
     "notebook": 12,
     "criticality": 12,
     "lane_places": 10,
+    "lane_dist": 10,
     "cookbook": 9,
     "export_scenarios": 8,
     "report": 6,
