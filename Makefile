@@ -175,7 +175,7 @@ maps: $(VENV)/.base
 	build/maps/bin/python tests/oracle_sumo.py
 
 # Files of tests that try more where SGSTORE_LONG is set (tests/thorough.py).
-LONG := lang_scope world_rows collection collection_landing collection_select collection_verbs collection_ray collection_remote commonroad collection_spark temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file order abstractions \
+LONG := lang_scope lang_empty lane_dist world_rows collection collection_landing collection_select collection_verbs collection_ray collection_remote commonroad collection_spark temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file order abstractions \
   lang_after lang_attributes lang_counting lang_match lang_oracle lang_parts lang_subgraphs doors frozen importing ingest_data ingest_hardship library zones \
   export_scenarios monitor motion union store_verify notebook assistant online parts serve sgg_traces step_expressions store_transactions tolerance over_time check_verdicts lane_places lane_courses roundabouts criticality_recorded crime
 oracle: $(VENV)/.dev
