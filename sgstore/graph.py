@@ -1,4 +1,4 @@
-"""Scene graphs as columns: a block of many frames for the store, a single frame for people and networkx."""
+"""Scene graphs as columns: blocks of frames for the store, single frames for callers and networkx."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _IS_IN, _LEADS, _FOLLOWS = (RELATION_CODE[name] for name in ("isIn", "leads", "f
 
 @dataclass(frozen=True, slots=True)
 class Edges:
-    """Edges of the graphs of a block, one row an edge and frame; shape (E,).
+    """Edges of the graphs of a block, one row per edge and frame; shape (E,).
 
     Attributes
     ----------
@@ -61,18 +61,18 @@ class Edges:
         return len(self.frame)
 
     def distinct(self) -> Edges:
-        """Each edge once, by frame, and in it in the order of source, relation and destination."""
+        """Return each edge once, ordered by frame, source, relation and destination."""
         every, new = _ordered(self)
         return taken(every, new)
 
     def differing(self, other: Edges) -> Edges:
-        """The edges that only one of both has, in that order."""
+        """Return the edges that only one of the two tables has, in the order of :meth:`distinct`."""
         every, new = _ordered(Edges.chained([self.distinct(), other.distinct()]))
         return taken(every, new & np.append(new[1:], True)[: len(new)])
 
     @classmethod
     def chained(cls, parts: Sequence[Edges]) -> Edges:
-        """Edges of all parts, one part after another, in columns of int32; of no part none."""
+        """Concatenate edge tables into int32 columns. Without parts, the result is empty."""
         none = np.empty(0, np.int8)
         parts = [cls(none, none, none, none), *parts]
         frame, src, dst = (
@@ -85,7 +85,7 @@ class Edges:
 
 
 def _ordered(edges: Edges) -> tuple[Edges, NDArray[np.bool_]]:
-    """All edges in order, and which are not as the one before."""
+    """Return the sorted edges, and a mask of the rows that differ from the row before."""
     order = np.lexsort((edges.dst, edges.relation, edges.src, edges.frame))
     every = taken(edges, order)
     columns = (every.frame, every.src, every.relation, every.dst)
@@ -96,7 +96,7 @@ def _ordered(edges: Edges) -> tuple[Edges, NDArray[np.bool_]]:
 
 @dataclass(frozen=True, slots=True)
 class LaneGaps:
-    """Gaps along the lanes from followers to those they follow: the attribute of both edges; shape (K,).
+    """Gaps along the lanes between a follower and its leader: attributes of both edges; shape (K,).
 
     Attributes
     ----------
@@ -179,7 +179,7 @@ class LaneStates:
 
 @dataclass(frozen=True, slots=True)
 class WorldBlock:
-    """What is known beyond the graphs of a block, out to ``[range] world``: what is in no graph of its frame.
+    """Data outside the graphs of a block, up to the distance ``[range] world``.
 
     Attributes
     ----------
@@ -205,7 +205,7 @@ class WorldBlock:
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """How many states of a recording settings leave out of graphs; those of what never moves do not count.
+    """Numbers of recorded states excluded from the graphs by settings. Static objects do not count.
 
     Attributes
     ----------
@@ -223,7 +223,7 @@ class LeftOut:
     excluded: tuple[tuple[int, int], ...] = ()
 
     def more(self, other: LeftOut) -> LeftOut:
-        """Return the counts of both together."""
+        """Return the sum of both counts."""
         excluded = dict(self.excluded)
         for code, many in other.excluded:
             excluded[code] = excluded.get(code, 0) + many
@@ -279,7 +279,7 @@ class GraphBlock:
 def graph_of_records(
     nodes: Iterable[Mapping[str, Any]], edges: Iterable[Mapping[str, Any]], **about: Any
 ) -> nx.MultiDiGraph[Any]:
-    """A graph in node-link form as a ``networkx.MultiDiGraph``.
+    """Return a graph in node-link form as a ``networkx.MultiDiGraph``.
 
     Parameters
     ----------
@@ -304,7 +304,7 @@ def graph_of_records(
 def named_graph(
     nodes: Mapping[str, str], edges: Iterable[tuple[str, str, str]], **about: Any
 ) -> nx.MultiDiGraph[str]:
-    """A graph of names and labels as a ``networkx.MultiDiGraph``, as the literature has them.
+    """Return a graph of names and labels, as in the literature, as a ``networkx.MultiDiGraph``.
 
     Parameters
     ----------
@@ -334,7 +334,7 @@ def named_graph(
 
 
 class LaneDistances:
-    """Starts of lanes, measured along others: the table for distances along the lanes of a map.
+    """Lane starts measured along other lanes: the table for distances along the lanes of a map.
 
     Parameters
     ----------
@@ -374,7 +374,6 @@ class LaneDistances:
 
     @cached_property
     def _onward(self) -> dict[int, list[tuple[int, float]]]:
-        """Lane → lanes to which one can drive from it, itself among them, and their starts."""
         found: dict[int, list[tuple[int, float]]] = {}
         for (lane, other), starts in self._starts.items():
             found.setdefault(lane, []).extend((other, start) for start in starts if start >= 0)
@@ -396,7 +395,7 @@ class LaneDistances:
 
     @cached_property
     def _of_lanes(self) -> dict[int, list[tuple[float, float, float | None]]]:
-        """Lane → starts of its stretches, which ascend, curvatures and slopes."""
+        """Lane → its stretches, ascending: start (m), curvature (1/m) and slope of each."""
         found: dict[int, list[tuple[float, float, float | None]]] = {}
         for lane, start, curvature, slope in self._courses:
             known = None if slope is None or math.isnan(slope) else slope
@@ -406,7 +405,10 @@ class LaneDistances:
         return found
 
     def tells(self, what: str) -> bool:
-        """Whether anything is known of lanes: of ``ways`` along them, their ``curvature``, their ``slope``."""
+        """True if the map has values for lanes:
+
+        ``ways`` along them, their ``curvature``, or their ``slope``.
+        """
         return what in self._told
 
     @cached_property
@@ -417,27 +419,30 @@ class LaneDistances:
         return frozenset(what for what, is_known in known.items() if is_known)
 
     def course(self, lane: int, along: float) -> tuple[float | None, float | None]:
-        """Curvature, 1/m, and slope of a lane at a place along it; ``None``: not known."""
+        """Return curvature (1/m) and slope of a lane at a position along it. ``None`` means unknown."""
         stretches = self._of_lanes.get(lane, ())
         if not stretches:
             return None, None
         return stretches[bisect_right(stretches, max(along, 0.0), key=itemgetter(0)) - 1][1:]
 
     def stretches(self, node: int) -> Stretches:
-        """Lanes on which a part of the map lies, and from where to where along them; m."""
+        """Return the lanes of a map element, with its start and end along each lane; m."""
         return self._of_parts.get(node, ())
 
     def stretches_of(self, what: str, lane: int) -> Sequence[tuple[float, float]]:
-        """From where to where along a lane parts of the map of one sort lie; m."""
+        """Return the start and end, along a lane, of each map element of one kind; m."""
         return self._on_lanes.get((what, lane), ())
 
     def distance(self, one: Places, other: Places) -> float | None:
-        """Distance from one entity to another, by their places; see :meth:`SceneGraph.lane_dist`."""
+        """Return the distance between two entities from their lane positions; m."""
         ends = ([(lane, along, along) for lane, along in places] for places in (one, other))
         return self.between(*ends)
 
     def between(self, one: Stretches, other: Stretches) -> float | None:
-        """Distance from the end of one to the start of another, 0 where they overlap, negative behind; m."""
+        """Return the gap between two stretches along the lanes; m.
+
+        Overlap gives 0; a stretch behind is negative.
+        """
         ahead, behind = math.inf, -math.inf
         for lane, first, last in one:
             for to, start, end in other:
@@ -452,7 +457,7 @@ class LaneDistances:
         return nearest if abs(nearest) <= self.FARTHEST else None
 
     def next(self, one: Stretches, what: str) -> float | None:
-        """Distance to the next part of the map of one sort, driving on; 0 on it; m."""
+        """Return the driving distance to the next map element of one kind, 0 on the element; m."""
         found = math.inf
         for lane, first, last in one:
             for to, way in self._onward.get(lane, ()):
@@ -463,7 +468,7 @@ class LaneDistances:
 
 
 class EdgeColumns(Sequence["EdgeRecord"]):
-    """The edges of one graph, kept as columns: each record is made when it is asked for.
+    """Edges of one graph, stored as columns. A record is created on access.
 
     A record takes about 250 bytes, a row ten. The object equals any sequence of the same records.
 
@@ -523,7 +528,7 @@ class EdgeColumns(Sequence["EdgeRecord"]):
 
 @dataclass(frozen=True, slots=True, repr=False)
 class SceneGraph:
-    """The scene graph of one frame: ``(V, E, Ego, kind, rel, att)`` of the paper, as records.
+    """Scene graph of one frame as records: ``(V, E, Ego, kind, rel, att)`` of the paper.
 
     Attributes
     ----------
@@ -571,7 +576,7 @@ class SceneGraph:
     excluded: frozenset[str] = field(default=frozenset(), compare=False, repr=False)
 
     def known(self) -> SceneGraph:
-        """All that is known of the world around: this graph, and what lies beyond it, out to ``[range] world``.
+        """Graph of all known objects: this graph, extended to the distance ``[range] world``.
 
         Outside this graph, only the edges ``isIn``, ``controlsTrafficOf``, ``leads``, ``follows`` and map edges
         exist.
@@ -586,7 +591,7 @@ class SceneGraph:
         return f"<SceneGraph {self.trace}#{self.seq}: {size}>"
 
     def places(self) -> dict[int, list[tuple[int, float]]]:
-        """Places of entities along their own lanes: node id → pairs of a lane and the way from its start; m."""
+        """Positions along own lanes: node id → pairs of (lane, distance from its start); m."""
         found: dict[int, list[tuple[int, float]]] = {}
         for src, relation, dst, about in self.edges:
             if relation == "isIn" and about.get("is_own") and "along" in about:
@@ -594,7 +599,7 @@ class SceneGraph:
         return found
 
     def stretches(self) -> dict[int, Stretches]:
-        """Lanes on which entities are, and from where to where along these: node id → (lane, start, end).
+        """Stretches of lanes that entities occupy: node id → (lane, start, end); m.
 
         Traffic lights and signs are at the stop positions of the lanes they control; see
         :mod:`sgstore.roads._places`.
@@ -611,7 +616,7 @@ class SceneGraph:
         return dict(found)
 
     def _stops(self, what: str, lane: int) -> Sequence[tuple[float, float]]:
-        """Places where a lane is waited on before a signal."""
+        """Return the stop positions of a lane before a signal."""
         known = self.reach.stretches_of(what, lane) if self.reach is not None else ()
         about = self.nodes.get(lane, {})
         if not known and ("junction" in about or "length" in about):
@@ -620,7 +625,7 @@ class SceneGraph:
         return known
 
     def lane_dist(self, a: int, b: int) -> float | None:
-        """Distance along the lanes from one entity, or part of the map, to another; m.
+        """Return the distance along the lanes between two entities or map elements; m.
 
         Measured from centre to centre along the centre lines of their own lanes (:attr:`LaneStates.own`) and
         the lanes connected by ``travelsTo``. Positive if the route leads from a to b, negative from b to a; the
@@ -643,7 +648,7 @@ class SceneGraph:
         return None if self.reach is None else self.reach.next(self.stretches().get(node, ()), what)
 
     def curvature(self, node: int) -> float | None:
-        """Curvature of the lane that an entity is in above all, where it is; 1/m.
+        """Return the curvature of an entity's primary lane at its position; 1/m.
 
         Mean over about a metre of the centre line; positive in a left turn of the lane's traffic. ``None``
         means no lane, or no map.
@@ -651,7 +656,7 @@ class SceneGraph:
         return self._course(node)[0]
 
     def slope(self, node: int) -> float | None:
-        """Slope of the lane that an entity is in above all, where it is: rise over run, 0.05 for 5 %.
+        """Return the slope of an entity's primary lane at its position: rise over run, 0.05 for 5 %.
 
         Mean over about a metre; positive if the lane's traffic drives uphill. ``None`` means no lane, no map,
         or a map without heights.
@@ -663,7 +668,7 @@ class SceneGraph:
         return (None, None) if self.reach is None or place is None else self.reach.course(*place)
 
     def primary_places(self) -> dict[int, tuple[int, float]]:
-        """The lane that each entity is in above all, and the way from its start; m."""
+        """Primary lane of each entity: node id → (lane, distance from its start); m."""
         return {
             src: (dst, about["along"])
             for src, relation, dst, about in self.edges
@@ -671,7 +676,7 @@ class SceneGraph:
         }
 
     def to_networkx(self) -> nx.MultiDiGraph[int]:
-        """The graph as a ``networkx.MultiDiGraph``.
+        """Return the graph as a ``networkx.MultiDiGraph``.
 
         Returns
         -------
@@ -709,7 +714,7 @@ class SceneGraph:
 
 
 class MapRecords:
-    """A road map, as graphs have its parts: attributes of its nodes, and its edges.
+    """Graph elements of a road map: the attributes of its nodes, and its edges.
 
     Parameters
     ----------
@@ -743,7 +748,7 @@ class MapRecords:
         self._lowest = min(src.min(initial=0), dst.min(initial=0))
 
     def among(self, present: Ints) -> Ints:
-        """Rows of the edges whose ends are both present."""
+        """Return the rows of the edges whose two nodes are both present."""
         if not len(present):
             return np.zeros(0, np.intp)
         here = np.zeros(1 - min(present.min(), self._lowest), np.bool_)
@@ -753,7 +758,7 @@ class MapRecords:
 
 @dataclass(frozen=True, slots=True)
 class SceneColumns:
-    """Scene graphs of some frames of a trace, as columns of all of them.
+    """Scene graphs of several frames of a trace, stored as shared columns.
 
     Attributes
     ----------
@@ -786,7 +791,10 @@ class SceneColumns:
     map: MapRecords | None
 
     def graphs(self) -> Iterator[SceneGraph]:
-        """The graph of each frame: what moves, what stands and the map; edges of the trace before the map's."""
+        """Yield the graph of each frame: moving, static and map nodes.
+
+        Edges of the trace come before map edges.
+        """
         frame, node, about = self.moving
         order = np.lexsort((node, frame))
         moving = _divided(frame[order], len(self.frame_id))
@@ -840,7 +848,7 @@ def edge_attributes(
     lanes: Iterable[tuple[int, int, int, Attributes]],
     gaps: Iterable[tuple[int, int, int, Attributes]],
 ) -> dict[tuple[int, int, int, int], Attributes]:
-    """Attributes of edges by frame, relation, source and destination.
+    """Return the attributes of edges: (frame, relation, source, destination) → attributes.
 
     Parameters
     ----------
@@ -857,12 +865,10 @@ def edge_attributes(
 
 
 def _divided(frame: Whole, frames: int) -> list[slice]:
-    """Rows of each frame, of a column that ascends."""
     ends = np.searchsorted(frame, np.arange(frames + 1)).tolist()
     return [slice(*pair) for pair in pairwise(ends)]
 
 
 def _narrow(nodes: Whole) -> Whole:
-    """The same node ids in half the space, unless one of them is larger than it takes."""
     narrow = nodes.astype(np.int32)
     return narrow if np.array_equal(narrow, nodes) else nodes

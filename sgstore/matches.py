@@ -91,14 +91,14 @@ T = TypeVar("T")
 if TYPE_CHECKING:
 
     class Row(tuple[Any, ...]):
-        """Row of matches, as a type checker sees it: a named tuple whose fields follow from the query."""
+        """Result row, as seen by a type checker: a named tuple with one field per query column."""
 
         def __getattr__(self, name: str) -> Any: ...
 
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """Consecutive frames of a trace in which something holds.
+    """Consecutive frames of a trace in which the same binding matches.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class Interval:
 
 
 class Matches(Tabular):
-    """Matches of a query. Iterating gives rows; each way of asking searches anew.
+    """Matches of a query. Iteration yields rows; each call runs a new search.
 
     ``count``, ``frames`` and ``clips`` cover all matching frames; ``RETURN`` has no effect on them. With
     ``LIMIT``, they cover the frames of the listed rows.
@@ -177,7 +177,7 @@ class Matches(Tabular):
         return f"<Matches of {shown!r}{limit}>"
 
     def _repr_html_(self) -> str:
-        """The first rows, the number of frames, and pictures of the first scenes, for notebooks."""
+        """Return HTML for notebooks: the first rows, the number of frames, and pictures of the first scenes."""
         from sgstore.display import html_table
 
         with self._file.snapshot():
@@ -191,7 +191,7 @@ class Matches(Tabular):
         return html_table(columns, some[:IN_NOTEBOOK], caption, below) + pictures
 
     def _pictures(self) -> Iterator[str]:
-        """Small pictures of the frames in which the first runs begin; none where that cannot be."""
+        """Yield small pictures of the first frame of the first intervals, or nothing if drawing fails."""
         from sgstore.display import html_media
         from sgstore.draw import thumbnail
 
@@ -215,7 +215,7 @@ class Matches(Tabular):
                 return
 
     def limit(self, most: int) -> Self:
-        """The same matches, but no more rows than so many, as if the query ended in ``LIMIT``.
+        """Return the same matches with at most ``most`` rows, as if the query ended in ``LIMIT``.
 
         Raises
         ------
@@ -235,17 +235,17 @@ class Matches(Tabular):
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Traces that cannot answer the query, because something that it needs is not known of them."""
+        """Names of the traces that lack data for the query. These traces are not searched."""
         return tuple(self.reasons)
 
     @property
     def reasons(self) -> dict[str, str]:
-        """The reason for each of the traces in :attr:`left_out`, by name."""
+        """Reasons for the skipped traces in :attr:`left_out`: trace name → reason."""
         return self._ready.reasons
 
     @contextmanager
     def _compiled(self) -> Generator[Compiled]:
-        """The query compiled for the store as it is; the store stays so until this is left.
+        """Yield the query compiled for the current store. The store cannot change inside the block.
 
         The content of a store affects the SQL, so a change of the file requires a new compilation.
         """
@@ -257,7 +257,7 @@ class Matches(Tabular):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on likely mistakes, such as a text that is compared with names and is none of the store's."""
+        """Notes on likely mistakes, such as a text that equals no name in the store."""
         from sgstore.lang import compared_in_query
 
         with self._compiled() as compiled:
@@ -266,7 +266,7 @@ class Matches(Tabular):
 
     @property
     def scope(self) -> dict[str, Any]:
-        """What settings left out of the traces that are asked; see :func:`sgstore.store.scope_of`."""
+        """Data that the settings excluded from the searched traces; see :func:`sgstore.store.scope_of`."""
         with self._compiled() as compiled:
             chosen = {trace.trace_id for trace in compiled.chosen}
             traces = (one for one in self._file.traces() if one.trace_id in chosen)
@@ -282,18 +282,21 @@ class Matches(Tabular):
             yield from map(row._make, rows if layout is None else map(layout.row, rows))
 
     def rows(self) -> list[Row]:
-        """All rows at once."""
+        """Return all rows as a list."""
         return list(self._rows(whole=True))
 
     def count(self) -> int:
-        """The number of distinct frames."""
+        """Return the number of distinct matching frames."""
         with self._compiled() as compiled:
             if compiled.limited_to_frames is not None:
                 return len({row[0] for row in self._frames()})
             return self._file.rows(**self._asked(compiled.count())).values[0][0]
 
     def frames(self) -> Iterator[FrameRef]:
-        """The distinct frames, by name of the trace and number; of limited rows, in the order of the rows."""
+        """Yield each matching frame once, ordered by trace name and frame number.
+
+        Limited rows keep their order.
+        """
         for frame_id, trace, seq, time_ns, t, log_time_ns in self._frames():
             yield FrameRef(frame_id, frame_id >> SEQ_BITS, trace, seq, time_ns, log_time_ns, t)
 
@@ -307,7 +310,7 @@ class Matches(Tabular):
             yield from dict.fromkeys(found)
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
-        """Return the node ids of the variables in one frame by name, whatever ``RETURN`` says."""
+        """Return all bindings in one frame: variable name → node id. ``RETURN`` has no effect."""
         bucket = frame.frame_id >> BUCKET_SHIFT
         with self._compiled() as compiled:
             statement = compiled.bindings(Window(bucket, bucket + 1))
@@ -322,7 +325,10 @@ class Matches(Tabular):
         return [{n: row[i] for i, n in names.items() if row[i] is not None} for row in found]
 
     def parts(self, frame: FrameRef, binding: Mapping[str, int] | None = None) -> TruthLanes:
-        """Intervals of each part of the pattern, for the nodes of a match; see :meth:`sgstore.Store.parts`."""
+        """Return the intervals in which each part of the pattern holds, for one binding.
+
+        See :meth:`sgstore.Store.parts`.
+        """
         from sgstore.truth_lanes import truth_lanes  # with numpy, which a question does without
 
         with self._compiled() as compiled:
@@ -341,7 +347,7 @@ class Matches(Tabular):
         return replace(compiled, bound=query, query=ready, finder=None)
 
     def subgraphs(self) -> Iterator[nx.MultiDiGraph[int]]:
-        """Each match as a graph of the nodes and edges that it binds, whatever ``RETURN`` says.
+        """Yield each match as a graph of its bound nodes and edges. ``RETURN`` has no effect.
 
         Nodes are node ids with all known attributes, and ``variables``: their names in the pattern. Edges have
         their relation as key and as attribute, and all known attributes; see :mod:`sgstore.lang._compile`. The
@@ -363,7 +369,7 @@ class Matches(Tabular):
                 yield graph_of_records(nodes, edges, **about)
 
     def intervals(self, *, bound: bool = False) -> Iterator[Interval]:
-        """Maximal runs of consecutive frames of a trace in which the same binding holds.
+        """Yield the longest intervals of a trace in which the same binding matches.
 
         With ``RETURN``, the returned values are constant in an interval. A gap longer than 2.5 median periods
         ends an interval.
@@ -381,7 +387,7 @@ class Matches(Tabular):
                 yield Interval(*row[:width], values=dict(zip(names, row[width:], strict=True)))
 
     def clips(self, before: float = 0.0, after: float = 0.0) -> Iterator[Clip]:
-        """Clips around the frames that match, in log time; those that overlap are one.
+        """Yield clips around the matching frames, in log time. Overlapping clips are merged.
 
         Parameters
         ----------
@@ -405,12 +411,11 @@ class Matches(Tabular):
 
     @property
     def _slack(self) -> dict[str, int]:
-        """The tolerance of times of each trace, by name; ns."""
         traces = self._ready.catalog.traces
         return {trace.name: tolerance_ns(trace.period_ns) for trace in traces}
 
     def numpy(self) -> dict[str, NDArray[np.generic]]:
-        """All columns as arrays, masked where something is NULL."""
+        """Return all columns as arrays. NULL values are masked."""
         with self._compiled() as compiled:
             return self._file.arrays(**self._asked(compiled.rows()))
 
@@ -433,7 +438,7 @@ class Matches(Tabular):
             return as_told(found, self.columns, most)
 
     def parquet(self, path: str | Path) -> int:
-        """Write all rows to a Parquet file, as they come; how many there are.
+        """Stream all rows into a Parquet file, and return the number of rows.
 
         Raises
         ------
@@ -447,7 +452,10 @@ class Matches(Tabular):
             return write_batches(as_told_batches(self.columns, (columns, found)), Path(path))
 
     def _record_batches(self) -> Generator[Any]:
-        """The columns, then rows in batches of Arrow; nothing where Arrow has them otherwise than Python."""
+        """Yield the columns, then Arrow batches of rows.
+
+        Yield nothing if Arrow and Python values would differ.
+        """
         if self.graphs:
             return
         with self._compiled() as compiled:
@@ -467,7 +475,7 @@ class Matches(Tabular):
                             return
 
     def as_table(self, name: str, *, apart: bool = False) -> list[Given]:
-        """Maker of a table of all rows, for a statement that speaks of it by a name.
+        """Return the steps that create a temporary table of all rows under the given name.
 
         ``apart``: add columns that distinguish equal node ids of different traces.
 
@@ -488,12 +496,12 @@ class Matches(Tabular):
         return [*asked["given"], (made, asked["parameters"])]
 
     def explain(self) -> str:
-        """Explain the query, stage by stage: parse, bind, rewrite, emit."""
+        """Explain the query stage by stage: parse, bind, rewrite, emit."""
         with self._compiled() as compiled:
             return compiled.stages()
 
     def for_people(self) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-        """Columns and rows as a person wants to read them: see :func:`sgstore.lang.for_people`."""
+        """Return columns and rows in readable form; see :func:`sgstore.lang.for_people`."""
         return for_people(self.columns, self, graphs=self.graphs)
 
     def _stream(
@@ -503,7 +511,7 @@ class Matches(Tabular):
         *,
         whole: bool = False,
     ) -> Iterator[tuple[Any, ...]]:
-        """Rows of a statement, window by window; all windows see the same state of the store.
+        """Yield the rows of a statement, window by window. All windows read the same state of the store.
 
         ``form`` is the form of the statement: rows, intervals, clips or frames. ``None`` means the form of the
         query; order and limit apply only to this form. ``whole``: the caller reads all rows.
@@ -530,7 +538,7 @@ class Matches(Tabular):
         *,
         whole: bool = False,
     ) -> Iterator[tuple[SqlStatement, Windows]]:
-        """A statement for each window; whoever reads its rows counts them in ``Windows.rows``."""
+        """Yield one statement per window. The caller must add the number of rows to ``Windows.rows``."""
         result, form = compiled.query.result, form or compiled.query.result.form
         at_once = form == result.form and not compiled.in_windows
         windows = Windows(
@@ -543,7 +551,7 @@ class Matches(Tabular):
                 yield one, windows
 
     def _asked(self, statement: SqlStatement) -> dict[str, Any]:
-        """A statement as :class:`StoreFile` takes it: its last step, and the tables that it is given before.
+        """Return the arguments of :class:`StoreFile` methods: the last SQL step, and the tables it needs.
 
         The tables are external matches, and results of earlier steps.
         """
@@ -564,7 +572,7 @@ class Matches(Tabular):
 
 
 class UnionMatches(Matches):
-    """Matches of several queries as one: of a ``UNION``, or of ``UNION ALL``.
+    """Combined matches of the parts of a ``UNION`` or ``UNION ALL`` query.
 
     Rows of frames, intervals or clips are ordered by trace and time, or part by part if a part has ``ORDER
     BY``. Other rows are ordered by value (``UNION``) or part by part (``UNION ALL``).
@@ -604,7 +612,7 @@ class UnionMatches(Matches):
                     raise QueryError(reason, text=text, span=part.span)
 
     def limit(self, most: int) -> Self:
-        """The same matches, but no more rows than so many."""
+        """Return the same matches with at most ``most`` rows."""
         if most < 0:
             raise ValueError(f"limit is {most}, expected 0 or more")
         fewer = copy.copy(self)
@@ -613,7 +621,7 @@ class UnionMatches(Matches):
 
     @property
     def scope(self) -> dict[str, Any]:
-        """What settings left out of the traces that any part is asked of."""
+        """Data that the settings excluded from the traces that any part searches."""
         ready = [part._ready for part in self._parts]  # noqa: SLF001
         chosen = {trace.trace_id for one in ready for trace in one.chosen}
         traces = (one for one in self._file.traces() if one.trace_id in chosen)
@@ -621,7 +629,7 @@ class UnionMatches(Matches):
 
     @property
     def reasons(self) -> dict[str, str]:
-        """The reasons of all parts for each of the traces in :attr:`left_out`, by name."""
+        """Reasons of all parts for the skipped traces in :attr:`left_out`: trace name → reasons."""
         found: dict[str, list[str]] = {}
         for part in self._parts:
             for name, reason in part.reasons.items():
@@ -630,7 +638,7 @@ class UnionMatches(Matches):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on likely mistakes in any part."""
+        """Notes on likely mistakes in any part of the query."""
         return tuple(dict.fromkeys(note for part in self._parts for note in part.notes))
 
     def _rows(self, *, whole: bool) -> Iterator[Row]:
@@ -648,7 +656,7 @@ class UnionMatches(Matches):
     def _merged(
         self, parts: Sequence[Iterable[T]], key: Callable[[T], Any], told: Callable[[T], object]
     ) -> Iterator[T]:
-        """Rows of parts, in one order, as one; of a ``UNION`` each once, by what is told of it."""
+        """Merge the sorted results of the parts. For a ``UNION``, yield equal results once."""
         last: Any = None
         seen: set[object] = set()
         for one in merge(*parts, key=key):
@@ -660,7 +668,10 @@ class UnionMatches(Matches):
             yield one
 
     def _joined(self) -> dict[str, Any]:
-        """The statement of all rows, as :class:`StoreFile` takes it: the rows of each part are a table."""
+        """Return the arguments of :class:`StoreFile` methods for all rows.
+
+        Each part becomes a temporary table.
+        """
         given: list[Given] = []
         tables = [f":part {number}" for number in range(len(self._parts))]
         for name, part in zip(tables, self._parts, strict=True):
@@ -671,11 +682,11 @@ class UnionMatches(Matches):
         return {"sql": select.text(), "parameters": {"1": traces} if named else {}, "given": given}
 
     def count(self) -> int:
-        """The number of distinct frames."""
+        """Return the number of distinct matching frames."""
         return sum(1 for _ in self.frames())
 
     def frames(self) -> Iterator[FrameRef]:
-        """The distinct frames of all parts, by name of the trace and number."""
+        """Yield the matching frames of all parts once, ordered by trace name and frame number."""
 
         def key(frame: FrameRef) -> tuple[Any, int]:
             return natural(frame.trace), frame.seq
@@ -692,17 +703,20 @@ class UnionMatches(Matches):
                     yield frame
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
-        """Return the node ids of the variables of each part in one frame by name, whatever ``RETURN`` says."""
+        """Return the bindings of all parts in one frame: variable name → node id. ``RETURN`` has no effect."""
         return [binding for part in self._parts for binding in part.bindings(frame)]
 
     def subgraphs(self) -> Iterator[nx.MultiDiGraph[int]]:
-        """Each match of each part as a graph; see :meth:`Matches.subgraphs`."""
+        """Yield each match of each part as a graph; see :meth:`Matches.subgraphs`."""
         with self._file.snapshot():
             parts = [part.subgraphs() for part in self._parts]
             yield from merge(*parts, key=lambda of: (natural(of.graph["trace"]), of.graph["seq"]))
 
     def parts(self, frame: FrameRef, binding: Mapping[str, int] | None = None) -> TruthLanes:
-        """The lanes of truth of the part that has such a match in a frame; of the first where none has."""
+        """Return the truth lanes of the first part that matches the frame with this binding.
+
+        Default: the first part.
+        """
         from sgstore.lang import has_nodes
 
         given = (binding or {}).items()
@@ -711,13 +725,13 @@ class UnionMatches(Matches):
         return next(matching, named[0]).parts(frame, binding)
 
     def intervals(self, *, bound: bool = False) -> Iterator[Interval]:
-        """Intervals of all parts, by trace and start; see :meth:`Matches.intervals`."""
+        """Yield the intervals of all parts, ordered by trace and start; see :meth:`Matches.intervals`."""
         with self._file.snapshot():
             parts = [self._in_time(part.intervals(bound=bound), _begin) for part in self._parts]
             yield from self._merged(parts, _begin, repr)
 
     def clips(self, before: float = 0.0, after: float = 0.0) -> Iterator[Clip]:
-        """Clips around the frames that match a part, in log time; those that overlap are one."""
+        """Yield clips around the matching frames of all parts, in log time. Overlapping clips are merged."""
         with self._file.snapshot():
             parts = [part.clips(before, after) for part in self._parts]
             found = merge(*parts, key=lambda clip: (natural(clip.trace), clip.start_ns))
@@ -730,7 +744,7 @@ class UnionMatches(Matches):
         return sorted(intervals, key=key) if chosen else intervals
 
     def numpy(self) -> dict[str, NDArray[np.generic]]:
-        """All columns as arrays, masked where something is NULL."""
+        """Return all columns as arrays. NULL values are masked."""
         with self._file.snapshot():
             return self._file.arrays(**self._joined())
 
@@ -741,7 +755,7 @@ class UnionMatches(Matches):
         yield from ()
 
     def as_table(self, name: str, *, apart: bool = False) -> list[Given]:
-        """Maker of a table of all rows; see :meth:`Matches.as_table`."""
+        """Return the steps that create a temporary table of all rows; see :meth:`Matches.as_table`."""
         if self.graphs:
             return self._parts[0].as_table(name, apart=apart)  # which refuses
         asked = self._joined()
@@ -749,7 +763,7 @@ class UnionMatches(Matches):
         return [*asked["given"], (made, asked["parameters"])]
 
     def explain(self) -> str:
-        """Explain each part, stage by stage."""
+        """Explain each part of the query, stage by stage."""
         word = "UNION" if self._distinct else "UNION ALL"
         return f"\n\n==== {word}\n\n".join(part.explain() for part in self._parts)
 
@@ -759,18 +773,20 @@ def _begin(interval: Interval) -> tuple[Any, int]:
 
 
 class TooMuchError(QueryError):
-    """A window has more of something than memory may hold; of several traces, each may be asked alone."""
+    """A query needs more memory for one window than allowed. A smaller set of traces may work."""
 
 
 @lru_cache(maxsize=64)
 def row_type(columns: tuple[str, ...]) -> Any:
-    """A named tuple for rows of some columns; a column whose name no field can have is named by its number."""
+    """Return a named tuple class for rows. A column without a valid field name gets a numbered name."""
     names = [re.sub(r"\W+", "_", name).strip("_") for name in columns]
     return namedtuple("Row", names, rename=True)  # pyright: ignore[reportUntypedNamedTuple]
 
 
 class Windows:
-    """Ranges of buckets, trace after trace; ``None`` (all) for a small store.
+    """Iterator of bucket ranges for a search, trace by trace.
+
+    A small store yields only ``None``: all buckets.
 
     Each range is longer than the previous one, unless that one had very many rows. A range is a part of one
     trace, or several whole traces. Traces in order of their ids are fastest.
@@ -820,7 +836,7 @@ class Windows:
             yield from self._told(group, used)
 
     def parts(self, window: Window | None, ask: Callable[[Window | None], T]) -> Iterator[T]:
-        """Rows that are found in a range, or, where that is too much, in each half of it, and so on.
+        """Yield the result for a range. If it is too large, split the range into halves and repeat.
 
         Raises
         ------
@@ -842,7 +858,7 @@ class Windows:
                 yield found
 
     def _divided(self, first: int, buckets: int) -> Iterator[Window]:
-        """Ranges of a trace that is longer than one may be."""
+        """Split a trace that is longer than the largest range."""
         end = first + buckets
         while first < end:
             taken = min(self._size, end - first)
@@ -850,7 +866,6 @@ class Windows:
             first += taken
 
     def _told(self, group: list[tuple[int, int]], used: int) -> Iterator[Window]:
-        """One range; when its rows were read, it is known how long the next one may be."""
         self.rows = 0
         yield Window.of(group)
         grown = GROWTH * max(used, self._size)
@@ -894,14 +909,14 @@ def notes_in(
     query: str,
     parameters: Mapping[str, object],
 ) -> tuple[str, ...]:
-    """Return notes about the texts of a query that a store has not; see :func:`sgstore.lang.notes_on`."""
+    """Return notes on query texts that the store does not contain; see :func:`sgstore.lang.notes_on`."""
     from sgstore.lang import notes_on
 
     return notes_on(compared, query, parameters, lambda sql, values: file.rows(sql, values).values)
 
 
 def merged(clips: Iterable[Clip], slack: Mapping[str, int] | None = None) -> Iterator[Clip]:
-    """Clips, ordered by trace and start, with those that overlap or touch made one.
+    """Merge clips that overlap or touch. The clips must be ordered by trace and start.
 
     ``slack`` is the largest gap between touching clips of each trace; ns, default 0.
     """

@@ -1,4 +1,4 @@
-"""A store as people use it: recordings go in, frames are found, seen as graphs and pictures, cut into clips."""
+"""User interface of a store: ingest recordings, find frames, and get graphs, pictures and clips."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 class StoreFrame:
-    """A frame of a store: its graph, and what the sensors of the recording saw. Notebooks draw it from above.
+    """Frame of a store: its scene graph and its sensor messages. Notebooks show it as a bird's-eye view.
 
     Attributes
     ----------
@@ -65,32 +65,32 @@ class StoreFrame:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Topics of the sensors whose messages belong to the frame."""
+        """Topics of the sensor messages that belong to the frame."""
         sql = "SELECT channel FROM payloads WHERE frame_id = ? ORDER BY channel"
         return tuple(topic for (topic,) in self._store.file.rows(sql, [self.ref.frame_id]))
 
     def graph(self, abstraction: str | None = None) -> nx.MultiDiGraph[Any]:
-        """Its scene graph, or what an abstraction makes of it; see :meth:`Store.graph`."""
+        """Return the scene graph of the frame, or its form in an abstraction; see :meth:`Store.graph`."""
         return self._store.graph(self.ref, *filter(None, [abstraction]))
 
     def picture(self, channel: str | None = None) -> Image:
-        """Picture of a camera, by default the first one; see :meth:`Store.picture`."""
+        """Return the picture of a camera, by default of the first camera; see :meth:`Store.picture`."""
         from sgstore.draw import camera_of
 
         return self._store.picture(self.ref, channel or camera_of(self._store, self.ref.trace))
 
     def points(self, channel: str | None = None) -> NDArray[Any]:
-        """The points that a lidar or radar saw, by default the first one; see :meth:`Store.points`."""
+        """Return the points of a lidar or radar, by default of the first one; see :meth:`Store.points`."""
         return self._store.points(self.ref, channel)
 
     def show(self, query: str | Pattern | nx.Graph[Any] | None = None, **look: Any) -> Image:
-        """The frame from above; see :meth:`Store.show`."""
+        """Draw the frame as a bird's-eye view; see :meth:`Store.show`."""
         return self._store.show(self.ref, query, **look)
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class ClipAnimation:
-    """A clip as an animation. Notebooks play it.
+    """Animation of a clip. Notebooks play it.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ class ClipAnimation:
         return html_media(self.data, kind, f"{self.frames[0]} to {self.frames[1]}")
 
     def save(self, path: str | Path) -> None:
-        """Write it into a file.
+        """Write the animation to a file.
 
         Raises
         ------
@@ -135,7 +135,7 @@ class ClipAnimation:
 
 
 class Store:
-    """A store of traces, by its path.
+    """Store of traces, opened by its path.
 
     The file stays open for a second after a query. It closes at once when another process needs to write, so an
     explicit close is not necessary. Before other code of the same process opens the file, for example with
@@ -191,7 +191,7 @@ class Store:
 
     @classmethod
     def of(cls, file: StoreFile) -> Self:
-        """The store of a file that is open."""
+        """Return the store of an open file."""
         found = cls.__new__(cls)
         found.file = file
         return found
@@ -200,7 +200,7 @@ class Store:
         return f"Store({str(self.file.path)!r})"
 
     def _repr_html_(self) -> str:
-        """The traces as a table, for notebooks."""
+        """Return the traces as an HTML table, for notebooks."""
         from sgstore.display import html_table
 
         columns = ("trace", "frames", "seconds", "ego", "map", "flavour")
@@ -221,13 +221,13 @@ class Store:
         self.close()
 
     def close(self) -> None:
-        """Give the file back now. A later question opens it again."""
+        """Close the file now. A later query opens it again."""
         self.file.close()
 
     def ingest(
         self, traces: str | Path | Sequence[str | Path], /, **options: Any
     ) -> list[TraceOutcome]:
-        """Read recordings into the store; those that are in it already are left as they are.
+        """Read recordings into the store. Recordings that are already in the store do not change.
 
         Parameters
         ----------
@@ -260,11 +260,11 @@ class Store:
         return ingest(self.file.path, files, **options)
 
     def catalog(self) -> Catalog:
-        """The catalog of the store for queries; remembered while the file stays as it is."""
+        """Return the catalog of the store for queries. It is cached until the file changes."""
         return self.file.catalog()
 
     def find(self, query: str | Pattern | nx.Graph[Any], /, **parameters: object) -> Matches:
-        """Return the matches of a pattern; nothing is searched before it is asked for.
+        """Return the matches of a pattern. The search runs when the matches are read.
 
         Parameters
         ----------
@@ -295,7 +295,7 @@ class Store:
         status: bool = False,
         **parameters: object,
     ) -> CheckRun:
-        """Verdicts of ``CHECK`` statements for every trace; nothing is asked before they are iterated.
+        """Return the verdicts of ``CHECK`` statements for every trace. The evaluation runs during iteration.
 
         Parameters
         ----------
@@ -330,7 +330,7 @@ class Store:
     def sql(
         self, text: str, *, timeout_s: float | None = None, max_rows: int | None = None
     ) -> Rows:
-        """The rows of a statement on the views of the store, which only reads and sees no files.
+        """Run a read-only SQL statement on the views of the store. It cannot read files.
 
         ``sgql('MATCH …')`` is a table of the rows that a pattern returns; ``sgql('… $least …', least := 10)``
         sets a parameter.
@@ -368,7 +368,7 @@ class Store:
     def graph(self, frame: int | str | FrameRef, abstraction: str) -> nx.MultiDiGraph[str]: ...
 
     def graph(self, frame: int | str | FrameRef, abstraction: str | None = None) -> Any:
-        """The scene graph of a frame, or what an abstraction makes of it.
+        """Return the scene graph of a frame, or its form in an abstraction.
 
         Parameters
         ----------
@@ -412,7 +412,9 @@ class Store:
     def classes(
         self, abstraction: str = "RSV", trace: int | str | None = None
     ) -> dict[str, NDArray[np.generic]]:
-        """The class of each frame in an abstraction: equal exactly where the labelled graphs are isomorphic.
+        """Return the class of each frame in an abstraction.
+
+        Two classes are equal if the labelled graphs are isomorphic.
 
         Parameters
         ----------
@@ -477,7 +479,7 @@ class Store:
         return frames_like(self.file, example, limit, each_trace=each_trace)
 
     def pattern(self, frame: int | str | FrameRef, *, ignore: Sequence[str] = ()) -> str:
-        """The text of a pattern that describes a frame around its ego, and matches it.
+        """Return a pattern text that describes a frame around its ego and matches this frame.
 
         Parameters
         ----------
@@ -498,7 +500,7 @@ class Store:
         return pattern_of(self.file.graph(_ref(frame)), ignore)
 
     def payload(self, frame: int | str | FrameRef, channel: str) -> bytes:
-        """The sensor message of a channel that belongs to a frame, as it stands in the recording.
+        """Return the raw sensor message of a channel at a frame, as recorded.
 
         For the picture in the message of a camera see :meth:`picture`.
 
@@ -512,7 +514,7 @@ class Store:
         return self.file.payload(_ref(frame), channel)
 
     def picture(self, frame: int | str | FrameRef, channel: str) -> Image:
-        """The picture that a camera took at a frame, read from the recording.
+        """Return the picture of a camera at a frame, read from the recording.
 
         Parameters
         ----------
@@ -541,7 +543,7 @@ class Store:
         return camera_image(self, _ref(frame), channel)
 
     def points(self, frame: int | str | FrameRef, channel: str | None = None) -> NDArray[Any]:
-        """The points of a lidar or radar at a frame, read from the recording.
+        """Return the points of a lidar or radar at a frame, read from the recording.
 
         ::
 
@@ -582,7 +584,7 @@ class Store:
         return cloud_of(self.file, _ref(frame), channel)
 
     def frame(self, frame: int | str | FrameRef) -> StoreFrame:
-        """A frame, to look at from all sides: its graph, its pictures, its points.
+        """Return a frame with access to its graph, pictures and points.
 
         Parameters
         ----------
@@ -604,7 +606,7 @@ class Store:
         form: Literal["gif", "mp4", "webm"] = "gif",
         **look: Any,
     ) -> ClipAnimation:
-        """A clip as an animation that runs as fast as the trace did.
+        """Return an animation of a clip at the speed of the recording.
 
         Parameters
         ----------
@@ -641,7 +643,7 @@ class Store:
             return ClipAnimation(file.read_bytes(), form, frames, marked)
 
     def _range_of(self, clip: str | Clip | Interval) -> tuple[str, str]:
-        """The first and the last frame of a clip, by their names."""
+        """Return the names of the first and the last frame of a clip."""
         from sgstore.draw import range_of
         from sgstore.matches import Interval
 
@@ -663,7 +665,7 @@ class Store:
         query: str | Pattern | nx.Graph[Any] | None = None,
         **look: Any,
     ) -> Image:
-        """A frame drawn from above, beside what the camera saw.
+        """Draw a frame as a bird's-eye view, next to the camera picture.
 
         Parameters
         ----------
@@ -693,21 +695,21 @@ class Store:
         return frame_image(self, _ref(frame), matches, **look)
 
     def traces(self) -> tuple[StoredTrace, ...]:
-        """The traces of the store, by name in natural order (``run2`` before ``run10``)."""
+        """Return the traces of the store by name, in natural order (``run2`` before ``run10``)."""
         return self.file.traces()
 
     def info(self) -> tuple[StoredTrace, ...]:
-        """The same as :meth:`traces`, by its name before 0.2."""
+        """Alias of :meth:`traces`, kept for old callers."""
         return self.traces()
 
     def explain(self, text: str, /, **parameters: object) -> str:
-        """Explain a query, stage by stage: parse, bind, rewrite, emit."""
+        """Explain a query stage by stage: parse, bind, rewrite, emit."""
         return self.find(text, **parameters).explain()
 
     def why_not(
         self, frame: int | str | FrameRef, text: str, /, **parameters: object
     ) -> WhyNot | WhyNotSteps:
-        """Explain why a pattern does not match a frame: the first part that fails, and how near it came.
+        """Explain why a pattern does not match a frame: the first failing part, and the nearest binding.
 
         Parameters
         ----------
@@ -758,7 +760,7 @@ class Store:
         /,
         **parameters: object,
     ) -> TruthLanes:
-        """Intervals of each part of a pattern, over the trace of a frame, for the nodes of a match there.
+        """Return the intervals in which each part of a pattern holds, over the whole trace, for one binding.
 
         The binding matches in the frames in which all parts hold. For a sequence, this applies to each step.
 
@@ -789,7 +791,7 @@ class Store:
     def _nearest(
         self, ref: FrameRef, text: str, parameters: Mapping[str, object]
     ) -> dict[str, int]:
-        """Nodes of a frame with which a pattern comes nearest to a match there."""
+        """Return the binding that comes nearest to a match in a frame: variable name → node id."""
         why: Any = self.why_not(ref, text, **parameters)
         ids = {
             str(about.get("name", node)): node
@@ -803,7 +805,7 @@ class Store:
         return found
 
     def _view(self, frame: FrameRef, query: Query) -> FrameView:
-        """A frame as a pattern in memory sees it, with what it asks that only the store knows."""
+        """Return a frame for evaluation in memory, with the store values that the query needs."""
         from sgstore.lang import FrameView, events_in, looked_up
         from sgstore.world import seconds_of
 
@@ -835,7 +837,7 @@ class Store:
 def matches_of(
     file: StoreFile, catalog: Callable[[], Catalog], text: str, parameters: Mapping[str, object]
 ) -> Matches:
-    """Return the matches of a query, or of the parts of a ``UNION``, in a file with a catalog.
+    """Return the matches of a query in a store file. A ``UNION`` combines the matches of its parts.
 
     Raises
     ------
@@ -852,7 +854,7 @@ def matches_of(
 
 
 class UserStatement:
-    """A statement of SQL in which patterns are tables.
+    """SQL statement of a user in which ``sgql`` patterns are tables.
 
     Parameters
     ----------

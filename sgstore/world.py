@@ -1,4 +1,4 @@
-"""Data of a simulator: frames of a trace as arrays, and the places of its messages in the file.
+"""Simulator data: the frames of a trace as arrays, and the file positions of its messages.
 
 Readers pass these values to the scene graph generator and to the store. The store rounds them. Conventions of
 axes, units and signs are those of :mod:`sgstore.geometry`: OpenDRIVE's inertial axes, metres, radians, seconds,
@@ -58,7 +58,7 @@ def seconds_of(ns: int) -> float:
 
 
 def tolerance_ns(period_ns: int) -> int:
-    """Greatest difference of two times of a trace that still count as the same: clocks jitter.
+    """Return the largest clock jitter of a trace: times this near count as equal; ns.
 
     All comparisons of time use this tolerance in favour of equality: ``>= 3 s`` is true for 2.9999 s, ``< 3 s``
     is false.
@@ -77,12 +77,12 @@ def tolerance_ns(period_ns: int) -> int:
 
 
 def derivable_ns(period_ns: float) -> float:
-    """The longest time between two frames across which motion is derived: three median periods; ns."""
+    """Return the longest gap between frames over which motion is derived: three median periods; ns."""
     return 3 * period_ns + tolerance_ns(int(period_ns))
 
 
 def longest_step_ns(period_ns: int) -> float:
-    """The longest time between two frames of a trace between which none is missing; ns."""
+    """Return the longest time between consecutive frames without a missing frame; ns."""
     return GAP * period_ns + tolerance_ns(period_ns)
 
 
@@ -113,7 +113,7 @@ _SIZES: Final = slice(POSE.index("length"), POSE.index("height") + 1)
 
 
 def implausible(values: Floats) -> Bools:
-    """The sizes and velocities that no body has: the one check of all flavours and of the online mode.
+    """Return a mask of impossible sizes and velocities. All flavours and the online mode use this check.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def implausible(values: Floats) -> Bools:
 def is_plausible(
     vx: float, vy: float, vz: float, length: float, width: float, height: float
 ) -> bool:
-    """False if :func:`implausible` may find something among the numbers of one entity; fast."""
+    """Fast test of one entity. False if :func:`implausible` may reject one of its values."""
     # A comparison with NaN is false.
     if any(size < 0 or size > LARGEST for size in (length, width, height)):
         return False
@@ -144,7 +144,7 @@ def is_plausible(
 
 
 def without_implausible(values: Floats) -> tuple[Floats, list[tuple[int, str]]]:
-    """The same numbers, with NaN for those that no body has.
+    """Return the values with NaN in place of impossible sizes and velocities, and their faults.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def without_implausible(values: Floats) -> tuple[Floats, list[tuple[int, str]]]:
 
 
 class FaultTally:
-    """Numbers that no body has, by entity: the first one, and in how many states."""
+    """Impossible values by entity: the first value, and the number of states with such values."""
 
     MOST: Final = 1000
     """Number of listed faults. Further faults are only counted."""
@@ -186,7 +186,7 @@ class FaultTally:
         self._more = 0
 
     def add(self, ident: str, words: str) -> None:
-        """Count one: ``length is -4.5 m``."""
+        """Count one fault, such as ``length is -4.5 m``."""
         number, _, value = words.partition(" ")
         what = f"{number} of entity {ident!r}"
         if what not in self._found and len(self._found) == self.MOST:
@@ -196,7 +196,7 @@ class FaultTally:
         self._found[what] = first, count + 1
 
     def losses(self) -> list[Loss]:
-        """One loss for each number of an entity."""
+        """Return one loss for each faulty attribute of an entity."""
         reasons = [
             f"{what} {first}: missing in {count} states"
             for what, (first, count) in self._found.items()
@@ -207,7 +207,7 @@ class FaultTally:
 
 
 def is_leap(away: float, seconds: float) -> bool:
-    """True if no body can move so far in so short a time.
+    """True if the distance is too long for any body to cover in this time.
 
     Parameters
     ----------
@@ -220,7 +220,7 @@ def is_leap(away: float, seconds: float) -> bool:
 
 
 def leaps(away: Floats, seconds: Floats) -> Bools:
-    """:func:`is_leap` of arrays."""
+    """Vectorised form of :func:`is_leap`."""
     return (seconds > 0) & (away > FASTEST * seconds + LEAP)
 
 
@@ -234,7 +234,7 @@ AnyEntity = TypeVar("AnyEntity")
 
 
 class Sight(NamedTuple):
-    """Where and when an entity was seen.
+    """Place and time of an observation of an entity.
 
     Attributes
     ----------
@@ -257,14 +257,14 @@ class Sight(NamedTuple):
 
 
 class Life(NamedTuple, Generic[AnyEntity]):
-    """One of the entities that an id has had; ``seen``: where it was last, ``None`` without a known place."""
+    """One entity among those that share an id. ``seen`` is its last place; ``None`` means unknown."""
 
     entity: AnyEntity
     kind: int
     seen: Sight | None = None
 
     def goes_on(self, kind: int | None, here: Sight) -> bool:
-        """True if the entity may be the one with its id in a frame.
+        """True if the observation can belong to this entity.
 
         The kinds must be equal (``None``: uncertain kind), and the distance must be possible. After a clock
         jump, any distance is possible.
@@ -280,7 +280,7 @@ class Life(NamedTuple, Generic[AnyEntity]):
         return not is_leap(away, (here.time_ns - seen.time_ns) / 1e9)
 
     def is_recent(self, here: Sight) -> bool:
-        """True if the entity was away for a short time, or if the clock has jumped back meanwhile."""
+        """True if the entity disappeared only a short time ago, or if the clock was reset since."""
         seen = self.seen
         if seen is None or seen.run != here.run:
             return True
@@ -288,7 +288,7 @@ class Life(NamedTuple, Generic[AnyEntity]):
 
 
 class Lives(Generic[AnyEntity]):
-    """The entities that one id has had.
+    """Entities that have used one id, one after another.
 
     If an id returns with another kind, or at an impossible distance, it denotes another entity from then on.
     Entities that use one id in turns continue.
@@ -317,7 +317,7 @@ class Lives(Generic[AnyEntity]):
     def follow(
         self, kind: int, here: Sight, enter: Callable[[], AnyEntity], *, sure_kind: bool = True
     ) -> AnyEntity:
-        """Return the entity that has the id now.
+        """Return the entity that uses the id in this observation.
 
         Parameters
         ----------
@@ -352,7 +352,7 @@ HIGHEST_GEAR: Final = 127
 
 @dataclass(frozen=True, slots=True)
 class Entities:
-    """Constant properties of the entities that a block sees for the first time, in order of node id.
+    """Constant properties of the new entities of a block, ordered by node id.
 
     Attributes
     ----------
@@ -394,7 +394,7 @@ class Entities:
 
 @dataclass(frozen=True, slots=True)
 class States:
-    """States of entities, one row an entity and instant. All arrays have shape (N,).
+    """States of entities, one row per entity and time. All arrays have shape (N,).
 
     Attributes
     ----------
@@ -463,12 +463,15 @@ class States:
         return len(self.node)
 
     def take(self, rows: NDArray[np.intp] | Bools) -> States:
-        """Some of the rows, in the order given."""
+        """Return the selected rows in the given order."""
         return taken(self, rows)
 
     @classmethod
     def of(cls, **columns: NDArray[np.generic]) -> States:
-        """States from the columns at hand (``node`` at least); all others are missing."""
+        """Return states from the given columns.
+
+        ``node`` is required; other columns default to missing values.
+        """
         n = len(columns["node"])
         missing = {
             "lights": np.full(n, -1, np.int64),
@@ -486,7 +489,7 @@ class States:
 
 @dataclass(frozen=True, slots=True)
 class MessageRefs:
-    """Places of messages in the file of their trace; one row a message, shape (M,).
+    """Positions of messages in the recording, one row per message; shape (M,).
 
     Attributes
     ----------
@@ -514,7 +517,7 @@ class MessageRefs:
 
 @dataclass(frozen=True, slots=True)
 class FrameBlock:
-    """Consecutive frames of a trace; frame f owns the rows ``offsets[f]:offsets[f + 1]`` of ``states``.
+    """Consecutive frames of a trace. Frame f has the rows ``offsets[f]:offsets[f + 1]`` of ``states``.
 
     Attributes
     ----------
@@ -563,7 +566,7 @@ class FrameBlock:
 
     @property
     def frame_of(self) -> Ints:
-        """(N,) int64: the frame, counted in this block, that each state belongs to."""
+        """(N,) int64: the index of the frame of each state in this block."""
         return np.repeat(np.arange(len(self)), np.diff(self.offsets))
 
 
@@ -636,7 +639,7 @@ class TraceInfo:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that a simulator says has happened: to one of its vehicles, or to weather and light.
+    """Event reported by a simulator, for a vehicle or for weather and light.
 
     Attributes
     ----------
@@ -677,7 +680,7 @@ _PIECE: Final = 4096
 
 
 def nearest_frames(events: Sequence[Event], time_ns: Any, log_time_ns: Any) -> Ints:
-    """For each event the row of the nearest frame; of two that are as near the first."""
+    """Return the row of the nearest frame for each event. The first of two equally near frames is used."""
     found: list[Ints] = [np.zeros(0, np.int64)]
     for start in range(0, len(events), _PIECE):
         some = events[start : start + _PIECE]
@@ -691,7 +694,7 @@ def nearest_frames(events: Sequence[Event], time_ns: Any, log_time_ns: Any) -> I
 
 @dataclass(slots=True)
 class TraceReport(Findings):
-    """Findings from reading a trace; filled while its blocks are read.
+    """Findings from the reading of a trace. The reader adds findings block by block.
 
     Attributes
     ----------
@@ -718,7 +721,7 @@ class TraceReport(Findings):
 
 @dataclass(frozen=True, slots=True)
 class Clip:
-    """An interval of a trace, both ends included.
+    """Time interval of a trace, both ends included.
 
     Attributes
     ----------
@@ -733,7 +736,7 @@ class Clip:
     end_ns: int
 
     def widened(self, by: int) -> Clip:
-        """The same, longer at both ends; ns."""
+        """Return the clip, extended by this time at both ends; ns."""
         return Clip(self.trace, self.start_ns - by, self.end_ns + by)
 
 
@@ -752,7 +755,7 @@ _HAND_BRAKE: Final = KEPT.index("hand_brake")
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Point that positions of a trace are relative to; whole metres."""
+    """Reference point of the positions of a trace; whole metres."""
 
     x: float
     y: float
@@ -781,7 +784,7 @@ def _middle(states: States) -> Origin:
 
 
 def quantize(frames: FrameBlock, origin: Origin) -> FrameBlock:
-    """The frames with the numbers that a store gives back of them, so that graphs made of either are equal."""
+    """Round values as the store does. Graphs are then equal before and after storage."""
     return replace(
         frames,
         states=_as_kept(frames.states, origin),
@@ -790,7 +793,7 @@ def quantize(frames: FrameBlock, origin: Origin) -> FrameBlock:
 
 
 def _as_kept(states: States, origin: Origin) -> States:
-    """States as float32 about an origin. Doing it twice changes nothing, nor does storing them afterwards.
+    """Return states as float32 relative to an origin. A second call, or storage, changes nothing.
 
     A float32 has 24 significant bits. The sum with the origin may round off low bits in float64; the difference
     to the origin then still fits into 24 bits.
