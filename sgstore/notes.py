@@ -1,4 +1,4 @@
-"""Tags and notes of users, in a CSV file beside the store.
+"""Tags and notes of users, in a CSV file next to the store.
 
 The store is only a cache, so it does not contain them. Each line is one tag: ``trace,seq,tag,note,who,at``.
 Lines are only appended. The removal of a tag appends the same line with ``-`` before the tag. Two users can

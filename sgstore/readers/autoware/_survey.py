@@ -45,7 +45,7 @@ INDICATORS: Final = "indicators"
 HAZARDS: Final = "hazards"
 
 _PACKAGES: Final = ("autoware_", "autoware_auto_")
-"""How names of packages begin; the second is that of releases before 2024."""
+"""Prefixes of package names; the second one is for releases before 2024."""
 _NAMES: Final = {
     "perception_msgs/TrackedObjects": OBJECTS,
     "perception_msgs/PredictedObjects": OBJECTS,
@@ -62,20 +62,20 @@ CONTENTS: Final = {
     "nav_msgs/Odometry": POSE_OF_EGO,
     "tf2_msgs/TFMessage": TRANSFORMS,
 }
-"""Schema → what its messages are."""
+"""Schema → content type of its messages."""
 RANK: Final = {"DetectedObjects": 1, "PredictedObjects": 2, "TrackedObjects": 3}
-"""The lists of objects; the greatest that has any leads."""
+"""Priorities of the list types; the non-empty list with the highest priority leads."""
 
 EGO: Final = "ego"
 """Id of the ego."""
 STATIC: Final = "tf_static"
-"""End of the topic of transforms that hold for ever, which is a constant of ROS itself."""
+"""Last part of the topic of static transforms, which is fixed in ROS."""
 MAP: Final = "map"
 _MOST_CLASSES: Final = 4
 _MOST_OBJECTS: Final = 100_000
-"""Objects of which the classes are counted; later ones are what they are called first."""
+"""Maximum number of objects with counted classes. Later objects keep their first class."""
 _MOST_AXES: Final = 1000
-"""Axes whose parents are remembered."""
+"""Maximum number of axes with stored parents."""
 LABELS: Final = (
     *("unknown", "car", "truck", "bus", "trailer", "motorcycle", "bicycle", "pedestrian"),
     *("animal", "hazard", "over_drivable", "under_drivable"),
@@ -166,8 +166,6 @@ class AutowareSurvey(Survey[ObjectLead]):
         self._static: list[Ref] = []
         self._looks = 0
 
-    # What was found ----------------------------------------------------------------------------------
-
     def rank(self, lead: ObjectLead) -> tuple[int, ...]:
         """Return the sort key of a candidate: non-empty, then the list type, then the number of frames."""
         return lead.objects > 0, lead.order, lead.frames
@@ -214,8 +212,6 @@ class AutowareSurvey(Survey[ObjectLead]):
         """Return the messages that later ones depend on: static transforms and calibrations."""
         return [*self._static, *super().context()]
 
-    # Channels ----------------------------------------------------------------------------------------
-
     def meet(self, channel: int) -> bool:
         """True if the messages of a channel are objects, poses or transforms."""
         return self._content(channel) in {OBJECTS, POSE_OF_EGO, TRANSFORMS}
@@ -244,8 +240,6 @@ class AutowareSurvey(Survey[ObjectLead]):
             order = RANK[short_name(schema.name).rpartition("/")[2]]
             stamps = self.shared_stamps(channel, Stamps(explicit=False))
             self.leads[channel] = ObjectLead(order=order, stamps=stamps)
-
-    # One message -------------------------------------------------------------------------------------
 
     def look(self, run: Messages, row: int) -> None:
         """Examine one message. Unreadable messages are reported during the reading of the frames."""
@@ -283,7 +277,7 @@ class AutowareSurvey(Survey[ObjectLead]):
         static = self.topic(channel).endswith(STATIC)
         self._looks += not static
         if not static and self._looks > _MOST_AXES:
-            return  # what moves in what does not change
+            return  # Moving axes in fixed axes.
         told: list[dict[str, Any]] = records(
             decode(self.structures[channel], run.data(row)), "transforms"
         )

@@ -67,7 +67,7 @@ _KINDS: Final = {
     **{one: TypeMeaning(one) for one in ("bicycle", "animal")},
     **{one: TypeMeaning("prop", "", one) for one in ("hazard", "over_drivable", "under_drivable")},
 }
-"""Class of an object → what it is; ``unknown`` is that."""
+"""Class of an object → its meaning."""
 
 SAMPLE_VEHICLE: Final = Ego(
     type="sample_vehicle", length=4.89, width=1.896, height=2.5, offset=(1.345, 0.0, 1.25)
@@ -81,16 +81,16 @@ _PUSHED: Final = ("acceleration_with_covariance", "initial_acceleration_with_cov
 _BOX_BEGINS: Final = len(CLASS_COLUMNS)
 
 _HOLDS_NS: Final = 500_000_000
-"""How long the ego goes on as it did when nothing more is told of it; ns."""
+"""Maximum extrapolation of the ego's motion; ns."""
 _LIT_NS: Final = 2_000_000_000
-"""How long what a light shows, and what the vehicle reports, holds after it was told; ns."""
+"""Validity of light states and vehicle reports; ns."""
 _MOST_KEPT: Final = 4096
 _REMEMBERED_NS: Final = 20_000_000_000
-"""How far back poses are remembered; ns."""
+"""Time span of stored poses; ns."""
 _POLYGON: Final = 2
 _NO_HEADING, _NO_SIGN = 0, 1
 _NEAR: Final = 2.0
-"""How far a detection may be from where the one before was, or would be by its velocity; m."""
+"""Maximum distance of a detection from the previous one, or from its extrapolated position; m."""
 
 _COLOURS: Final = {1: "red", 2: "yellow", 3: "green"}
 _CIRCLE, _OFF, _FLASHING = 1, 1, 3
@@ -229,7 +229,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
 
     def complete(self, frames: list[AutowareRawFrame]) -> list[FrameRows]:
         """Return the frames with their numbers, in fixed axes."""
-        if frames and frames[-1] is self._open:  # the last one
+        if frames and frames[-1] is self._open:  # The last frame.
             self._settle_open()
         return [self._rows(frame) for frame in frames]
 
@@ -247,8 +247,6 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
             warn(
                 "detected objects have no ids: they were followed from list to list by place and class"
             )
-
-    # Messages ----------------------------------------------------------------------------------------
 
     def _is_predicted(self) -> bool:
         return "Predicted" in self._survey.structures[self._survey.leading].name
@@ -330,8 +328,6 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
         if np.isfinite(value):
             stamp = self._stamp(told, "stamp", log_time)
             self._reports[self._survey.contents[channel]] = stamp, int(value)
-
-    # Frames ------------------------------------------------------------------------------------------
 
     def _raw(self, log_time: int, data: memoryview) -> AutowareRawFrame:
         head, table = self._table.read(data)
@@ -449,8 +445,6 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
             turn = _rotations(table[row, None, _BOX_BEGINS + 3 : _BOX_BEGINS + 7])[0][0]
             table[row, _BOX_BEGINS : _BOX_BEGINS + 3] += np.nan_to_num(turn @ middle)
 
-    # Places ------------------------------------------------------------------------------------------
-
     def _settle_open(self) -> None:
         """Compute the poses of the open frame from the messages so far."""
         frame, self._open = self._open, None
@@ -565,11 +559,11 @@ def _numbers(objects: Floats, base: Pose | None) -> tuple[Floats, Bools]:
     backwards = (available == _NO_SIGN) & (objects[:, 7] < 0)
     values[backwards, 3] = np.remainder(values[backwards, 3] + 2 * np.pi, 2 * np.pi) - np.pi
     values[plain, 3:6] = np.nan
-    moving = ~(objects[:, 19] == 0)  # a detection that has no twist says so
+    moving = ~(objects[:, 19] == 0)  # A flag marks detections without a twist.
     values[moving, 12] = objects[moving, 10]
     sizes = objects[:, 14:17]
     values[:, 13:16] = np.where((sizes != 0) & np.isfinite(sizes), sizes, np.nan)
-    with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers may be infinite
+    with np.errstate(invalid="ignore", over="ignore"):  # Damaged numbers may be infinite.
         values[:, :3] = place + objects[:, :3] @ outer.T
         values[moving, 6:9] = (turns @ objects[:, 7:10, None])[moving, :, 0]
         values[:, 9:12] = (turns @ objects[:, 11:14, None])[:, :, 0]
@@ -626,9 +620,6 @@ def _gear_of(report: int) -> float:
     if 2 <= report <= 19:
         return float(report - 1)
     return {1: 0.0, 20: -1.0, 21: -2.0, 22: 0.0, 23: 1.0, 24: 2.0}.get(report, NAN)
-
-
-# The recording ------------------------------------------------------------------------------------
 
 
 class AutowareTrace(SurveyedTrace[AutowareSurvey]):

@@ -22,20 +22,20 @@ if TYPE_CHECKING:
 
 ROOT: Final = "commonRoad"
 MAX_BYTES: Final = 256 << 20
-"""Greatest size of a file."""
+"""Maximum size of a file; bytes."""
 MAX_ELEMENTS: Final = 20_000_000
 MAX_PART: Final = 4_000_000
-"""Elements of a document, and of an obstacle, a lanelet or the like."""
+"""Maximum number of elements in a part of a document, such as an obstacle or a lanelet."""
 MAX_STATES: Final = 2_000_000
-"""States of all obstacles together, each of which is kept."""
+"""Maximum number of states of all obstacles together."""
 MAX_TEXT: Final = 1000
-"""Characters of an element; a number has some 20."""
+"""Maximum number of characters in an element; a number has about 20."""
 MAX_NAME: Final = 100
 MAX_STEP: Final = 10_000_000
 MAX_LOST: Final = 1000
-"""Losses that are kept; further ones are counted."""
+"""Maximum number of listed losses; further ones are only counted."""
 _FAR: Final = 1e8
-"""Greatest distance of a place from the origin; m."""
+"""Maximum distance of a point from the origin; m."""
 
 VERSIONS: Final = ("2018b", "2020a")
 
@@ -130,7 +130,7 @@ class Lanelet:
     lights: tuple[str, ...]
     speed_limit: float = math.nan
     stop_line: tuple[Place, ...] | None = None
-    """Its points; empty: it lies at the end."""
+    """Points of the stop line; empty: it is at the end of the lanelet."""
 
 
 @dataclass(slots=True)
@@ -293,9 +293,6 @@ def _take(scenario: TrafficScenario, node: _Node) -> None:
         scenario.lose(f"{node.tag} {node.attributes.get('id', '')[:MAX_NAME]}: {error}")
 
 
-# Values -------------------------------------------------------------------------------------------
-
-
 def _ident(node: _Node, name: str = "id") -> str:
     ident = node.attributes.get(name, "").strip()
     if not 0 < len(ident) <= MAX_NAME or not ident.isprintable():
@@ -413,8 +410,6 @@ def _body(node: _Node | None) -> ObstacleBox:
     return ObstacleBox(length, width, ahead, left)
 
 
-# Obstacles ----------------------------------------------------------------------------------------
-
 _LIGHTS: Final = {
     "indicatorLeft": ("light_left",),
     "indicatorRight": ("light_right",),
@@ -422,7 +417,7 @@ _LIGHTS: Final = {
     "brakingLights": ("light_brake",),
     "flashingBlueLights": ("light_special1",),
 }
-"""Words of a ``signalState`` → lights of a vehicle; the horn is none."""
+"""Element of a ``signalState`` → light of a vehicle; the horn is ignored."""
 
 
 def _state(node: _Node) -> State | None:
@@ -433,7 +428,7 @@ def _state(node: _Node) -> State | None:
     along, across = _value(node.get("velocity")), _value(node.get("velocityY"))
     slip = _value(node.get("slipAngle"))
     if not math.isnan(along) and math.isnan(across):
-        # A speed alone is that along the slip angle, which is 0 where none is told.
+        # A single speed is along the slip angle, which is 0 by default.
         slip = 0.0 if math.isnan(slip) else slip
         along, across = along * math.cos(slip), along * math.sin(slip)
     return State(
@@ -512,9 +507,6 @@ def _surroundings(scenario: TrafficScenario, node: _Node) -> None:
     scenario.obstacles[ident] = Obstacle(
         ident, kind, static=True, body=ObstacleBox(body.length, body.width), states={0: state}
     )
-
-
-# Roads --------------------------------------------------------------------------------------------
 
 
 def _lanelet(scenario: TrafficScenario, node: _Node) -> None:
@@ -602,4 +594,4 @@ _PARTS: Final[dict[str, Callable[[TrafficScenario, _Node], Any]]] = {
     "trafficSign": _sign,
     "intersection": _intersection,
 }
-"""Parts of a document that are read. Planning problems tell what a planner shall do, and no recording."""
+"""Parts of a document that are read. Planning problems are not part of a recording."""

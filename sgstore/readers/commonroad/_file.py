@@ -33,17 +33,17 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 ENDINGS: Final = (".xml",)
-"""How the names of such files end; :func:`is_scenario` tells them from others."""
+"""Suffixes of such files; :func:`is_scenario` checks the contents."""
 MAP: Final = "commonroad.Map"
 STEP: Final = "commonroad.Step"
 """Schemas of the messages."""
 NAME: Final = "scenario"
-"""Key of the name of the scenario in the metadata of a channel."""
+"""Key of the scenario name in the metadata of a channel."""
 
 _MAP_CHANNEL, _STEP_CHANNEL = 1, 2
 _HEAD: Final = 4096
 _RUN: Final = 256
-"""Messages that are handed on together."""
+"""Maximum number of messages in a run."""
 
 
 def is_scenario(path: Path) -> bool:
@@ -198,9 +198,6 @@ def read_messages(path: Path, places: Iterator[tuple[int, int]]) -> Iterator[byt
                 reason = f"no message of {length} bytes at {offset} there: the file was replaced"
                 raise TraceError(reason, path=path)
             yield data
-
-
-# Messages -----------------------------------------------------------------------------------------
 
 
 def _steps(scenario: TrafficScenario) -> list[int]:

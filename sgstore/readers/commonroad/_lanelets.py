@@ -55,7 +55,7 @@ _TYPES: Final = {
     "restricted": "restricted",
     "busStop": "stop",
 }
-"""``laneletType`` → types of lanes as OpenDRIVE has them; all others are driven on."""
+"""``laneletType`` → OpenDRIVE lane type; others are ``driving``."""
 
 _CROSSWALK: Final = "crosswalk"
 _ON_FOOT: Final = {"pedestrian"}
@@ -64,7 +64,7 @@ _CROSSED: Final = {
     **dict.fromkeys(("dashed", "broad_dashed", "no_marking"), True),
     **dict.fromkeys(("solid", "broad_solid", "curb", "lowered_curb"), False),
 }
-"""Markings → whether traffic may cross them."""
+"""Marking → permission to cross it."""
 
 _BROAD: Final = {"broad_dashed", "broad_solid"}
 
@@ -72,7 +72,7 @@ _MPH: Final = 0.44704
 _KMH: Final = 1 / 3.6
 _ZONE: Final = "274.1"
 _CODES: Final = {
-    # Code of a sign → kind. Each country has codes of its own, none of which means something else in another.
+    # Code of a sign → kind. Each country has its own codes, which never conflict.
     # Source: CommonRoad: XML format documentation, and commonroad-io 2024.3, traffic_sign.
     **dict.fromkeys(("206", "R1-1", "r2"), "stop_sign"),
     **dict.fromkeys(("205", "R1-2", "r1"), "yield_sign"),

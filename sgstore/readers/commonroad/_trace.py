@@ -37,7 +37,7 @@ _KINDS: Final[dict[str, dict[str, str]]] = {
     "building": {"kind": "building"},
     "pillar": {"kind": "pole", "subkind": "pillar"},
 }
-"""Types of obstacles → kinds; all others are ``unknown``."""
+"""Type of an obstacle → kind; others are ``unknown``."""
 
 _STATES: Final = {
     "red": "red",

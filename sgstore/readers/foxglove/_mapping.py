@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 MAX_MAPPING_BYTES: Final = 1 << 20
 PREFIX: Final = "foxglove_"
-"""Before the names of the mappings that are shipped, in the names of their files."""
+"""Prefix of the files of included mappings."""
 METADATA: Final = "metadata."
-"""Before the key of an entity's metadata, where a mapping says where something stands."""
+"""Prefix of a metadata key in the places of a mapping."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,10 +179,10 @@ _ALIASES: Final = {
     "cyclist": "bicycle",
     "ego": "car",
 }
-"""Words that producers use for kinds; what is called nothing but the ego is a car."""
+"""Producer's words for kinds; an entity named only as the ego is a car."""
 _GENERAL: Final = Mapping(entity=EntityMapping(type="metadata.type"))
 _TYPE_KEYS: Final = ("type", "class", "category", "label", "kind", "classification")
-"""Keys of metadata that tell a type where no mapping says which one does."""
+"""Metadata keys of the type, without a mapping."""
 _SECTIONS: Final[dict[str, type[Any]]] = {
     "recognise": Recognise,
     "scene": SceneMapping,

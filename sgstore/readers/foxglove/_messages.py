@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 
 
 MAX_AXES: Final = 10_000
-"""Axes of a recording; those of more are not taken up."""
+"""Maximum number of axes in a recording; further ones are ignored."""
 MAX_DEPTH: Final = 64
-"""Greatest number of transforms from any axes to those that stand still."""
+"""Maximum number of transforms from any axes to the fixed axes."""
 MAX_KEPT: Final = 4096
-"""Transforms of one pair of axes that are remembered at once."""
+"""Maximum number of stored transforms per pair of axes."""
 
 Pose = tuple["Floats", "Floats"]
-"""Place (3,) and turn (4,), a quaternion x, y, z, w of length 1."""
+"""Position (3,) and rotation (4,), a quaternion x, y, z, w of length 1."""
 
 STILL: Final = np.array([0.0, 0.0, 0.0, 1.0])
 ORIGIN: Final = np.zeros(3)
@@ -132,7 +132,7 @@ def normed(turn: Floats) -> Floats:
     largest = float(np.abs(turn).max())
     if not 0 < largest < np.inf:
         return STILL
-    scaled = turn / largest  # the squares of very small numbers are 0
+    scaled = turn / largest  # The squares of very small numbers are 0.
     return scaled / np.sqrt(scaled @ scaled)
 
 
@@ -179,7 +179,7 @@ def angles(turn: Floats) -> tuple[float, float, float]:
     )
 
 
-# ``foxglove.SceneUpdate`` and ``FrameTransform`` in protobuf and in JSON → the same plain values ----
+# Conversion of ``foxglove.SceneUpdate`` and ``FrameTransform`` (protobuf or JSON) into the same plain values.
 # Source: foxglove-sdk, schemas (SceneUpdate, SceneEntity, SceneEntityDeletion, CubePrimitive, FrameTransform).
 
 SCENE: Final = "foxglove.SceneUpdate"
@@ -188,13 +188,13 @@ TRANSFORMS: Final = "foxglove.FrameTransforms"
 READ: Final = frozenset({SCENE, TRANSFORM, TRANSFORMS})
 
 MAX_BYTES: Final = 16 << 20
-"""Greatest size of a protobuf message that is read."""
+"""Maximum size of a protobuf message; bytes."""
 MAX_JSON: Final = 8 << 20
-"""Greatest size of a JSON message that is read; in memory it becomes up to thirty times as large."""
+"""Maximum size of a JSON message; bytes. In memory, it becomes up to thirty times larger."""
 MAX_ENTITIES: Final = 100_000
-"""Greatest number of entities of a message."""
+"""Maximum number of entities in a message."""
 MAX_PARTS: Final = 10_000
-"""Greatest number of cubes, or of anything else, of an entity."""
+"""Maximum number of cubes, or of other parts, in an entity."""
 _PLACE: Final = dict.fromkeys(("x", "y", "z"))
 _TURN: Final = dict.fromkeys(("x", "y", "z", "w"))
 _SOLID: Final = {"pose": {"position": _PLACE, "orientation": _TURN}, "size": _PLACE}
@@ -206,9 +206,9 @@ _SCENE_FIELDS: Final[dict[str, Any]] = {
         **dict.fromkeys(("cubes", "cylinders", "spheres", "models"), _SOLID),
     },
 }
-"""Fields that are read of a scene; lines, triangles and texts stay bytes."""
+"""Used fields of a scene; lines, triangles and texts stay bytes."""
 ERRORS: Final = (*DECODE_ERRORS, RecursionError)
-"""What reading a message raises if it is not what it seems."""
+"""Exceptions for a malformed message."""
 _LATEST: Final = 1 << 62
 _DELETE_ALL: Final = 1
 
@@ -278,7 +278,7 @@ class Transform:
 
 
 DERIVED: Final = {"sgstore": "derived"}
-"""Metadata of channels that an export made of a recording, scene graphs to be drawn among them."""
+"""Metadata of channels added by an export, such as drawn scene graphs."""
 
 
 def encoding_of(recording: Recording, channel: int) -> str:

@@ -55,17 +55,17 @@ if TYPE_CHECKING:
 
 
 MAX_STANDING: Final = 100_000
-"""Entities that stay from one message to the next."""
+"""Maximum number of entities that stay between messages."""
 REMEMBERED: Final = 10_000_000_000
-"""How long transforms are remembered; ns."""
+"""Time span of stored transforms; ns."""
 NO_EGO: Final = "no entity is the ego: none is named, and the mapping names none that is there"
 
 LISTED: Final = 20
-"""Entities that an error lists by name."""
+"""Maximum number of entities listed in an error."""
 EGO_NAMES: Final = frozenset({"ego", "hero", "host", "ego_vehicle", "ego-vehicle", "vehicle.ego"})
-"""Ids and types that mean the ego where no mapping says who it is, in lower case."""
+"""Ids and types of the ego in lower case, without a mapping."""
 EGO_AXES: Final = ("base_link", "ego_vehicle", "ego", "hero")
-"""Axes that move with the ego where no mapping says which do."""
+"""Names of the ego's axes, without a mapping."""
 
 _HEADING, _VELOCITY, _ACCELERATION, _SIZE = 3, 6, 9, 13
 
@@ -195,16 +195,13 @@ class FoxgloveSurvey(Survey[Lead]):
                 for one in told:
                     if self._axes.tell(one.child, one.parent, 0, (ORIGIN, STILL)):
                         count_ref(self._transforms, one.child, ref_of(run, row))
-        except ERRORS:  # counted as a loss when the frames are read
+        except ERRORS:  # Counted as a loss during the reading of the frames.
             return
 
 
 def time_of(scene: SceneUpdate) -> int | None:
     """Return the time of a message, that of its latest entity; ``None`` without a time."""
     return max((box.time_ns for box in scene.boxes if box.time_ns is not None), default=None)
-
-
-# Frames -------------------------------------------------------------------------------------------
 
 
 @dataclass(slots=True)
@@ -272,7 +269,9 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
             return None
         last, before = self._open, self._told_by
         leads = channel in self._leading
-        same = last is not None and last.log_time_ns == log_time  # it tells of the same instant
+        same = (
+            last is not None and last.log_time_ns == log_time
+        )  # The message belongs to the same instant.
         goes_on = same and leads and before not in {-1, channel}
         self._take_scene(self._sources[channel], scene, time_ns, log_time, goes_on=goes_on)
         if leads:
@@ -328,8 +327,6 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
         if self._ego < 0:
             self._warn_of_egos(NO_EGO)
 
-    # Messages ------------------------------------------------------------------------------------------
-
     def _take_transforms(self, told: list[Transform], log_time: int) -> None:
         for one in told:
             time_ns = self._stamps.beside(log_time, one.time_ns)
@@ -368,7 +365,7 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
             else:
                 self._see_kind(node, box)
             told = time_ns if box.time_ns is None else self._stamps.beside(log_time, box.time_ns)
-            if box.time_ns not in {None, told}:  # it is of another clock
+            if box.time_ns not in {None, told}:  # The time is from another clock.
                 box = replace(box, time_ns=told)  # noqa: PLW2901
             standing[ident] = (told, box)
 
@@ -403,8 +400,6 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
         ego = self._mapping.ego
         self._idents.append(self._ego_axes)
         return self.roster.enter(self._ego_axes, self._mapping.meaning(ego.type), ego.type)
-
-    # Rows ----------------------------------------------------------------------------------------------
 
     def _rows(self, frame: FoxgloveRawFrame) -> FrameRows:
         nodes: list[int] = []
@@ -483,9 +478,6 @@ def _row(pose: Pose, size: tuple[float, float, float]) -> list[float]:
 
 def _size(ego: Ego) -> tuple[float, float, float]:
     return ego.length, ego.width, ego.height
-
-
-# The recording ------------------------------------------------------------------------------------
 
 
 class FoxgloveTrace(SurveyedTrace[FoxgloveSurvey]):

@@ -452,7 +452,7 @@ class Statics:
     _found: dict[tuple[str, int], _Static] = field(default_factory=dict)  # pyright: ignore[reportUnknownVariableType]
 
     def look(self, told: Mapping[str, Any], log_time_ns: int) -> None:
-        """Add the static objects of a ground truth. ``told`` contains the objects by field."""
+        """Add the static objects of a ground truth, given by field."""
         for name in _FIELDS:
             for thing in told.get(name, ()):
                 key = (name, thing.id.value)

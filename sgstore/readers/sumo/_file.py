@@ -36,10 +36,10 @@ if TYPE_CHECKING:
 STEP: Final = "sumo.Timestep"
 """Schema of the messages."""
 MAX_STEP: Final = 64 << 20
-"""Greatest size of a time step; bytes. One of 100,000 vehicles takes 20 MB."""
+"""Maximum size of a time step; bytes. One with 100,000 vehicles has 20 MB."""
 
 ENDINGS: Final = (".xml", ".xml.gz")
-"""How names of files end that SUMO writes."""
+"""Suffixes of SUMO files."""
 
 _CHANNEL: Final = 1
 _PIECE: Final = 1 << 20
@@ -235,7 +235,7 @@ def _pieces(file: BufferedIOBase, report: Findings) -> Iterator[bytes]:
 def _steps(file: BufferedIOBase, report: Findings) -> Iterator[tuple[int, bytes]]:
     """Yield position and bytes of each time step, from its start tag to its end tag."""
     file.seek(0)
-    rest, place = b"", 0  # what was read and not used, and where it begins in the file
+    rest, place = b"", 0  # Unused bytes, and their position in the file.
     for piece in _pieces(file, report):
         rest += piece
         used = 0
@@ -256,7 +256,7 @@ def _steps(file: BufferedIOBase, report: Findings) -> Iterator[tuple[int, bytes]
                 report.lose(Loss("the file ends before its last element does", bytes=0))
             return
         if begin is None:
-            used = max(used, len(rest) - 1100)  # a tag may be cut
+            used = max(used, len(rest) - 1100)  # A tag may be split.
         elif len(rest) - begin.start() > MAX_STEP:
             report.lose(Loss(f"a time step larger than {MAX_STEP:,} bytes", bytes=len(rest)))
             used = len(rest)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 MAX_CHANGES: Final = 5_000_000
-"""Most changes of state in a file."""
+"""Maximum number of state changes in a file."""
 
 _STATES: Final = {
     **dict.fromkeys("rs", "red"),
@@ -32,7 +32,7 @@ _STATES: Final = {
     "o": "flashing",
     "O": "off",
 }
-"""Letter of a link → what its light shows; ``s``: red, with an arrow to the right."""
+"""Letter of a link → state of its light; ``s``: red, with an arrow to the right."""
 _PIECE: Final = 1 << 20
 
 

@@ -43,7 +43,7 @@ SIZES: Final = {
     "train": (22.0, 2.4, 3.2),
     "person": (0.215, 0.478, 1.719),
 }
-"""Length, width and height that SUMO takes for vehicles of a kind; m."""
+"""SUMO's default length, width and height by kind; m."""
 
 _WORDS: Final = (
     *((word, "person") for word in ("pedestrian", "pedtype", "person", "walker")),
@@ -56,7 +56,7 @@ _WORDS: Final = (
     *((word, "van") for word in ("delivery", "van")),
     *((word, "car") for word in ("passenger", "taxi", "car", "default_vehtype", "vehtype")),
 )
-"""Parts of names of types → kinds, the first that fits."""
+"""Part of a type name → kind; the first match counts."""
 _SIGNALS: Final = {"light_right": 0x1, "light_left": 0x2, "light_brake": 0x8}
 _BACK: Final = 0x80
 _SPECIAL: Final = (("emergency", "emergency"), ("police", "emergency"), ("taxi", "taxi"))
@@ -169,7 +169,7 @@ class _TimeStep:
         ahead = (math.cos(heading), math.sin(heading))
         back = length / 2 if 0 < length <= LARGEST and math.isfinite(heading) else 0.0
         speed, push = _number(told, "speed"), _number(told, "acceleration")
-        # SUMO does not let vehicles slide: they move where they look to. Of a lane change it knows no more.
+        # Vehicles never slide in SUMO: they move along their heading, also in a lane change.
         way = ahead if math.isfinite(heading) else (math.nan, math.nan)
         self._frame.add(
             ident,
