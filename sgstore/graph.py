@@ -405,10 +405,7 @@ class LaneDistances:
         return found
 
     def tells(self, what: str) -> bool:
-        """True if the map has values for lanes:
-
-        ``ways`` along them, their ``curvature``, or their ``slope``.
-        """
+        """True if the map has values of this kind: ``ways``, ``curvature`` or ``slope``."""
         return what in self._told
 
     @cached_property
