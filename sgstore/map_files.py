@@ -195,7 +195,7 @@ class Maps:
 
 
 def lost_lanes(info: TraceInfo, road_map: RoadMap | None) -> list[Loss]:
-    """Return losses for the recording's own lanes, unless another map replaces them."""
+    """Return losses for the unusable lanes of a recording, unless another map replaces them."""
     if road_map is not None and road_map.text != info.map_text:
         return []
     return [Loss(reason, 0, 0) for reason in info.lost_lanes]

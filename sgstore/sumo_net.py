@@ -1,4 +1,4 @@
-"""Conversion of SUMO networks (``.net.xml``) to text of plain lanes, the form of maps without OpenDRIVE.
+"""Reader of SUMO networks (``.net.xml``), which converts them to text of plain lanes.
 
 A lane is a line with a width; lane 0 of an edge is its rightmost. Lanes inside a junction
 (``:J0_1_0``) are lanes of that junction. Crossings become crosswalks; walking areas are skipped.

@@ -46,7 +46,7 @@ _DEEPEST: Final = 150
 
 
 class TooSymmetricError(Exception):
-    """The search exceeds its work limit; the package handles it internally."""
+    """Raised inside the package if the search exceeds its work limit."""
 
 
 @dataclass(slots=True)
@@ -295,7 +295,7 @@ _TOLD[[RELATION_CODE[name] for name in OF_JUNCTION]] = True
 
 
 def contents_of(seen: GraphColumns) -> list[bytes]:
-    """Return 256 bits per frame; frames with equal bits are equal for the abstractions of ingest.
+    """Return 256 bits per frame; equal bits mean equal classes in the abstractions of ingest.
 
     The bits cover the nodes, the edges of ``junction``, and the lanes relative to the ego. Two
     equal frames have the same classes in ``E``, ``EL``, ``ER``, ``RSV`` and ``junction``; only one
@@ -451,7 +451,7 @@ def _digests(labels: tuple[str, ...]) -> NDArray[np.uint64]:
 
 
 def _on_edges(words: Words, bundles: tuple[tuple[int, ...], ...]) -> Words:
-    """Return the hash words of labels for sums over edges: each label, then each bundle from the end."""
+    """Return the hash words of labels and bundles, for sums over edges."""
     words = _mixed(words)
     several = bundles[::-1]
     flat = np.array([label for bundle in several for label in bundle], np.int64)
@@ -591,7 +591,7 @@ def _searched(block: _Block, cell: Ints, rows: Ints, number: int, work: int) -> 
 
 
 def _hashed(block: _Block, order: Ints, known: Bools) -> list[str]:
-    """Hash the graphs with their nodes in this order."""
+    """Return the hashes of graphs with their nodes in this order."""
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
     nodes = np.stack([block.node_low[order], block.node_high[order]], axis=1).astype("<u8")

@@ -235,7 +235,7 @@ class GraphColumns:
 
     @cached_property
     def is_traffic(self) -> Bools:
-        """Return a mask (N,) of the entities of the literature, which exclude scenery."""
+        """Return a mask (N,) of traffic entities, without scenery."""
         return are_entities(self.kind) & ~_SMALL[self.kind]
 
     @cached_property
@@ -292,7 +292,7 @@ class GraphColumns:
 
 
 def _united(cell: Ints, bit: Ints, bound: int) -> tuple[Ints, Ints]:
-    """Return cells below a bound with bits, ascending, and the union of bits of each."""
+    """Return the distinct cells, ascending, and the union of each cell's bits."""
     if bound <= _CELLS:
         sums = np.bincount(cell, weights=np.exp2(bit))
         cells = np.flatnonzero(sums)
@@ -307,7 +307,7 @@ def _united(cell: Ints, bit: Ints, bound: int) -> tuple[Ints, Ints]:
 
 
 def found(frames: Ints, nodes: Ints, frame: Ints, node: Ints) -> Ints:
-    """Return rows of (frame, node) in columns of unique pairs, or -1."""
+    """Return the row of each (frame, node) in sorted columns, or -1."""
     if not len(nodes):
         return np.full(len(node), -1)
     low, span = int(nodes.min()), int(nodes.max()) - int(nodes.min()) + 1
@@ -339,7 +339,7 @@ _CELLS: Final = 1 << 23
 
 @dataclass(frozen=True)
 class Labelled:
-    """One directed multigraph per frame, with labels on nodes and edges.
+    """Directed multigraph of each frame, with labels on nodes and edges.
 
     Attributes
     ----------
@@ -514,7 +514,7 @@ class Strands:
         self._roles: OrderedDict[int, dict[int, int]] = OrderedDict()
 
     def roles(self, ego: int) -> dict[int, int]:
-        """Map strands to roles: 0 for the ego's, n for the n-th on its left, -n for its right."""
+        """Map strands to roles: 0 the ego's, n the n-th on its left, -n the n-th on its right."""
         if ego not in self._roles:
             roles = {ego: 0}
             for beside, sign in ((self._left, 1), (self._right, -1)):
@@ -634,7 +634,7 @@ class EgoLanes:
     off_road: Part
 
     def taken(self, number: Ints) -> EgoLanes:
-        """Return the lanes of some frames; ``number`` has the new number of each frame, or -1."""
+        """Return the lanes of selected frames; ``number`` has each frame's new number, or -1."""
 
         def some(frame: Ints, *columns: Ints) -> Part:
             rows = np.flatnonzero(number[frame] >= 0)

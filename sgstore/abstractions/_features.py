@@ -114,7 +114,7 @@ def without(graphs: Labelled, ignored: Iterable[str]) -> Labelled:
 
 
 def of_frames(graphs: Labelled, chosen: Bools) -> Labelled:
-    """Return graphs with the frames outside ``chosen`` emptied."""
+    """Empty the graphs of the frames outside ``chosen``."""
     nodes, edges = chosen[graphs.node_frame], chosen[graphs.frame]
     return replace(
         graphs,

@@ -163,7 +163,7 @@ def junction(seen: GraphColumns) -> Labelled:
 
 
 def _drawn(seen: GraphColumns, kept: Bools, columns: Part, whose: Ints | None) -> Part:
-    """Return edges between kept nodes, with merged ends, each once and without loops."""
+    """Return edges between representative nodes, each once and without loops."""
     frame, relation, src, dst = columns
     a, b = seen.row_of(frame, src), seen.row_of(frame, dst)
     both = (a >= 0) & (b >= 0) & kept[a] & kept[b]

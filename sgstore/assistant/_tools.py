@@ -183,7 +183,7 @@ class StoreTools:
             ),
         ] = "here",
     ) -> ToolAnswer:
-        """Tell what a query can say. Read 'language' once before the first query of your own."""
+        """Describe the words of queries. Read 'language' once before your first query."""
         text = self.topic(about)
         return ToolAnswer(text, {"about": about, "text": text})
 
@@ -253,7 +253,7 @@ class StoreTools:
         return self._rows("find", query=query, form=form, limit=limit, parameters=parameters or {})
 
     def why_not(self, frame: FrameName, query: Pattern, parameters: Values = None) -> ToolAnswer:
-        """Explain why a pattern does not match a frame: what fails first, and how near it came."""
+        """Explain why a pattern does not match a frame: the first failing condition, and its margin."""
         reply = self._ask("why_not", frame=frame, query=query, parameters=parameters or {})
         return ToolAnswer(reply["text"], finite(reply))
 
@@ -262,7 +262,7 @@ class StoreTools:
         statement: Annotated[str, Field(description="SELECT … FROM frames, nodes, edges, …")],
         limit: Limit = ROWS,
     ) -> ToolAnswer:
-        """Ask in DuckDB's SQL, read only; vocabulary 'views' tells tables and columns."""
+        """Run a read-only SQL statement of DuckDB; vocabulary 'views' lists tables and columns."""
         return self._rows("sql", statement=statement, limit=limit)
 
     def check(
@@ -288,7 +288,7 @@ class StoreTools:
         traces: Annotated[list[str] | None, Field(description="only these")] = None,
         picture: Annotated[bool, Field(description="as a picture, too")] = False,  # noqa: FBT002
     ) -> ToolAnswer:
-        """Show over time when patterns hold and rules are violated: a lane for each entity."""
+        """Show over time when patterns match and rules are violated: one lane per entity."""
         from sgstore.draw import Lane, Timeline, draw_timelines, lines_of
 
         reply = self._ask("timeline", queries=queries, traces=traces or [], limit=TRACES_DRAWN)
@@ -344,7 +344,7 @@ class StoreTools:
         frame: FrameName,
         channel: Annotated[str, Field(description="topic of a camera; empty: the first")] = "",
     ) -> ToolAnswer:
-        """Fetch what a camera saw at a frame."""
+        """Fetch the camera picture of a frame."""
         from sgstore.draw import camera_of
 
         with self._turn:
@@ -388,7 +388,7 @@ class StoreTools:
         of_ego: Annotated[bool, Field(description="only features of the ego")] = True,  # noqa: FBT002
         limit: Limit = ROWS,
     ) -> ToolAnswer:
-        """List combinations that do not occur in some frames: of the values of a query, or of k features."""
+        """List combinations that are missing in some frames: values of a query, or k features."""
         reply = self._ask(
             "missing",
             frames=frames,
@@ -416,7 +416,7 @@ class StoreTools:
         limit: Annotated[int, Field(ge=1, description="clips at most")] = ROWS,
         parameters: Values = None,
     ) -> ToolAnswer:
-        """Cut what a pattern matches out of the recordings, as files in the folder that the user gave."""
+        """Export the matches of a pattern as clips, into the folder of the user."""
         from sgstore.exporters import Export, exporter_named, write_export
         from sgstore.world import Clip
 
@@ -489,7 +489,7 @@ def _rows_text(reply: Mapping[str, Any]) -> str:
 
 
 def _lines(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> tuple[list[str], int]:
-    """Return a header with as many rows as fit, and their number."""
+    """Return a header and the rows that fit, with their number."""
     lines = [" | ".join(columns)]
     left = MOST_TEXT
     for number, row in enumerate(rows):

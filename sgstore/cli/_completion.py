@@ -100,7 +100,7 @@ def traces(ctx: typer.Context) -> Offers:
 
 
 def frames(ctx: typer.Context, incomplete: str) -> Offers:
-    """Yield frames by trace and number, or by trace and time, with one more digit."""
+    """Yield completions of a frame name: the typed digits plus one more digit."""
     kept = os.environ.get(_KEPT, "")
     typed = f"{kept}{incomplete}"
     for one in _traces(ctx):

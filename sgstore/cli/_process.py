@@ -42,7 +42,7 @@ _ENDS: Final = tuple(
 
 @dataclass(slots=True)
 class _RunEnd:
-    """End state of this process: its cause, and the previous hook for lost errors."""
+    """State of the process end: its cause, and the previous hook for lost errors."""
 
     signal: int = 0
     deadline_s: float = 0.0
@@ -145,7 +145,7 @@ def exit_code() -> int:
 
 
 def word() -> str:
-    """Return the name of the cause of an interruption."""
+    """Return a text for the cause of an interruption, such as ``ended by SIGTERM``."""
     return f"ended by {signal.Signals(_run.signal).name}" if _run.signal else "interrupted"
 
 

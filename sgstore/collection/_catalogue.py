@@ -103,7 +103,7 @@ def _damage(error: Exception) -> str:
 
 
 def create(place: Place, wanted: About) -> About:
-    """Create a collection, if there is none, and return its settings."""
+    """Create the collection if it is missing, and return its settings."""
     told = {
         "format": FORMAT,
         "schema_version": wanted.schema_version,

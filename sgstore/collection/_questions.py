@@ -688,7 +688,7 @@ class PartedMatches(Tabular):
         }
 
     def _answered(self, form: str, offsets: tuple[int, int] = (0, 0)) -> Iterator[tuple[Any, ...]]:
-        """Yield the merged rows of a form of the matches."""
+        """Yield the merged rows of the matches in one of their forms."""
         asked = parted(self._ready, form, *offsets)
         with self._tables(form, offsets) as tables:
             text, values = asked.statement(self._ready.catalog)
@@ -707,7 +707,7 @@ class PartedMatches(Tabular):
 
     @contextmanager
     def _tables(self, form: str, offsets: tuple[int, int]) -> Generator[dict[str, list[PartFile]]]:
-        """Run the query; yield the results of the bundles by table of the merging statement."""
+        """Run the query on the bundles; yield their results by table of the merging statement."""
         with working_folder("parts") as folder:
             question = self._question(form, folder, offsets)
             tables: dict[str, list[PartFile]] = {}
@@ -759,7 +759,7 @@ class PartedUnion(UnionMatches):
 
     @contextmanager
     def _tables(self) -> Generator[tuple[Any, Any, str, list[Any]]]:
-        """Yield the rows of the parts as tables, their words, and the joining statement."""
+        """Yield the rows of the parts as tables, their enumeration values, and the joining statement."""
         tables, snapshot = dict[str, list[PartFile]](), self._parts[0].snapshot
         with working_folder("union") as folder:
             for number, part in enumerate(self._parts):

@@ -92,7 +92,7 @@ class Whole:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Build it from plain values."""
+        """Build the facts from plain values."""
         return cls(**values)
 
 
@@ -170,7 +170,7 @@ _catalogs: Final[dict[tuple[Path, str], tuple[Catalog, Catalog]]] = {}
 
 @contextmanager
 def _opened(task: dict[str, Any], held: Path) -> Generator[StoreFile]:
-    """Yield the open bundle with the user tables, or in a separate process for user statements."""
+    """Yield the open bundle; user tables and user statements get their own connection."""
     if task["bundle"] == EMPTY:
         path = held / "empty.sgstore"
         StoreFile.create(path).close()

@@ -80,7 +80,7 @@ class Classed:
         return len(np.unique(trace_of(self.frame_id))) if unit == "trace" else 0
 
     def _units(self, unit: CountedUnit) -> Ints:
-        """Return the rows that represent units."""
+        """Return the rows that represent the counted units."""
         rows = np.flatnonzero(self.known)
         if unit == "frame" or not len(rows):
             return rows

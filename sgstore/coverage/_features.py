@@ -47,7 +47,7 @@ _ROWS: Final = 8_192
 
 @dataclass(frozen=True)
 class ClassFeatures:
-    """Features of classes.
+    """Features of classes, with counts.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ def zeros(shape: tuple[int, int], kind: np.dtype[Any]) -> NDArray[np.unsignedint
 
 
 def weighted(counts: NDArray[np.integer[Any]], weights: Floats, more_than: int = 0) -> Floats:
-    """Return total weights (K, F) of the classes with more than ``more_than`` of each feature."""
+    """Return total weights (K, F) of the classes with each feature more than ``more_than`` times."""
     total = np.zeros((len(weights), counts.shape[1]))
     # Integers below 2²⁴ are exact in 32 bits.
     small = np.abs(weights).sum() < 1 << 24 and (weights == np.round(weights)).all()

@@ -331,7 +331,7 @@ class _Held:
         return self._known[pattern]
 
     def values(self, specification: Specification) -> dict[tuple[str, str], Bits]:
-        """Map (slot, value) to the counting frames with this value."""
+        """Map each slot value to the counted frames that have it."""
         counts = self.of(specification.where)
         held: dict[tuple[str, str], Bits] = {}
         for slot in specification.slots:

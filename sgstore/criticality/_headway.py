@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def headway_recorded(of: Encounter) -> Floats:
-    """Return the time until a reaches b's place, from each common frame, (T,); s. NaN if it never does."""
+    """Return the time until a reaches b's present place, from each common frame, (T,); s; NaN for never."""
     comes = np.full(len(of.b), np.inf)
     for rows_a, rows_b in of.crossings():
         later = of.a.times[rows_a] - of.b.times[rows_b]

@@ -146,7 +146,7 @@ class Gif(Animation):
         self._stream.write(b";")  # the trailer of a GIF
 
     def _drop(self) -> None:
-        """The output closes its stream itself."""
+        """Do nothing: the output closes its stream itself."""
 
     def _write(self, pixels: Pixels, delay: int) -> None:
         """Write a frame with its display time in hundredths of a second."""

@@ -206,7 +206,7 @@ def draw_matrix(
     groups: Sequence[str] = (),
     most: int = MOST_FEATURES,
 ) -> None:
-    """Draw the common frames of pairs of features, and mark wanted pairs without any (gaps).
+    """Draw a matrix of feature pairs: frames with both, and gaps (wanted pairs without frames).
 
     Each pair has one place, below the diagonal.
 
@@ -289,7 +289,7 @@ def draw_matrix(
 def _one_direction(
     names: Sequence[str], frames: NDArray[np.int64], wanted: NDArray[np.bool_]
 ) -> NDArray[np.intp]:
-    """Return one feature of each group with equal frames, with preference for the ego's."""
+    """Return one feature of each group with the same frames, preferably the ego's."""
     order = np.array(
         sorted(range(len(names)), key=lambda i: not names[i].startswith("ego ")), np.intp
     )

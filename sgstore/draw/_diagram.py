@@ -79,7 +79,7 @@ class DiagramLine:
 
     @property
     def text(self) -> str:
-        """Return the text on the line; empty if its look is enough."""
+        """Return the text on the line; empty if its colour and style are enough."""
         if self.family in {"isIn", "part", "light"}:
             return ""
         there, back = (", ".join(words[:MOST_WORDS]) for words in (self.relations, self.back))
@@ -145,7 +145,7 @@ def _entities(graph: SceneGraph, matched: frozenset[int], relations: Relations) 
 
 
 def _close(graph: SceneGraph) -> set[int]:
-    """Return entities with a proximity relation to the ego, or with any relation without proximity."""
+    """Return entities with a proximity relation to the ego; any relation, if the graph has no proximity."""
     near: set[int] = set()
     any_way: set[int] = set()
     for src, relation, dst, _ in graph.edges:
@@ -513,7 +513,7 @@ class _Diagram:
         return spots | {n: (x, y) for n, (x, y) in zip(nodes, found.tolist(), strict=True)}
 
     def _aside(self, node: int) -> float:
-        """Return the right offset of a map part, at its point nearest to the ego."""
+        """Return the position of a map part to the right of the ego, at its nearest point; m."""
         ground = self._scene.ground
         if ground is not None:
             near = ground.nearest(node, (0.0, 4.0))

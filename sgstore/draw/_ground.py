@@ -136,7 +136,7 @@ class GroundView:
         return [o for row in rows if (o := self.outline(row)) is not None]
 
     def parts(self, node: int) -> list[int]:
-        """Return the rows with the outlines of a node: its own, or its lanes."""
+        """Return the map rows whose outlines make up a node: itself, or its lanes."""
         row = -1 - node
         if not 0 <= row < len(self.outlines):
             return []

@@ -32,7 +32,7 @@ Sign = Literal[
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Sign with its meaning.
+    """Entry of the legend: a sign with its meaning.
 
     Attributes
     ----------

@@ -187,7 +187,7 @@ def _is_named(body: Body) -> bool:
 
 
 def _room(stage: Stage, body: Body) -> list[Rect]:
-    """Return the space of a body and its arrow, as small squares."""
+    """Return the area of a body and its arrow, as small squares."""
     half_x, half_y = half_extents(stage, body)
     taken = [stage.rect(half_x * stage.metre, half_y * stage.metre, (body.x, body.y))]
     way = velocity_arrow(body)
@@ -215,7 +215,7 @@ _QUIET: Final[dict[Family, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class DrawnFrame:
-    """Prepared content of a frame.
+    """Content of a frame, prepared for drawing.
 
     Attributes
     ----------

@@ -71,7 +71,7 @@ def filmed(  # noqa: PLR0913  as many options as the picture has
     diagram: bool = False,
     start_ns: int | None = None,
 ) -> Iterator[Shot]:
-    """Draw shots into an animation; yield each shot after it is drawn.
+    """Draw frames of a clip into an animation; yield each after it is drawn.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def filmed(  # noqa: PLR0913  as many options as the picture has
 
 
 def scale_of(samples: Iterable[Shot]) -> float | None:
-    """Return the radius of a view that fits all of these shots, or ``None`` without shots."""
+    """Return the radius of a view that fits all of these frames, or ``None`` without frames."""
     radii = (view_of(graph, None, matched_nodes(marked)).radius for graph, marked, _ in samples)
     return max(radii, default=None)
 

@@ -420,7 +420,7 @@ def sentences(link: DrawnLink, names: Mapping[int, str]) -> list[str]:
 
 
 def linked(graph: SceneGraph) -> dict[tuple[int, int], tuple[tuple[str, ...], tuple[str, ...]]]:
-    """Map each pair of nodes ``(a, b)`` to its relations from b to a, and from a to b.
+    """Map each pair of nodes ``(a, b)`` to its sorted relations in both directions.
 
     The ego is ``a``. The most informative relations are first.
     """

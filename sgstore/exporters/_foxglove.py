@@ -172,7 +172,7 @@ def cloud(points: NDArray[Any], time_ns: int, frame_id: str) -> bytes:
 
 
 def values(told: dict[str, Any], time_ns: int) -> bytes:
-    """Return values by name as JSON, with their time."""
+    """Return values by name as JSON with a timestamp."""
     about = {"timestamp": {"sec": time_ns // 10**9, "nsec": time_ns % 10**9}} | told
     return json.dumps(finite(about), allow_nan=False).encode()
 

@@ -68,7 +68,7 @@ Place = tuple[int, int]
 
 @dataclass(slots=True)
 class _FrameMessage:
-    """Message of a frame."""
+    """Reference to a recorded message of a frame."""
 
     frame_id: int
     seq: int
@@ -645,7 +645,7 @@ def _points(data: bytes, record: Record) -> NDArray[Any]:
 
 
 def _field(told: Any, order: str, *, ros: bool) -> tuple[str, Any, int]:
-    """Return name, type and offset of a number of points."""
+    """Return name, type and offset of a field of point cloud points."""
     number = told["datatype"] if ros else told["type"]
     if isinstance(number, str):
         number = _FOXGLOVE_WORDS.index(number)

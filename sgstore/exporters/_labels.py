@@ -223,7 +223,7 @@ def _columns(
 
 
 def _rows(wanted: Ints, frame_id: Ints) -> tuple[Ints, Ints]:
-    """Return indices of the wanted frames, and their rows among all."""
+    """Return the positions of wanted frames in ``frame_id``, and their rows in ``wanted``."""
     row = np.minimum(np.searchsorted(wanted, frame_id), max(len(wanted) - 1, 0))
     of = np.flatnonzero(wanted[row] == frame_id) if len(wanted) else row[:0]
     return of, row[of]

@@ -103,7 +103,7 @@ def write(export: Export, folder: Path) -> list[WrittenClip]:
 
 @contextmanager
 def _near(path: Path) -> Generator[None]:
-    """Copy a recording on a slow disk to a local file, because it is read several times."""
+    """Use a local copy of a remote recording in the ``with`` block, because it is read several times."""
     with working_folder("recording") as held, near(path, held):
         yield
 
@@ -372,7 +372,7 @@ class _Cutting:
 
 
 def _among(run: Messages, places: dict[int, list[int]]) -> NDArray[np.bool_]:
-    """Return a mask of the messages of a run at these places (offsets by chunk)."""
+    """Return a mask of the messages at these places: offsets by chunk."""
     chunks, found = run.chunks, np.zeros(len(run), np.bool_)
     for chunk in np.unique(chunks).tolist():
         found |= (chunks == chunk) & np.isin(run.offset, places.get(chunk, ()))

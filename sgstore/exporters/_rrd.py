@@ -296,7 +296,7 @@ def _rgba(colour: drawn.Colour) -> list[int]:
 
 
 def _lines(graph: SceneGraph, places: dict[int, Any]) -> dict[str, list[Any]]:
-    """Return both ends of the edges of each relation."""
+    """Return the line ends of the edges of each relation."""
     found: dict[str, list[Any]] = {}
     for src, relation, dst, _ in graph.edges:
         if places.get(src) and places.get(dst):

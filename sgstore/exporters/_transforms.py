@@ -98,7 +98,7 @@ def parse_mounts(texts: Iterable[str]) -> tuple[Mount, ...]:
 
 
 def _ends(axes: str, mounts: Mapping[str, Mount]) -> str:
-    """Follow the parents of axes to the root."""
+    """Return the root axes of some axes."""
     while axes in mounts:
         axes = mounts[axes].parent
     return axes

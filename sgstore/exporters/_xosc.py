@@ -413,7 +413,7 @@ def _unwrapped(heading: Numbers) -> Numbers:
 
 
 def _origins(pose: Numbers, centre: tuple[float, float, float]) -> Numbers:
-    """Convert poses of box centres to poses of origins."""
+    """Convert poses of box centres to poses of vehicle origins."""
     (ch, cp, cr), (sh, sp, sr) = (
         [of(np.nan_to_num(pose[:, axis])) for axis in (3, 4, 5)] for of in (np.cos, np.sin)
     )

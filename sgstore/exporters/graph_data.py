@@ -147,7 +147,7 @@ class GraphData:
 
     @cached_property
     def _entities(self) -> dict[str, dict[int, tuple[str, str]]]:
-        """Map traces to nodes to the simulator's id and type."""
+        """Return the simulator's id and type name of each entity, by trace and node."""
         found: dict[str, dict[int, tuple[str, str]]] = {}
         file = self.folder / ENTITIES
         try:

@@ -1,4 +1,4 @@
-"""Conversion of Lanelet2 maps (``.osm``) to text of plain lanes, the form of maps without OpenDRIVE in a store.
+"""Reader of Lanelet2 maps (``.osm``), which converts them to text of plain lanes.
 
 ``_document`` reads the text into points, ways and relations. ``_projection`` converts latitude and
 longitude to metres. ``_lanes`` makes lanes of lanelets, and signals and crosswalks of other

@@ -167,7 +167,7 @@ def _areas(document: OsmDocument) -> list[PlainObject]:
 
 
 def _ring(document: OsmDocument, ways: Sequence[str]) -> Floats:
-    """Return the corners (n, 3) of an area with consecutive ways in any direction; empty if open."""
+    """Return the corners (n, 3) around an area from its consecutive ways; empty for an open area."""
     pieces = [way for way in ways if way in document.lines]
     if not pieces or len(pieces) < len(ways):
         return np.zeros((0, 3))
@@ -219,7 +219,7 @@ def _lanelets(document: OsmDocument) -> dict[str, _Lanelet]:
 
 
 def _around(document: OsmDocument) -> dict[str, str]:
-    """Map lanelets of roundabouts to Autoware's regulatory element with them as ``internal``."""
+    """Map each lanelet of a roundabout to Autoware's regulatory element."""
     return {
         lanelet: ident[:MAX_NAME]
         for ident, element in document.relations.items()
@@ -230,7 +230,7 @@ def _around(document: OsmDocument) -> dict[str, str]:
 
 
 def _turned(left: Floats, right: Floats) -> tuple[bool, bool]:
-    """Return for each border True if it runs against the lanelet."""
+    """Return for each border True if it runs against the lanelet's direction."""
     along = np.hypot(*(left[[0, -1]] - right[[0, -1]])[:, :2].T).sum()
     across = np.hypot(*(left[[0, -1]] - right[[-1, 0]])[:, :2].T).sum()
     apart = bool(along > across)
@@ -303,7 +303,7 @@ def speed_of(text: str) -> float:
 def _beside(
     document: OsmDocument, lines: Sequence[LaneLine], lanelets: dict[str, _Lanelet]
 ) -> list[LaneLine]:
-    """Add neighbours that share a border to lanes, each on its side."""
+    """Add to each lane its neighbours with a common border."""
     users: dict[str, list[tuple[str, bool]]] = defaultdict(list)  # lane, to the left of the way
     for line in lines:
         lanelet = lanelets[line.ident]
@@ -333,7 +333,7 @@ def _beside(
 def _joined(
     document: OsmDocument, lines: Sequence[LaneLine], lanelets: dict[str, _Lanelet]
 ) -> list[LaneLine]:
-    """Add predecessors and successors to lanes: those with the same two end points."""
+    """Add to each lane its predecessors and successors: lanes with the same end points."""
     at: dict[tuple[str, str], list[Joint]] = defaultdict(list)
     for line in lines:
         lanelet = lanelets[line.ident]

@@ -181,7 +181,7 @@ def _cases(
 
 
 def _frames(cases: Sequence[LockedCase], store: Store, trace: StoredTrace) -> tuple[Ints, Ints]:
-    """Return ids (ascending) and log times of a trace's frames, from the first to the last of some cases."""
+    """Return ids (ascending) and log times of the frames from the first to the last case."""
     numbers = [min((c.first for c in cases), default=0), max((c.last for c in cases), default=0)]
     first, last = frame_ids(trace.trace_id, np.array(numbers)).tolist()
     found = store.file.arrays(

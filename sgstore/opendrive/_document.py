@@ -421,5 +421,5 @@ def cubic_bend(coefficients: Floats, at: Floats) -> Floats:
 
 
 def coefficients_of(document: Document, kind: str) -> Floats:
-    """Return ``a``, ``b``, ``c``, ``d`` of all elements of a kind, (n, 4); 0 for missing ones."""
+    """Return the coefficients a, b, c, d of all elements of a kind, (n, 4)."""
     return np.stack([document.numbers(kind, letter, 0.0) for letter in "abcd"], axis=1)

@@ -254,7 +254,7 @@ def poses(plan: PlanView, record: Ints, s: Floats) -> Poses:
 
 
 def _spiral(ds: Floats, curvature: Floats, rate: Floats) -> tuple[Floats, Floats]:
-    """Return distances along and across after ``ds`` on clothoids, by quadrature."""
+    """Return the displacement along and across after ``ds`` on clothoids."""
     at = ds[:, None] * ((_NODES + 1) / 2)
     angle = at * (curvature[:, None] + rate[:, None] * at / 2)
     half = ds / 2
@@ -262,7 +262,7 @@ def _spiral(ds: Floats, curvature: Floats, rate: Floats) -> tuple[Floats, Floats
 
 
 def _cubic(plan: PlanView, record: Ints, ds: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return distances along and across, turn, and curvature after ``ds`` on parametric cubics."""
+    """Return displacement along and across, turn, and curvature after ``ds`` on parametric cubics."""
     number = np.cumsum(plan.kind == CUBIC) - 1
     length = plan.length[record]
     share = np.where(length > 0, ds / np.maximum(length, _TINY), 0.0)
@@ -456,7 +456,7 @@ def _stack(section: Ints, ident: Ints) -> tuple[Ints, Ints]:
 
 @dataclass(frozen=True, slots=True)
 class _LaneIntervals:
-    """Stretches between cuts, ordered by section and s; shape (n,)."""
+    """Intervals of lane sections between cuts, ordered by section and s; shape (n,)."""
 
     section: Ints
     start: Floats
@@ -661,7 +661,7 @@ def _stations(
 def _lateral_jumps(
     intervals: _LaneIntervals, borders: _LaneBorders
 ) -> tuple[Floats, Floats, Floats]:
-    """Return reach, jumps and turns of the borders at the end of each interval."""
+    """Return the greatest offset, jump and turn of the borders at the end of each interval."""
     n = len(intervals.section)
     length = (intervals.end - intervals.start)[borders.interval]
     reach, step, corner = np.zeros(n), np.zeros(n), np.zeros(n)

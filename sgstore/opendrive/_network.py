@@ -209,7 +209,7 @@ def _road_links(table: ElementTable) -> dict[int, dict[str, str]]:
 
 
 def _junctions(document: Document, network: Network) -> dict[tuple[str, str], list[_Connection]]:
-    """Map (junction, incoming road) to its ways; a direct junction connects in both directions."""
+    """Map (junction, incoming road) to its connections; a direct junction connects both ways."""
     ways: dict[tuple[str, str], list[_Connection]] = defaultdict(list)
     junctions = document["junction"]
     links = _lane_pairs(document)
@@ -427,7 +427,7 @@ def neighbours(lanes: LaneTable, ribbons: Ribbons) -> list[Edge]:
 
 
 def _pairs(lanes: LaneTable, rows: Ints) -> Ints:
-    """Return consecutive lanes of a section among ``rows``, from left to right, (2, n)."""
+    """Return pairs of consecutive lanes of a section among ``rows``, from left to right, (2, n)."""
     same: Bools = np.diff(lanes.section[rows]) == 0
     return np.stack((rows[:-1][same], rows[1:][same]))
 
@@ -476,7 +476,7 @@ def _roundabouts(document: Document) -> dict[str, set[str]]:
 
 
 def _in_roundabouts(document: Document) -> Iterator[tuple[int, int]]:
-    """Yield rows of road and roundabout: roads in its junctions, and roads between two of them."""
+    """Yield pairs of a road and its roundabout, as rows."""
     ends: list[list[str]] = [[] for _ in range(len(document["road"]))]
     for kind in ("road/predecessor", "road/successor"):
         table = document[kind]
@@ -551,7 +551,7 @@ _CROSSED: Final = frozenset({"none", "broken", "broken broken", "botts dots"})
 
 
 def permitted(kind: str, attribute: str, owner: int) -> tuple[bool, bool]:
-    """Return the permission of a mark to change towards higher lane ids, and towards lower ids.
+    """Return the lane changes that a mark permits: towards higher and towards lower lane ids.
 
     Parameters
     ----------

@@ -106,7 +106,7 @@ class Objects:
 
 
 class _Ring(NamedTuple):
-    """Corners (k, 2) of an area, or of a line, of an item."""
+    """Corners (k, 2) of an area or line of an object."""
 
     item: int
     corners: Floats
@@ -220,7 +220,7 @@ def _quadrangle(shape: Any) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class _Repeat:
-    """A ``repeat``: from ``s`` for ``length``, every ``distance``; other values at its start and end."""
+    """A ``repeat`` element: from ``s`` for ``length``, every ``distance``, with values at both ends."""
 
     s: float
     length: float
@@ -349,7 +349,7 @@ def _copy(
     repeat: _Repeat,
     one: tuple[_Rings, tuple[float, float]],
 ) -> int:
-    """Add the copies of a repeat; return the number of the next copy."""
+    """Add the copies that a ``repeat`` makes of an object; return the next copy number."""
     shares = repeat.shares(repeat.copies()).tolist()
     for number, share in enumerate(shares, name[1]):
         place = (
@@ -362,7 +362,7 @@ def _copy(
 
 
 def _stretch(items: _Items, row: int, name: str, repeat: _Repeat) -> None:
-    """Add the strip along the road of a repeat without distance."""
+    """Add the strip along the road that a ``repeat`` without distance makes."""
     n = repeat.copies() + 1
     share = repeat.shares(n)
     s, t = repeat.s + share * repeat.length, np.interp(share, (0, 1), repeat.t)

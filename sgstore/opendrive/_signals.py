@@ -117,7 +117,7 @@ class Doubts:
         return bool(lanes.both[lane] or lanes.forward[lane] == (end == END))
 
     def _before(self, road: int, s: float) -> str:
-        """Return the end of the road with a junction near a place, or an empty text."""
+        """Return the end of the road with a junction near this place; empty if there is none near."""
         if not self._junctions:
             self._lengths = self.document.rough_numbers("road", "length").tolist()
             self._junctions = {
@@ -142,7 +142,7 @@ class Doubts:
 def places(
     document: Document, plan: PlanView, road: Ints, s: Floats, t: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return places ``s`` along roads and ``t`` to their left, clamped to the road's ends.
+    """Return map positions and headings of places ``s`` and ``t`` on roads, clamped to their ends.
 
     Returns x, y and z in map axes, and the heading of the road there.
     """
@@ -163,7 +163,7 @@ def places(
 
 
 def standing(document: Document, kind: str, rows: Ints, warnings: list[str]) -> Ints:
-    """Return the rows with a known place; add a warning for each other row."""
+    """Return the rows with a valid place; add a warning for each other row."""
     table = document[kind]
     placed = np.ones(len(table), bool)
     for name in ("s", "t", "zOffset", "hdg", "hOffset"):
@@ -346,7 +346,7 @@ class _Reach:
         self._known: dict[tuple[int, object], frozenset[int]] = {}
 
     def valid(self, element: tuple[str, int, str], place: tuple[int, float]) -> frozenset[int]:
-        """Return the driving lanes at a place (road, s) in the validity of an element (kind, row, signal)."""
+        """Return the driving lanes at a place (road, s) to which an element's validity applies."""
         kind, row, signal = element
         ranges = self._ranges[kind].get(row)
         orientation = self._tables[kind].attributes[row].get("orientation", "")
@@ -378,7 +378,7 @@ class _Reach:
     def _oriented(
         self, lanes: list[tuple[int, int]], orientation: str, reading: str
     ) -> frozenset[int]:
-        """Return the lanes of an orientation: those in that direction, or on that side."""
+        """Return the lanes that an orientation selects: by direction, or by side."""
         if orientation not in {"+", "-"}:
             return frozenset(lane for lane, _ in lanes)
         plus, about = orientation == "+", self._network.lanes

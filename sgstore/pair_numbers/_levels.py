@@ -57,7 +57,7 @@ UNEVEN: Final = {"flat": 1, "storeys": 2, "carried": 4, "near_flat": 8, "near_st
 
 
 def all_level(low: Floats, high: Floats, frame: NDArray[np.int64] | None = None) -> bool:
-    """True if no two bodies are on different storeys, for any assignment to frames.
+    """True if no two compared bodies are on different storeys.
 
     Parameters
     ----------

@@ -49,7 +49,7 @@ Marks = frozenset[str]
 
 @cache
 def _expression(name: str, without: Marks) -> str:
-    """Return the SQL of a number or part, without unneeded marks, which cost time."""
+    """Return the SQL of a number or part, without the marks that no pair needs."""
     text = EXPRESSIONS[name]
     for mark in without:
         text = text.replace(f" + {mark}", "").replace(f"{mark} > 0 OR ", "")

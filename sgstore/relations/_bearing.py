@@ -58,7 +58,7 @@ DOUBT: Final = 4e-6
 
 
 def _wanted(scene: BlockScene) -> Bools | None:
-    """Return a mask of the pairs that get directions; ``None`` means all pairs."""
+    """Return a mask of the pairs with direction relations; ``None`` means all pairs."""
     settings, pairs = scene.config.direction, scene.pairs
     wanted: Bools | None = None
     if settings.within > 0:

@@ -75,7 +75,7 @@ def contacts(bodies: Bodies, unwanted: Bools) -> Iterator[tuple[Rows, Rows]]:
 
 
 def contacts_of(bodies: Bodies, ego: Rows, frames: Bools) -> tuple[Rows, Rows]:
-    """Return the bodies that the ego touches in some of the frames; ``ego`` holds its rows."""
+    """Return the bodies that the ego touches in selected frames."""
     mine = ego[bodies.frame]
     near = frames[bodies.frame] & (mine >= 0) & (mine != np.arange(len(bodies)))
     others = np.flatnonzero(near & ~IS_SIGNAL[bodies.kind])
@@ -96,7 +96,7 @@ def _touching(bodies: Bodies, a: Rows, b: Rows) -> tuple[Rows, Rows]:
 
 
 def _separation(bodies: Bodies, a: Rows, b: Rows) -> Floats:
-    """Return the distance that one side separates two footprints by; negative if they overlap; m.
+    """Return the largest separation of two footprints along a side's normal; negative for an overlap; m.
 
     The gap is at least as large. NaN if rounding or a missing size requires the exact gap.
     """

@@ -172,7 +172,7 @@ class Extent:
 
 
 class Areas:
-    """Areas of some frames.
+    """Ranges of egos in some frames, as areas of the plane.
 
     Parameters
     ----------
@@ -286,7 +286,7 @@ class Areas:
         raise NotImplementedError
 
     def _level(self, frame: Ints, away: Floats, height: Floats, hung: Bools | None = None) -> Bools:
-        """Return a mask of the heights, at these distances, that are on the storey of an ego."""
+        """Return a mask of the places on the storey of their frame's ego, by height and distance."""
         rise = height - self.egos.ground[frame]
         lowest, highest = self.settings.height
         if hung is not None:  # the lowest possible height
@@ -475,7 +475,7 @@ def _along(road_map: RoadMap, lane: Ints, x: Floats, y: Floats) -> Floats:
 
 
 def _pieces(road_map: RoadMap, lane: Ints, begin: Floats, end: Floats) -> tuple[Rows, Floats]:
-    """Return pieces of centre lines between two lengths: owners, and ends (S, 2, 2)."""
+    """Cut centre lines between two lengths into pieces: owners, and ends (S, 2, 2)."""
     ribbons = road_map.ribbons
     owner, row = spread(ribbons.offsets[lane], np.diff(ribbons.offsets)[lane] - 1)
     here = (ribbons.along[row] < end[owner]) & (ribbons.along[row + 1] > begin[owner])

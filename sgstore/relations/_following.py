@@ -93,7 +93,7 @@ class LaneNet:
         self._from = np.searchsorted(dst[order], np.arange(count + 1))
 
     def onward(self, lane: Ints) -> tuple[Rows, Ints]:
-        """Return the next lanes of each lane: rows of the query, and lanes."""
+        """Return the successors of lanes, as pairs of query row and lane."""
         first = self._first[lane]
         owner, index = spread(first, self._first[lane + 1] - first)
         return owner, self._next[index]
@@ -152,7 +152,7 @@ class Centrelines:
         np.maximum.at(self._radius, run, far)
 
     def along(self, lane: Ints, x: Floats, y: Floats) -> Floats:
-        """Return the length of the centre line from the lane's start to the foot of a place.
+        """Return the length along each lane's centre line to the point nearest to a place; m.
 
         Parameters
         ----------
@@ -199,7 +199,7 @@ class Centrelines:
         return before + np.where(out, onward, share[at]) * (after - before)
 
     def _near(self, lane: Ints, x: Floats, y: Floats) -> tuple[Rows, Rows]:
-        """Return places, and the pieces of their lanes that may be nearest, by circles around runs."""
+        """Return pairs of a place and a piece of its lane that may be the nearest."""
         first, count = self._first_run[lane], self._runs[lane]
         owner, run = spread(first, count)
         away = np.hypot(
@@ -324,7 +324,7 @@ class OwnLanes:
     along: Floats
 
     def first_in(self, key: Ints, but: Rows) -> tuple[Rows, Rows]:
-        """Find the first other vehicle in each lane of a frame; return rows of query and vehicles."""
+        """Find the first other vehicle on each lane; return pairs of query row and vehicle row."""
         place = np.searchsorted(self.key, key)
         last = max(len(self.key) - 1, 0)
         itself = (self.row[np.minimum(place, last)] == but) & (place <= last)
@@ -334,7 +334,7 @@ class OwnLanes:
 
 
 def own_hits(net: LaneNet, bodies: Bodies, hits: LaneHits) -> Bools:
-    """Return a mask of the hits on a body's own lanes."""
+    """Return a mask of the lane hits that are on a body's own lanes."""
     lane = -2 - hits.lane
     junction = np.full(len(bodies), -1)
     junction[hits.row[hits.primary]] = net.junction[lane[hits.primary]]
@@ -345,7 +345,7 @@ def own_hits(net: LaneNet, bodies: Bodies, hits: LaneHits) -> Bools:
 
 
 def own_lanes(net: LaneNet, bodies: Bodies, standing: Standing) -> OwnLanes:
-    """Return the vehicles on their own lanes that they face along."""
+    """Return the vehicles on their own lanes, if they face along the lane."""
     hits = standing.hits
     lane = -2 - hits.lane
     own = standing.own & (np.abs(hits.heading_error) < np.pi / 2)
@@ -416,7 +416,7 @@ def _beyond(net: LaneNet, own: OwnLanes, limit: float) -> list[Column]:
 
 
 def _nearer(key: Ints, distance: Floats, best: Best) -> tuple[Rows, Best]:
-    """Return rows of the fronts that improve the best distance, and the updated best distances."""
+    """Return the search fronts that are nearer than the best so far, and the updated best."""
     known, least = best
     place = np.minimum(np.searchsorted(known, key), max(len(known) - 1, 0))
     again = known[place] == key if len(known) else np.zeros(len(key), np.bool_)
@@ -521,12 +521,12 @@ class Parking:
 
     @property
     def parked(self) -> Codes:
-        """Return 1 for parked, 0 for not parked, -1 for unknown or other kinds, (n,); within graphs."""
+        """Return the parked state of each entity within graphs: 1 parked, 0 not parked, -1 unknown."""
         return self._parked(0)
 
     @property
     def world_parked(self) -> Codes:
-        """Return the same codes as :meth:`parked`, from all known states, (n,)."""
+        """Return the parked state of each entity from all known states; codes as in :meth:`parked`."""
         return self._parked(1)
 
     def _parked(self, row: int) -> Codes:

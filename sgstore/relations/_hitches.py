@@ -133,7 +133,7 @@ class Hitches:
     def _parted(
         self, bodies: Callable[[Rows], Bodies], frames: FrameBlock, rows: Rows, carrier: Ints
     ) -> Ints:
-        """Return the carriers of a block, without pairs that end in it."""
+        """Return the carriers of a block, without pairs that separate in it."""
         states, frame = frames.states, frames.frame_of
         count = len(self._seen)
         key = frame * count + states.node
@@ -158,7 +158,7 @@ def new_frames(frames: FrameBlock, new: Bools) -> Bools:
 
 
 def _first(node: Ints, frame: Ints, count: int) -> Ints:
-    """Return the first frame of each node, or -1, (count,)."""
+    """Return the first frame of each node, or -1 for an absent node, (count,)."""
     first = np.full(count, -1)
     order = np.lexsort((-frame, node))
     first[node[order]] = frame[order]

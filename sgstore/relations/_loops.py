@@ -34,7 +34,7 @@ def near_pairs(
     limit: float,
     found: tuple[Ints, Ints],
 ) -> tuple[int, int]:
-    """Fill in pairs of rows within a squared distance, starting at ``first``.
+    """Write near pairs of bodies into ``found``, from place ``first`` on; return count and next place.
 
     ``order`` has the rows by frame and ``x``, ``end`` has the end of its frame for each place.
     Returns the number of pairs, and the place where the room may have run out.
@@ -69,7 +69,7 @@ def rungs(
     codes: Codes,
     columns: Columns,
 ) -> int:
-    """Fill in both edges of pairs within a squared bound; return their number.
+    """Write the proximity edges of pairs in both directions; return their number.
 
     ``wanted``: mask of pairs; empty means all pairs.
     """
@@ -110,7 +110,7 @@ def sectors(
     columns: Columns,
     doubtful: Ints,
 ) -> tuple[int, int]:
-    """Fill in edges of directions, and pairs that need the exact bearing; return both numbers.
+    """Write the direction edges of pairs, and the pairs that need the exact bearing; return both counts.
 
     ``bounds`` are sines and cosines. Pairs from ``len(a)`` on are mirror images.
     """
@@ -157,7 +157,7 @@ def sides(
     columns: Columns,
     doubtful: Ints,
 ) -> tuple[int, int]:
-    """Fill in edges of sides for bodies off the axis by more than a bound; negative means all bodies."""
+    """Write the left and right edges of pairs; ``beside`` is the least distance off the axis."""
     x, y, _ = place
     cos, sin = turn
     frame, node = ends
@@ -190,7 +190,7 @@ def along(
     pieces: Ints,
     line: tuple[Floats, Floats, Floats, Floats, Floats, Floats],
 ) -> Floats:
-    """Return lengths of lanes up to the feet of places; see ``_following.Centrelines``."""
+    """Return the lengths of lanes up to the nearest points of places; see ``_following.Centrelines``."""
     at_x, at_y, run_x, run_y, squared, length = line
     found = np.empty(len(lane))
     for i in range(len(lane)):

@@ -1,4 +1,4 @@
-"""Road map queries of a generator: map parts under bodies, and map parts in their graphs.
+"""Queries of the road map for the generator: map parts under bodies, and map parts in graphs.
 
 The look-up of lanes under a footprint is the most expensive query. Therefore it runs only for
 footprints that have moved: traffic often waits, parks or queues, and scenery never moves.
@@ -136,11 +136,11 @@ class Waypoints:
         )
 
     def _inside(self, points: LanePoints) -> tuple[Ints, Ints]:
-        """Return columns of waypoints and of their lanes."""
+        """Return pairs of a waypoint and its lane, as node columns."""
         return self._first[0] + np.arange(len(points.lane)), FIRST_LANE + points.lane
 
     def _onward(self, edges: MapEdges) -> tuple[Ints, Ints]:
-        """Return columns of waypoints and of the next waypoints."""
+        """Return pairs of a waypoint and the next waypoint, as node columns."""
         total = int(self._counts.sum())
         begin = int(self._first[0]) if len(self._first) else 0
         column = begin + np.arange(total)
@@ -155,7 +155,7 @@ class Waypoints:
         )
 
     def of(self, hits: LaneHits, along: Floats, bodies: Bodies) -> tuple[Ints, Ints]:
-        """Return rows of bodies, ascending, and node ids of their waypoints.
+        """Return pairs of a body row and the node id of its waypoint, ordered by body.
 
         Parameters
         ----------
@@ -405,7 +405,7 @@ class _Footing:
 
 
 def _runs(node: Ints, frame: Ints, box: Floats) -> tuple[Rows, Rows]:
-    """Return the first row of each run with an unchanged box, and the last row of each node."""
+    """Return for each row the first row with the same unchanged box, and each node's last row."""
     order = np.lexsort((frame, node))
     node, bits = (
         node[order],
@@ -422,6 +422,6 @@ def _runs(node: Ints, frame: Ints, box: Floats) -> tuple[Rows, Rows]:
 
 
 def _looked_up(table: Table, wanted: Rows) -> Table:
-    """Return the lines of a table for the wanted rows, with new row numbers."""
+    """Return the lines of a table for selected rows, with new row numbers."""
     owner, index = joined(table[0], wanted)
     return (owner, *(column[index] for column in table[1:]))

@@ -111,7 +111,7 @@ def related_pairs(bodies: Bodies, ego: Rows, near: Halves, config: Config) -> Bo
 
 
 def _behind(pairs: Halves, others: Halves, rows: Rows) -> Halves:
-    """Append the pairs of ``others`` in these rows."""
+    """Append selected pairs of ``others`` to ``pairs``."""
     count = len(pairs[0])
     a, b = np.empty((2, count + len(rows)), np.intp)
     for column, first, rest in zip((a, b), pairs, others, strict=True):
@@ -255,7 +255,7 @@ class StillPairs:
     def among(
         self, bodies: Bodies, keys: Ints, states: int, count: int, unwanted: Bools
     ) -> Iterator[tuple[Rows, Rows]]:
-        """Yield the pairs with both entities in range.
+        """Yield near static pairs with both entities in range.
 
         Parameters
         ----------
@@ -470,7 +470,7 @@ class Crowds:
             self._found[what] = count + 1, seq, most, span
 
     def losses(self, config: Config) -> list[Loss]:
-        """Return the omitted pairs by kind, with the first frame, its bodies, and the setting."""
+        """Return the omitted pairs as losses: by kind, with first frame, bodies and setting."""
         found: list[Loss] = []
         for what, (count, seq, bodies, span) in self._found.items():
             if what == NEAR:

@@ -1,4 +1,4 @@
-"""Distance of related bodies: at most one relation of a ladder of distances.
+"""Proximity relations of bodies: at most one of several distance ranges.
 
 The distance is between the centres of the boxes, in space; in the plane if a height is unknown.
 There is no relation between storeys, to a flat body, or between a carried body and its carrier.
@@ -55,7 +55,7 @@ def _edges(scene: BlockScene) -> Edges:
 
 
 def rung(name: str) -> Relation:
-    """Return the relation of a rung by its name."""
+    """Return the relation of a distance range by its name."""
 
     def asked(config: Config) -> bool:
         return name in config.proximity.names

@@ -203,7 +203,7 @@ class Keeping:
         return present
 
     def _standing_for(self, node: Ints) -> Ints:
-        """Replace lanes by the node of all their sections."""
+        """Replace lane nodes by the common node of all their sections."""
         if self._same is None:
             return node
         return np.where(node < 0, -1 - self._same[np.where(node < 0, -1 - node, 0)], node)

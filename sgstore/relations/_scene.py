@@ -183,7 +183,7 @@ class BodyPairs:
 
     @cached_property
     def span(self) -> Floats:
-        """Return spans of the first half of the pairs, (K / 2,); see :func:`spans`."""
+        """Return comparable distances of the first half of the pairs, (K / 2,); see :func:`spans`."""
         half = self._half
         found = np.empty(half)
         for part in even_parts(half):
@@ -248,7 +248,7 @@ class BodyPairs:
 
     @cached_property
     def of_bodies(self) -> Bools:
-        """Return a mask (K / 2,) of the pairs that :func:`meet_as_bodies`; empty means all."""
+        """Return a mask (K / 2,) of the pairs accepted by :func:`meet_as_bodies`; empty means all."""
         of = self._bodies
         plain = not (of.carrier >= 0).any() and not (of.height == 0).any()
         levels = of.low_and_high
@@ -287,7 +287,7 @@ EVEN_PART: Final = 1 << 13
 
 
 def by_frame(frame: Ints, frames: int) -> tuple[Rows, Ints]:
-    """Return rows ordered by frame, and the start of each frame's rows with the final end."""
+    """Return rows sorted by frame, and the start of each frame in them."""
     order = np.argsort(frame, kind="stable")
     return order, np.searchsorted(frame[order], np.arange(frames + 1))
 
@@ -348,12 +348,12 @@ def on_one_level(bodies: Bodies, a: Rows, b: Rows) -> Bools:
 
 
 def meet_as_bodies(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Return a mask of the pairs on one level without flat bodies and without carriers."""
+    """Return a mask of the pairs of solid bodies on one level; see :func:`solid_pairs`."""
     return solid_pairs(bodies, a, b) & on_one_level(bodies, a, b)
 
 
 def solid_pairs(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Return a mask of the pairs without flat bodies and without a carrier and its load."""
+    """Return a mask of the pairs of solid bodies, without a carrier and its load."""
     flat = ~IS_UPRIGHT[bodies.kind] & (bodies.height == 0)
     return ~(flat[a] | flat[b] | carried_by(bodies, a, b))
 
@@ -366,7 +366,7 @@ def carried_by(bodies: Bodies, a: Rows, b: Rows) -> Bools:
 
 
 def levels(bodies: Bodies, between: str) -> Floats:
-    """Return the heights of the reference points of distances; m."""
+    """Return the heights used for distances; m."""
     if between != "origins":
         return bodies.z
     on_ground: Bools = bodies.moves & IS_VEHICLE[bodies.kind]
@@ -411,7 +411,7 @@ class Standing:
     off_road: NDArray[np.intp]
 
     def take(self, place: NDArray[np.intp]) -> Standing:
-        """Filter the hits by bodies; ``place`` (N,) has their new rows, -1 for removed bodies."""
+        """Return the map parts of some bodies; ``place`` (N,) has their new rows, or -1."""
         hits, (rows, nodes) = self.hits, self.parts
         kept, there = place[hits.row] >= 0, place[rows] >= 0
         hits = taken(hits, kept)
@@ -482,7 +482,7 @@ class EdgeRoom:
         return frame[first:], relation[first:], src[first:], dst[first:]
 
     def filled(self, columns: Columns, count: int, more: Edges | None = None) -> Edges:
-        """Return the first edges of these columns, followed by ``more`` edges."""
+        """Return the filled part of shared columns as edges, with ``more`` edges appended."""
         if more is not None and len(more):
             if count + len(more) > len(columns[0]):
                 return Edges.chained([self.filled(columns, count), more])
@@ -625,7 +625,7 @@ def edges_between(
 def edges_of_pairs(
     scene: BlockScene, codes: Codes, holds: Bools, *, seen_by_a: bool = False
 ) -> tuple[Columns, int]:
-    """Return edges from a to b, or from b to a with ``seen_by_a``, for the pairs in a mask.
+    """Return the edges of the pairs in a mask: from a to b, or with ``seen_by_a`` from b to a.
 
     Parameters
     ----------
@@ -684,7 +684,7 @@ IS_USER: Final = kinds_mask((*VEHICLES, "person", "animal"))
 
 
 def spread(starts: Ints, counts: Ints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Expand many ranges into one array.
+    """Expand ranges into arrays of owner and index.
 
     Returns
     -------

@@ -170,7 +170,7 @@ def _views(bodies: Bodies, rows: Rows, eye: Rows) -> _Views:
 
 
 def _in_one_direction(views: _Views, frame: Ints) -> Iterator[tuple[Rows, Rows]]:
-    """Yield pairs of a body and a nearer one that shares a direction with it."""
+    """Yield pairs of a body and a nearer body in the same direction, which may hide it."""
     # Ranges beyond π occur a second time, from the other side.
     again = np.flatnonzero(views.high > np.pi)
     rows = np.concatenate([np.arange(len(views.low)), again])
@@ -184,7 +184,7 @@ def _in_one_direction(views: _Views, frame: Ints) -> Iterator[tuple[Rows, Rows]]
 
 
 def _blocked(views: _Views, target: Rows, cover: Rows, point: int) -> Bools:
-    """Return a mask of lines to a point of the target that the cover blocks."""
+    """Return a mask of the sight lines to a point of the target that the cover blocks."""
     cos, sin = views.cos[cover], views.sin[cover]
     x, y = views.x[cover, 0], views.y[cover, 0]
     to_x, to_y = views.x[target, point], views.y[target, point]
@@ -209,7 +209,7 @@ def _blocked(views: _Views, target: Rows, cover: Rows, point: int) -> Bools:
 def _within(
     start: Floats, run: Floats, half: Floats, enters: Floats | float, leaves: Floats | float
 ) -> tuple[Floats, Floats]:
-    """Clip a way, between two shares of it, to the part where a coordinate is within ±``half``."""
+    """Clip a line to the part where a coordinate is within ±``half``; return start and end shares."""
     with np.errstate(divide="ignore", invalid="ignore"):
         one, other = (-half - start) / run, (half - start) / run
     return (

@@ -118,7 +118,7 @@ def _quads(ribbons: Ribbons) -> _Quads:
 
 
 def _unfold(x: Floats, y: Floats) -> None:
-    """Cut end cross sections at their crossing point, in place.
+    """Shorten crossing end cross sections of quadrangles to their crossing point, in place.
 
     In a bend that is tighter than the lane is wide, the inner border runs backwards, beyond the
     centre of the bend. This part adds no area to the lane.
@@ -170,7 +170,7 @@ class _Grid:
         return np.floor((places - self.origin) / self.cell).astype(np.int64)
 
     def pairs(self, first: Ints, last: Ints) -> tuple[Ints, Ints]:
-        """Return pairs of rectangle and quadrangle for rectangles of cells ``first`` to ``last`` (2, N).
+        """Return the quadrangles in rectangles of grid cells, as pairs of rectangle and quadrangle.
 
         Each pair occurs once: a pair that shares several cells counts in the first of them.
         """
@@ -193,7 +193,7 @@ class _Grid:
 
 
 def _cells_between(first: Ints, last: Ints) -> tuple[Ints, Ints, Ints]:
-    """Return rectangle number and cell for all cells from ``first`` to ``last`` (2, N), both included."""
+    """List the cells of grid rectangles, as pairs of rectangle and cell."""
     spans = np.maximum(last - first + 1, 0)
     sizes = spans[0] * spans[1]
     row = np.repeat(np.arange(len(sizes)), sizes)
@@ -246,7 +246,7 @@ class LaneIndex:
         return chained([_no_touches(), *(self._gathered(shapes, *touching) for touching in found)])
 
     def _touching(self, shapes: _Shapes) -> tuple[Ints, Ints, Bools, Floats]:
-        """Return pairs of footprint and quadrangle that touch, a mask of centres inside, and numbers."""
+        """Return touching pairs of footprint and quadrangle, a mask of inner centres, and measures."""
         from sgstore.roads import _loops
 
         grid, quads = self._grid, self._quads

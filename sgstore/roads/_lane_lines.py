@@ -156,7 +156,7 @@ class Area:
 
 @dataclass(slots=True)
 class _Network:
-    """Lanes by number, with their contacts."""
+    """Lanes of a map by index, with look-ups of their ends."""
 
     lines: list[LaneLine]
     sections: list[Sections]
@@ -324,7 +324,7 @@ def _tell(network: _Network, lanes: Sequence[str], what: str) -> None:
 
 
 def _add_ways(network: _Network, areas: Iterable[Area]) -> None:
-    """Add lanes for the ways through areas."""
+    """Add connecting lanes through junction areas."""
     missing: list[str] = []
     astray: list[str] = []
     for area in areas:
@@ -346,7 +346,7 @@ def _add_ways(network: _Network, areas: Iterable[Area]) -> None:
 
 
 def _touches(line: LaneLine, area: str, *, at_exit: bool) -> bool:
-    """True if the joints of a lane connect its traffic with an area, or if the lane has no joints."""
+    """True if the traffic of a lane enters or leaves an area, or if the lane has no joints."""
     joints = line.after if line.forward == at_exit else line.before
     joints = (*line.before, *line.after) if line.both else joints
     untold = not line.before and not line.after
@@ -412,7 +412,7 @@ def _joints(network: _Network) -> set[_Joined]:
 
 
 def _contact(network: _Network, lane: int, end: str, other: int) -> str:
-    """Return the touching end of the other lane: as its joints state, else the nearer end."""
+    """Return the end of another lane that touches an end of a lane."""
     line, ident = network.lines[other], network.lines[lane].ident
     says = {
         contact

@@ -207,7 +207,7 @@ def road_map_of(
 
 
 def _stops(signals: Sequence[PlainSignal], first: int) -> tuple[Ints, Ints, Floats]:
-    """Return signals (columns of nodes), the lanes of their stopping places, and the places."""
+    """Return the stopping places of signals as columns: signal, lane, and place along it."""
     rows = [(first + row, *stop) for row, signal in enumerate(signals) for stop in signal.stops]
     column, lane = np.array([one[:2] for one in rows], np.int64).reshape(-1, 2).T
     return column, lane, np.array([along for *_, along in rows], np.float64)
@@ -429,7 +429,7 @@ def edges_of(parts: Sequence[Edge]) -> MapEdges:
 
 
 def _spread(groups: Sequence[tuple[int, ...]]) -> Ints:
-    """Return (n, 2): the row of each group with each member of the group."""
+    """Return pairs of a group's index and each of its members, (n, 2)."""
     row = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
     return np.column_stack((row, np.array([*chain(*groups)], np.int64)))
 
@@ -630,7 +630,7 @@ def cross_sections(
 
 
 def _cuts(run: Floats, more: Sequence[Floats]) -> Floats:
-    """Return cut places along a line: its own points, and others that are not too close to them."""
+    """Return the places of cross sections along a line: its own points, and other distinct ones."""
     inner = np.concatenate([run[1:-1], *more])
     own = np.arange(len(inner)) < len(run) - 2
     inside = (inner > APART) & (inner < run[-1] - APART)

@@ -27,7 +27,7 @@ def touching(
     turn: Floats,
     touch: float,
 ) -> tuple[Ints, Ints, Bools, Floats]:
-    """Return pairs that touch: rows, quadrangles, mask of centres inside, and numbers.
+    """Return touching pairs of footprint and quadrangle, a mask of inner centres, and measures.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def _place(corners: Floats, shapes: Shapes, row: int, at_x: Floats, at_y: Floats
 def _meets(
     x: Floats, y: Floats, size: tuple[float, float], turn: float, touch: float
 ) -> tuple[bool, bool]:
-    """Return True if they touch, and True if the footprint's centre is in the quadrangle."""
+    """Return two flags: footprint and quadrangle touch; the footprint's centre is inside."""
     a, b = size[0] + touch, size[1] + touch
     if x.min() > a or x.max() < -a or y.min() > b or y.max() < -b:
         return False, False
@@ -136,7 +136,7 @@ def _meets(
 
 @compiled
 def _beside(x: Floats, y: Floats) -> tuple[float, float]:
-    """Return the place of the centre along the centre line, and the squared distance."""
+    """Return the place of the footprint's centre along the centre line, and its squared distance."""
     from_x, from_y = (x[0] + x[3]) / 2, (y[0] + y[3]) / 2
     along_x, along_y = (x[1] + x[2]) / 2 - from_x, (y[1] + y[2]) / 2 - from_y
     share = -(from_x * along_x + from_y * along_y) / max(along_x**2 + along_y**2, 1e-18)

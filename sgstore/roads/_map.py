@@ -53,7 +53,7 @@ _MOST_AT_ONCE: Final = 1 << 22
 def _downstream(
     lengths: Floats, src: Ints, dst: Ints, limit: float
 ) -> Iterator[tuple[Ints, Ints, Floats]]:
-    """Yield chunks of lane, lane within ``limit`` after its end, and the distance.
+    """Yield, in chunks, a lane, a lane that starts within ``limit`` after its end, and the distance.
 
     Traffic flows from ``src`` to ``dst``. The fronts of all lanes advance together, lane by lane.
     """
@@ -83,7 +83,7 @@ def _downstream(
 
 
 def point_shapes(x: Floats, y: Floats) -> NDArray[np.object_]:
-    """(N,) shapely points."""
+    """Convert coordinates to shapely points, (N,)."""
     points: Any = shapely.points(np.column_stack([x, y]))
     return points
 
@@ -412,7 +412,7 @@ class RoadMap:
         )
 
     def crosswalks_of(self, boxes: Floats, z: Floats) -> tuple[Ints, Ints]:
-        """Return rows of ``boxes`` and node ids of the crosswalks that they touch, ordered by row.
+        """Find the crosswalks under footprints; return pairs of footprint row and node id.
 
         Boxes and heights as in :meth:`lanes_of`.
         """
@@ -432,7 +432,7 @@ class RoadMap:
         return row[order], -1 - column[order]
 
     def near(self, x: Floats, y: Floats, radius: float) -> tuple[Ints, Ints]:
-        """Return rows of the points, and node ids of all parts (except ``off_road``) within ``radius``.
+        """Find the map parts within ``radius`` of points; return pairs of point row and node id.
 
         A road or junction is near if one of its lanes is near. Ordered by row and by descending
         node id.
@@ -474,7 +474,7 @@ class RoadMap:
         return present
 
     def near_shapes(self, corners: Floats, distance: float) -> tuple[Ints, Ints]:
-        """Return rows of lines or polygons, and node ids of the parts within ``distance`` of them.
+        """Find the map parts within ``distance`` of shapes; return pairs of shape row and node id.
 
         Parameters
         ----------
@@ -556,7 +556,7 @@ class RoadMap:
         )
 
     def downstream(self, limit: float) -> tuple[Ints, Ints, Floats]:
-        """Return lanes that start at most ``limit`` metres after the end of a lane, along ``travelsTo``.
+        """Return pairs of lanes where the second starts at most ``limit`` metres after the end of the first.
 
         The last result is cached: a second call with the same limit is free.
 
@@ -578,7 +578,7 @@ class RoadMap:
 
     @cached_property
     def reach(self) -> tuple[Ints, Ints, Floats]:
-        """Return the starts of lanes, measured along the lanes from which they can be reached.
+        """Return pairs of connected lanes, with the start of the second measured along the first.
 
         Returns
         -------
@@ -635,7 +635,7 @@ class RoadMap:
         )
 
     def _on_roundabouts(self) -> MapPlaces:
-        """Return roundabouts as whole lanes of their roads."""
+        """Return the lanes of each roundabout as stretches along these lanes."""
         (lane, road), (part, whole) = self._containment
         around = np.flatnonzero(self.nodes.kind[whole] == KIND_CODE["roundabout"])
         of_road: dict[int, list[int]] = {}
@@ -686,7 +686,7 @@ class RoadMap:
 
     @cached_property
     def _crosswalks(self) -> tuple[Ints, shapely.STRtree, Ints | None]:
-        """Return crosswalk columns, shapes, and the cells near a crosswalk for bodies up to a cell long.
+        """Return the crosswalks: columns, a spatial index, and the grid cells near them.
 
         The cells are ``None`` if there are too many.
         """
@@ -723,7 +723,7 @@ class RoadMap:
 
     @cached_property
     def _containment(self) -> tuple[tuple[Ints, Ints], ...]:
-        """Return columns of children and parents: lanes in roads, then roads in junctions or roundabouts."""
+        """Return pairs of child and parent nodes: lanes in roads, then roads in junctions or roundabouts."""
         inside = self.edges.relation == RELATION_CODE["isIn"]
         child, parent = -1 - self.edges.src[inside], -1 - self.edges.dst[inside]
         lane = self.nodes.kind[child] == KIND_CODE["lane"]
@@ -740,7 +740,7 @@ _LANES_REF: Final = "lanes:"
 
 
 def lanes_ref(names: Iterable[str]) -> str:
-    """Return a substitute for the id of a signal that is missing in the map, from lane names."""
+    """Return a substitute id, made of lane names, for a signal that the map lacks."""
     return _LANES_REF + json.dumps(list(names), ensure_ascii=False)
 
 

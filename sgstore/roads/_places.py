@@ -72,14 +72,14 @@ class MapPlaces:
     def of(
         cls, part: Ints, what: Sequence[str], lane: Ints, start: Floats, end: Floats
     ) -> MapPlaces:
-        """Sort columns into stretches."""
+        """Make stretches from columns in any order."""
         order = np.lexsort((end, start, lane, part))
         told = tuple(what[int(row)] for row in order)
         return cls(part[order], told, lane[order], start[order], end[order])
 
 
 def broad_lines(rows: Sequence[tuple[int, bool, float, float]]) -> MapPlaces:
-    """Make stretches of broad markings from rows of lane, left side (bool), start and end; m."""
+    """Make stretches with broad markings from rows of lane, side, start and end; m."""
     lane = np.array([row[0] for row in rows], np.int64)
     start, end = (np.array([row[i] for row in rows], np.float64) for i in (2, 3))
     return MapPlaces.of(lane + 1, [BROAD_LINES[not row[1]] for row in rows], lane, start, end)
@@ -88,7 +88,7 @@ def broad_lines(rows: Sequence[tuple[int, bool, float, float]]) -> MapPlaces:
 def made_of_lanes(
     ribbons: Ribbons, what: str, names: Sequence[str], column: dict[str, int]
 ) -> MapPlaces:
-    """Return whole lanes as stretches of their lanes, roads or junctions.
+    """Return the complete lanes of roads or junctions as stretches.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def of_signals(
     applies: tuple[Ints, Ints],
     stops: tuple[Ints, Ints, Floats],
 ) -> MapPlaces:
-    """Return signals on the lanes that they apply to.
+    """Return the places of signals on the lanes that they apply to.
 
     Parameters
     ----------

@@ -135,7 +135,7 @@ class Ribbons:
         )
 
     def _turns(self, before: Ints) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
-        """Return headings relative to the chord at both of its ends, and the vector along it."""
+        """Return the headings at both ends of pieces relative to their chord, and the chord vectors."""
         after = before + 1
         x, y = (self.left_x + self.right_x) / 2, (self.left_y + self.right_y) / 2
         way = x[after] - x[before], y[after] - y[before]
@@ -334,7 +334,7 @@ def _pairs(lanes: Ints, junction: Sequence[str]) -> tuple[Ints, Ints]:
 
 
 def _share(src: Ints, dst: Ints, one: Ints, other: Ints) -> Bools:
-    """Return a mask of the pairs of lanes that have a common neighbour along ``src → dst``."""
+    """Return a mask of the pairs of lanes with a common successor in ``src → dst``."""
     after: dict[int, set[int]] = {}
     for lane, onward in zip(src.tolist(), dst.tolist(), strict=True):
         after.setdefault(lane, set()).add(onward)

@@ -133,7 +133,7 @@ class _Lanes:
                 yield from last[target]
 
     def _onto(self, lane: int) -> Iterable[tuple[int, int]]:
-        """Yield a lane, and the group of lanes outside junctions that it leads to."""
+        """Yield the lane groups after a junction that a lane leads to, with the last lane before each."""
         queue, seen = [lane], {lane}
         while queue and len(seen) < _MOST:
             at = queue.pop()
@@ -162,7 +162,7 @@ class _Lanes:
 
 
 def _related(count: int, pairs: tuple[Ints, Ints], traffic: Sequence[bool]) -> list[list[int]]:
-    """Return the related lanes of each lane; only lanes for motor traffic."""
+    """Return the lanes related to each lane, for motor traffic only."""
     found: list[list[int]] = [[] for _ in range(count)]
     for one, other in zip(*(column.tolist() for column in pairs), strict=True):
         if traffic[one] and traffic[other]:

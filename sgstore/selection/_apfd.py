@@ -114,5 +114,5 @@ def failure_curve(failed: Bools, points: int = 200) -> list[tuple[int, int, floa
 
 
 def _drawn(left: Floats, rng: np.random.Generator) -> float:
-    """Return the mean of an equal number of failures, drawn with replacement."""
+    """Return a bootstrap sample of the APFD: the mean over failures drawn with replacement."""
     return float(left[rng.integers(0, len(left), len(left))].mean())

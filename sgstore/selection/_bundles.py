@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class UnitsWished:
-    """Parameters of units; plain values of :class:`sgstore.selection.SelectionSpec`."""
+    """Parameters of units, as plain values of :class:`sgstore.selection.SelectionSpec`."""
 
     unit: str
     clip_s: float

@@ -56,7 +56,7 @@ ROUNDING = 1 + 1e-12
 
 @dataclass
 class BudgetTracker:
-    """Remainder of a budget, and the bought frames.
+    """Remainder of a selection budget, and the frames already paid.
 
     Attributes
     ----------
@@ -94,13 +94,13 @@ class BudgetTracker:
         return np.array([self.weights[own][~self.bought[own]].sum() for own in rows])
 
     def buy(self, one: int, price: float) -> None:
-        """Buy a unit."""
+        """Add a unit to the selection and pay its price."""
         self.bought[self.units.begin[one] : self.units.end[one]] = True
         self.spent += price
         self.left -= price
 
     def fitting(self, order: Ints, most: float = np.inf) -> Ints:
-        """Buy units in order, up to a limit; skip units that do not fit or add no frames."""
+        """Select units in order, up to a limit; skip units that do not fit or add no frames."""
         found: list[int] = []
         end = max(self.left - most * ROUNDING, 0.0)
         cost = self.cost[order]
@@ -560,7 +560,7 @@ def _strata(spec: SelectionSpec, units: Units) -> tuple[Ints, list[str]]:
 
 
 def _value(value: Any) -> str:
-    """Return the name of a value's stratum."""
+    """Return the stratum name of a value."""
     if value is None:
         return "unknown"
     if isinstance(value, bool):
@@ -767,7 +767,7 @@ _WORK: Final = 30_000_000
 
 @dataclass(frozen=True)
 class Curve:
-    """Elements kept by the first units of a selection.
+    """Curve of a selection: elements that its first n units keep.
 
     Attributes
     ----------
@@ -858,7 +858,7 @@ def _points(most: int, points: int) -> Ints:
 
 
 def random_need(units: Units, held: Holdings, wanted: int, seed: int) -> tuple[Floats, float]:
-    """Return the numbers of units in random order that hold as many elements.
+    """Return the number of random units that hold a number of elements, for several random orders.
 
     Returns
     -------

@@ -161,7 +161,7 @@ def _contained(
     superfluous: Callable[[Ints, Ints], Ints],
     most: int,
 ) -> tuple[Bools, int]:
-    """Find items that are redundant because of containment.
+    """Find redundant items: those contained in others, or containing others.
 
     Parameters
     ----------
@@ -281,7 +281,7 @@ def _parts(
 
 
 def _joined(sets: Ints, members: Ints, many: int, elements: int) -> Ints:
-    """Return the first set that each set is connected with through shared elements, (many,)."""
+    """Return the smallest set index in each set's connected component, (many,)."""
     first = np.arange(many)
     while True:
         # Propagate the least set number through elements and sets.
@@ -319,7 +319,7 @@ _MEMBERSHIPS: Final = 200_000_000
 
 
 def bounded(family: SetFamily, cover: Ints) -> tuple[float, Ints, Floats]:
-    """Return a lower bound, and a cover that costs at most as much as the given one.
+    """Return a lower bound, and a cover that is not more expensive than the given one.
 
     Parameters
     ----------
@@ -405,7 +405,7 @@ def has_solver() -> bool:
 
 
 def improved(family: SetFamily, cover: Ints, nodes: int) -> tuple[Ints, float, int]:
-    """Return a cover that costs at most as much as the given one, a lower bound, and the used nodes.
+    """Return the improved or given cover, a lower bound, and the used solver nodes.
 
     Parameters
     ----------
@@ -504,7 +504,7 @@ def _programme(family: SetFamily) -> Any:
 
 @dataclass(frozen=True)
 class Cover:
-    """Chosen sets of a cover.
+    """Cover: chosen sets, with cost and lower bound.
 
     Attributes
     ----------
@@ -558,7 +558,7 @@ def minimal(family: SetFamily, nodes: int = NODES) -> Cover:
 
 @dataclass(frozen=True)
 class Fitted:
-    """Chosen sets within a budget.
+    """Sets chosen within a budget, with the needs that they meet.
 
     Attributes
     ----------
@@ -614,7 +614,7 @@ def _at_most(family: SetFamily, chosen: Ints, budget: float) -> float:
 
 @dataclass(frozen=True)
 class UnitPieces:
-    """Units as ranges of pieces.
+    """Selection units as ranges of pieces, which overlapping units share.
 
     Attributes
     ----------
@@ -629,7 +629,7 @@ class UnitPieces:
     cost: Floats
 
     def left(self, one: int, taken: Bools) -> float:
-        """Return the cost of a unit without the taken pieces."""
+        """Return the cost of those pieces of a unit that are not yet taken."""
         own = slice(int(self.begin[one]), int(self.end[one]))
         return float(self.cost[own][~taken[own]].sum())
 

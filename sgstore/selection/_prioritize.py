@@ -384,7 +384,7 @@ def _said(
 
 
 def _lacking(spec: PrioritySpec, units: Units, worst: Sequence[WorstValues]) -> list[str]:
-    """Return notes about missing values of frames and pairs that hide possible conflicts."""
+    """Return notes about missing data that can hide conflicts of the ego."""
     told: list[str] = []
     of_pairs = bool({*spec.measures} & {*RANKED, *LATER}) or spec.by is Priority.learned
     if spec.by is Priority.diverse:
@@ -407,7 +407,7 @@ def _lacking(spec: PrioritySpec, units: Units, worst: Sequence[WorstValues]) -> 
 
 
 def _places(total: Floats, rank: Ints) -> Ints:
-    """Return the places in the order of a number, (U,), from 0 on."""
+    """Return the place of each value in ascending order, from 0, (U,); ``rank`` decides ties."""
     found = np.empty(len(total), np.int64)
     found[np.lexsort((rank, total))] = np.arange(len(total))
     return found
@@ -421,7 +421,7 @@ def _in_rounds(order: Ints, code: Ints) -> Ints:
 
 
 def _turns(code: Ints) -> Ints:
-    """Return the count of the same class so far, (n,), including itself."""
+    """Return for each unit the count of its class so far, itself included, (n,)."""
     order = np.argsort(code, kind="stable")
     fresh = np.append(True, np.diff(code[order]) != 0)[: len(code)]
     places = np.arange(len(code))
@@ -564,7 +564,7 @@ def _times(units: Units) -> Floats:
 
 
 def _or_none(values: Floats) -> list[float | None]:
-    """Return plain values; None means unknown."""
+    """Convert an array to a list, with None for NaN."""
     found: list[float | None] = values.tolist()
     for place in np.flatnonzero(np.isnan(values)).tolist():
         found[place] = None

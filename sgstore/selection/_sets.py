@@ -27,7 +27,7 @@ def distinct(values: Ints) -> Ints:
 
 
 def spread(begin: Ints, end: Ints) -> tuple[Ints, Ints]:
-    """Expand ranges: the index of the range, and all integers in it."""
+    """Expand ranges to pairs of range index and integer."""
     many = end - begin
     unit = np.repeat(np.arange(len(many)), many)
     return unit, np.arange(len(unit)) + np.repeat(begin - (np.cumsum(many) - many), many)
@@ -35,7 +35,7 @@ def spread(begin: Ints, end: Ints) -> tuple[Ints, Ints]:
 
 @dataclass(frozen=True)
 class SetFamily:
-    """Sets of elements.
+    """Family of sets of elements, with costs and needs.
 
     Attributes
     ----------
@@ -109,7 +109,7 @@ class SetFamily:
         return starts, self.set_of[order]
 
     def gains(self, open_: Bools) -> Floats:
-        """Return the weight of the open elements of each set, (S,)."""
+        """Return the weight of the uncovered elements of each set, (S,)."""
         rows = open_[self.members]
         weight = self.weight[self.members[rows]].astype(np.float64)
         return np.bincount(self.set_of[rows], weight, len(self)).astype(np.float64)
@@ -121,7 +121,7 @@ class SetFamily:
         return np.bincount(self.members[taken[self.set_of]], minlength=len(self.need))
 
     def part(self, sets: Ints, wanted: Bools, need: Ints) -> SetFamily:
-        """Return some sets with only the wanted elements, which are renumbered."""
+        """Return a smaller family: some sets, with renumbered wanted elements."""
         kept = np.zeros(len(self), np.bool_)
         kept[sets] = True
         rows = kept[self.set_of] & wanted[self.members]

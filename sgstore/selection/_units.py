@@ -256,7 +256,7 @@ def _mixed(
 def units_of(
     chosen: ChosenFrames, unit: SelectionUnit, clip_s: float = 2.0, stride_s: float | None = None
 ) -> Units:
-    """Divide frames into units.
+    """Divide frames into selection units: frames, clips or traces.
 
     A clip is a part of a run of consecutive frames, of a given length. The first clip begins with
     the run, the others follow at the stride, until one reaches the end of the run; the last one may
@@ -461,7 +461,7 @@ def sequence_holdings(units: Units, k: int, names: Sequence[str], within_s: floa
 
 
 def classes_of(units: Units, of: Classed) -> Ints:
-    """Return pairs of units and their occurring classes (from 0), (2, M)."""
+    """Return pairs of a unit and a class in it, (2, M); classes count from 0."""
     present = of.present()
     number = np.full(len(of.names) + 1, UNKNOWN)
     number[present] = np.arange(len(present))
@@ -510,7 +510,7 @@ def _distinct_combinations(found: Combinations) -> tuple[Bools, Ints, Ints]:
 
 
 def _of_units(pairs: Ints, has: Bools) -> Ints:
-    """Join units with classes and classes with elements to units with elements."""
+    """Return pairs of unit and element, from pairs of unit and class, and the elements of classes."""
     held = 0
     parts: list[Ints] = []
     unit, row = pairs
@@ -553,7 +553,7 @@ def kept(pairs: Ints, weight: Ints, picked: Ints, units: int) -> Ints:
 
 
 def numbers_of_frames(units: Units, text: str) -> tuple[Ints, Floats]:
-    """Return a number for each frame to select from.
+    """Evaluate an expression to a number for each frame to select from.
 
     Parameters
     ----------
@@ -598,7 +598,7 @@ def numbers_of_frames(units: Units, text: str) -> tuple[Ints, Floats]:
 
 
 def _condition_in(text: str) -> str | None:
-    """Return the condition of an expression that is only a robustness."""
+    """Return the condition in ``robustness(…)``, if the expression is nothing else."""
     begun = "MATCH () RETURN "
     try:
         match = parse(begun + text)[-1]
