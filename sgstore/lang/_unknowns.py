@@ -36,6 +36,7 @@ _ANSWERS: Final = frozenset({"IS NULL", "IS NOT NULL", "coalesce", "case"})
 """Operations with a known value even for unknown operands."""
 
 _FLIPPED: Final = {"<": ">=", "<=": ">", ">": "<=", ">=": "<", "=": "<>", "<>": "="}
+_TURNED: Final = {"<": ">", "<=": ">=", ">": "<", ">=": "<="}
 _EVERYWHERE: Final = frozenset({*BEYOND, *MAP_ONLY, "mayAffect"})
 """Relations that are also known beyond the graphs."""
 _OF_PAIRS: Final = frozenset({*DIRECTIONS, *SIDES})
@@ -91,7 +92,9 @@ def negated(condition: b.Bound) -> b.Bound:  # noqa: PLR0911 - a case each
             return b.all_of(pushed(left), negated(right))
         case b.Operation("XOR", operands):
             return negated(spelled_out(operands))
-        case b.Operation(word=word) if word in _FLIPPED and has_pairs(condition):
+        case b.Operation(word=word) if word in _FLIPPED and (
+            has_pairs(condition) or _counted(condition) is not None
+        ):
             return replace(condition, word=_FLIPPED[word])
         case b.Value(value=value):
             return replace(condition, value=value is not True)
@@ -153,6 +156,8 @@ def certain(  # noqa: PLR0911 - a case each
             if has_pairs(operand):
                 return condition
             return b.inverse(b.Operation("coalesce", (operand, doubt or _FALSE), Type.boolean))
+        case b.Operation() if not decided and _counted(condition) is not None:
+            return _of_counts(condition, least=True)
         case b.Operation() if _of_blocks(condition):
             doubt = None if decided else unknown(condition)
             return condition if doubt is None else b.all_of(condition, b.inverse(doubt))
@@ -170,6 +175,8 @@ def possible(condition: b.Bound) -> b.Bound:
         case b.Operation("NOT", (operand,)):
             doubt = unknown(operand)
             return certain(condition) if doubt is None else b.any_of((certain(condition), doubt))
+        case b.Operation() if _counted(condition) is not None:
+            return _of_counts(condition, least=False)
         case _:
             doubt = unknown(condition)
             return condition if doubt is None else b.any_of((condition, doubt))
@@ -254,18 +261,25 @@ def _of_block(block: b.BlockValue) -> tuple[b.Bound, ...]:
     if doubts:
         wanted = (*map(possible, where), b.any_of(dict.fromkeys(doubts)))
         found.append(_exists(block, block.scope.edges, wanted, _LOOSE))
+    beyond = _of_apart(block)
+    return (*found, beyond) if beyond is not None else tuple(found)
+
+
+def _of_apart(block: b.BlockValue) -> b.Bound | None:
+    """Return the condition that a block has a match with an edge that was not computed, or None."""
     apart = {edge.key: one for edge in block.scope.edges if (one := _not_computed(edge, block))}
-    if apart:
-        rest = tuple(edge for edge in block.scope.edges if edge.key not in apart)
-        told = (one for one in where if not _edges_of(one) & apart.keys())
-        wanted = (*map(possible, told), b.any_of(dict.fromkeys(apart.values())))
-        found.append(_exists(block, rest, wanted, 2 * _LOOSE))
-    return tuple(found)
+    if not apart:
+        return None
+    rest = tuple(edge for edge in block.scope.edges if edge.key not in apart)
+    where = map(pushed, block.scope.where)
+    told = (one for one in where if not _edges_of(one) & apart.keys())
+    wanted = (*map(possible, told), b.any_of(dict.fromkeys(apart.values())))
+    return _exists(block, rest, wanted, 2 * _LOOSE)
 
 
 @lru_cache(maxsize=1024)
 def _sure(block: b.BlockValue) -> b.BlockValue:
-    """Return an ``EXISTS`` limited to certain matches."""
+    """Return an ``EXISTS`` or ``COUNT`` limited to certain matches."""
     doubted = any(_of_blocks(one) and unknown(one) is not None for one in block.scope.where)
     loose = [
         b.inverse(b.any_of(doubts))
@@ -274,7 +288,7 @@ def _sure(block: b.BlockValue) -> b.BlockValue:
         and "off_road" in block.scope.kinds(edge.dst).every
         and (doubts := [*_unmeasured_ends(edge, block.scope)])
     ]  # a body with a size may reach onto a road although its centre does not
-    if block.word != "EXISTS" or not (loose or doubted):
+    if block.word not in {"EXISTS", "COUNT"} or not (loose or doubted):
         return block
     where = tuple(certain(pushed(one)) for one in block.scope.where)
     scope = replace(block.scope, where=(*where, *loose))
@@ -305,6 +319,78 @@ def _exists(
         type=Type.boolean,
         number=block.number + number,
     )
+
+
+def _counted(condition: b.Bound) -> tuple[list[b.BlockValue], str, b.Value] | None:
+    """Return the blocks of a comparison of counts with a number, its operator and the number, or None."""
+    match condition:
+        case b.Operation(word, (counts, b.Value(value=int() | float()) as limit)):
+            pass
+        case b.Operation(word, (b.Value(value=int() | float()) as limit, counts)):
+            word = _TURNED.get(word, word)
+        case _:
+            return None
+    blocks = _summands(counts)
+    return (blocks, word, limit) if word in _FLIPPED and blocks else None
+
+
+def _summands(value: b.Bound) -> list[b.BlockValue]:
+    match value:
+        case b.BlockValue(word="COUNT"):
+            return [value]
+        case b.Operation("+", (one, other)) if (first := _summands(one)) and (
+            rest := _summands(other)
+        ):
+            return [*first, *rest]
+        case _:
+            return []
+
+
+def _of_counts(condition: b.Operation, *, least: bool) -> b.Bound:
+    """Return the condition that a comparison of counts is certain (``least``) or possible."""
+    found = _counted(condition)
+    assert found is not None  # noqa: S101 - it was asked before
+    blocks, word, limit = found
+    doubt = unknown(condition)
+    if doubt is None:
+        return condition
+    if not all(map(_can_be_counted, blocks)):
+        return b.all_of(condition, b.inverse(doubt)) if least else b.any_of((condition, doubt))
+    low, high = _total(map(_sure, blocks)), _total(m for one in blocks for m in _all_of(one))
+    ways = {
+        "=": ((low, "="), (high, "=")) if least else ((low, "<="), (high, ">=")),
+        "<>": ((low, ">"), (high, "<")) if least else ((low, "<>"), (high, "<>")),
+    }
+    if word not in ways:
+        value = low if (word in {">", ">="}) == least else high
+        return b.Operation(word, (value, limit), Type.boolean)
+    parts = [b.Operation(how, (value, limit), Type.boolean) for value, how in ways[word]]
+    return b.all_of(*parts) if word == "=" else b.any_of(parts)
+
+
+def _can_be_counted(block: b.BlockValue) -> bool:
+    """Return True if the nodes of a block alone give its possible matches beyond the graph."""
+    beyond = _of_apart(block)
+    told = not any(edge.named for edge in block.scope.edges)
+    return beyond is None or (told and isinstance(beyond, b.BlockValue))
+
+
+def _total(blocks: Iterable[b.BlockValue]) -> b.Bound:
+    first, *rest = blocks
+    found: b.Bound = first
+    for one in rest:
+        found = b.Operation("+", (found, one), Type.number)
+    return found
+
+
+def _all_of(block: b.BlockValue) -> Iterable[b.BlockValue]:
+    """Yield blocks that together have all possible matches of a block."""
+    where = tuple(possible(pushed(part)) for part in block.scope.where)
+    scope = replace(block.scope, where=where)
+    yield replace(block, scope=scope, number=block.number + 8 * _LOOSE)
+    beyond = _of_apart(block)
+    if isinstance(beyond, b.BlockValue):
+        yield replace(beyond, word="COUNT", type=Type.number, number=block.number + 16 * _LOOSE)
 
 
 def _edges_of(condition: b.Bound) -> frozenset[str]:
