@@ -7,7 +7,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
 import pytest
-from scenes import Scene, actor, along, cone, ego, store_of, street
+from scenes import Scene, actor, along, cone, ego, seen_by, store_of, street
 
 from sgstore.config import Config, PairSettings, Proximity, RangeSettings
 from sgstore.lang import Binding, ScopeSearch, compile_query
@@ -15,6 +15,7 @@ from sgstore.step import replayed
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from sgstore.query import Store
@@ -95,13 +96,17 @@ def stored(folder: Path, radius: float, world: float) -> Store:
 
 
 @pytest.fixture(scope="module")
-def near(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    return stored(tmp_path_factory.mktemp("near"), 50, 200)
+def near(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
+    store = stored(tmp_path_factory.mktemp("near"), 50, 200)
+    with store.file.snapshot():
+        yield store
 
 
 @pytest.fixture(scope="module")
-def wide(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    return stored(tmp_path_factory.mktemp("wide"), 200, 0)
+def wide(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
+    store = stored(tmp_path_factory.mktemp("wide"), 200, 0)
+    with store.file.snapshot():
+        yield store
 
 
 def named(asked: str, trace: str) -> str:
@@ -109,6 +114,13 @@ def named(asked: str, trace: str) -> str:
     return asked.replace("FIRST", first).replace("SECOND", second)
 
 
+def among(asked: str, trace: str) -> str:
+    """The question of a trace and of all whose rungs have the same names."""
+    same = [one for one in TRACES if (one in RUNGS) == (trace in RUNGS)]
+    return f"MATCH {named(asked, trace)} AND trace.name IN {same}"
+
+
+@cache
 def rows(store: Store, text: str) -> list[tuple[Any, ...]]:
     return sorted(map(tuple, store.find(text)), key=repr)
 
@@ -129,13 +141,10 @@ def test_a_search_in_memory_finds_the_same_beyond_graphs(near: Store, trace: str
     frames = [frame for (frame,) in near.sql(sql).values]
     found, seen = dict[str, int](), dict[str, int]()
     for asked in ASKED:
-        text = f"USING SCOPE world MATCH {named(asked, trace)} AND trace.name = '{trace}'"
+        text = f"USING SCOPE world {among(asked, trace)}"
         found[asked] = sum(row[0] in frames for row in rows(near, text))
         query = compile_query(text, near.catalog()).bound
-        views = (
-            near._view(near.file.frame(frame), query)  # pyright: ignore[reportPrivateUsage]
-            for frame in frames
-        )
+        views = (seen_by(near, frame, query) for frame in frames)
         seen[asked] = sum(
             1 for view in views for _ in ScopeSearch(query.scope, injective=True).run(Binding(view))
         )
